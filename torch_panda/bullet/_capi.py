@@ -1,0 +1,380 @@
+"""Declarations of Bullet's C API, as the extension module of pybullet exports it.
+
+Every line binds one function of ``PhysicsClientC_API.h`` (pybullet 3.2.7): name,
+result and arguments together. No logic lives here.
+
+The module is opened twice, because ctypes ties the lock to the library object:
+
+* ``CDLL`` releases the GIL around a call. It serves the calls that do real work, so
+  that clients in different threads step at the same time.
+* ``PyDLL`` keeps the GIL. It serves the setters, which take less time than handing
+  the lock over; through ``CDLL`` two threads would pass it back and forth.
+
+The file is found, not imported: importing pybullet prints a line on stdout.
+"""
+
+import ctypes
+import importlib.metadata
+import importlib.util
+from ctypes import POINTER, c_char, c_char_p, c_double, c_int, c_size_t, c_void_p
+from typing import Any
+
+SUPPORTED_VERSION = "3.2.7"
+
+# enum EnumSharedMemoryServerStatus
+CMD_CLIENT_COMMAND_COMPLETED = 2
+CMD_URDF_LOADING_COMPLETED = 6
+CMD_ACTUAL_STATE_UPDATE_COMPLETED = 21
+CMD_DESIRED_STATE_RECEIVED_COMPLETED = 25
+CMD_STEP_FORWARD_SIMULATION_COMPLETED = 26
+CMD_CONTACT_POINT_INFORMATION_COMPLETED = 39
+CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43
+CMD_CREATE_COLLISION_SHAPE_COMPLETED = 80
+CMD_CREATE_MULTI_BODY_COMPLETED = 84
+CMD_PERFORM_COLLISION_DETECTION_COMPLETED = 112
+
+# enum eURDF_Flags
+URDF_IGNORE_VISUAL_SHAPES = 1 << 20
+
+# enum for b3JointControlCommandInit2
+CONTROL_MODE_POSITION_VELOCITY_PD = 2
+
+# The ...MultiDof setters ignore a call for more degrees of freedom than this.
+MAX_MULTI_DOF = 4
+
+
+class JointInfo(ctypes.Structure):
+    """``struct b3JointInfo``."""
+
+    _fields_ = (
+        ("link_name", c_char * 1024),
+        ("joint_name", c_char * 1024),
+        ("joint_type", c_int),
+        ("q_index", c_int),
+        ("u_index", c_int),
+        ("joint_index", c_int),
+        ("flags", c_int),
+        ("damping", c_double),
+        ("friction", c_double),
+        ("lower_limit", c_double),
+        ("upper_limit", c_double),
+        ("max_force", c_double),
+        ("max_velocity", c_double),
+        ("parent_frame", c_double * 7),
+        ("child_frame", c_double * 7),
+        ("axis", c_double * 3),
+        ("parent_index", c_int),
+        ("q_size", c_int),
+        ("u_size", c_int),
+    )
+
+
+class ContactPoint(ctypes.Structure):
+    """``struct b3ContactPointData``."""
+
+    _fields_ = (
+        ("flags", c_int),
+        ("body_a", c_int),
+        ("body_b", c_int),
+        ("link_a", c_int),
+        ("link_b", c_int),
+        ("position_on_a", c_double * 3),
+        ("position_on_b", c_double * 3),
+        ("normal_on_b", c_double * 3),
+        ("distance", c_double),
+        ("normal_force", c_double),
+        ("friction_force_1", c_double),
+        ("friction_force_2", c_double),
+        ("friction_direction_1", c_double * 3),
+        ("friction_direction_2", c_double * 3),
+    )
+
+
+class ContactInformation(ctypes.Structure):
+    """``struct b3ContactInformation``."""
+
+    _fields_ = (("count", c_int), ("points", POINTER(ContactPoint)))
+
+
+def wrong_pybullet(reason: str) -> ImportError:
+    """The one error for a pybullet whose C API is not the one declared here."""
+    try:
+        installed = importlib.metadata.version("pybullet")
+    except importlib.metadata.PackageNotFoundError:
+        installed = "none"
+    return ImportError(
+        f"torch_panda calls Bullet's C API through pybullet, and {reason} "
+        f"(installed: {installed}). Version {SUPPORTED_VERSION} works: "
+        f"pip install pybullet=={SUPPORTED_VERSION}"
+    )
+
+
+def library_path(module: str = "pybullet") -> str:
+    """Path of the extension module, without importing it."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise wrong_pybullet("pybullet is not installed")
+    return spec.origin
+
+
+def bind(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any:  # noqa: ANN401 (ctypes function types)
+    """Declare one C function.
+
+    Raises:
+        ImportError: the library does not export the name.
+    """
+    try:
+        function = getattr(library, name)
+    except AttributeError:
+        raise wrong_pybullet(f"it does not export {name}") from None
+    function.restype = result
+    function.argtypes = arguments
+    return function
+
+
+_path = library_path()
+_work = ctypes.CDLL(_path)
+_cheap = ctypes.PyDLL(_path)
+
+_client = _command = _status = c_void_p
+# Doubles are passed as a ctypes array or as an address, for instance of a tensor.
+_doubles = c_void_p
+_address = POINTER(c_void_p)
+
+# Connection, and the one call that makes Bullet work.
+connect_direct = bind(_work, "b3ConnectPhysicsDirect", _client)
+disconnect = bind(_work, "b3DisconnectSharedMemory", None, _client)
+submit = bind(_work, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command)
+status_type = bind(_cheap, "b3GetStatusType", c_int, _status)
+# lfind(key, base, &count, width, compare) of <search.h>, on POSIX systems, calls
+# compare(key, base + k * width) until it answers 0. With compare = submit, key =
+# client, base = command and width = 0 that submits a command ``count`` times in one
+# foreign call, so that the GIL is handed over once a step instead of once a substep:
+# 4 to 10 % more steps/s with two threads. It gives NULL if every one was answered.
+repeat = bind(
+    ctypes.CDLL(None),
+    "lfind",
+    c_void_p,
+    _client,
+    _command,
+    POINTER(c_size_t),
+    c_size_t,
+    c_void_p,
+)
+
+# World
+physics_init = bind(_cheap, "b3InitPhysicsParamCommand", _command, _client)
+physics_set_gravity = bind(
+    _cheap, "b3PhysicsParamSetGravity", c_int, _command, c_double, c_double, c_double
+)
+physics_set_timestep = bind(
+    _cheap, "b3PhysicsParamSetTimeStep", c_int, _command, c_double
+)
+step_init = bind(_cheap, "b3InitStepSimulationCommand", _command, _client)
+detect_init = bind(_cheap, "b3InitPerformCollisionDetectionCommand", _command, _client)
+
+# Bodies
+urdf_init = bind(_cheap, "b3LoadUrdfCommandInit", _command, _client, c_char_p)
+urdf_set_position = bind(
+    _cheap,
+    "b3LoadUrdfCommandSetStartPosition",
+    c_int,
+    _command,
+    c_double,
+    c_double,
+    c_double,
+)
+urdf_set_orientation = bind(
+    _cheap,
+    "b3LoadUrdfCommandSetStartOrientation",
+    c_int,
+    _command,
+    c_double,
+    c_double,
+    c_double,
+    c_double,
+)
+urdf_set_fixed_base = bind(
+    _cheap, "b3LoadUrdfCommandSetUseFixedBase", c_int, _command, c_int
+)
+urdf_set_flags = bind(_cheap, "b3LoadUrdfCommandSetFlags", c_int, _command, c_int)
+status_body = bind(_cheap, "b3GetStatusBodyIndex", c_int, _status)
+shape_init = bind(_cheap, "b3CreateCollisionShapeCommandInit", _command, _client)
+shape_add_box = bind(_cheap, "b3CreateCollisionShapeAddBox", c_int, _command, _doubles)
+shape_add_sphere = bind(
+    _cheap, "b3CreateCollisionShapeAddSphere", c_int, _command, c_double
+)
+shape_add_cylinder = bind(
+    _cheap, "b3CreateCollisionShapeAddCylinder", c_int, _command, c_double, c_double
+)
+status_shape = bind(_cheap, "b3GetStatusCollisionShapeUniqueId", c_int, _status)
+body_init = bind(_cheap, "b3CreateMultiBodyCommandInit", _command, _client)
+body_set_base = bind(
+    _cheap,
+    "b3CreateMultiBodyBase",
+    c_int,
+    _command,
+    c_double,  # mass
+    c_int,  # collision shape
+    c_int,  # visual shape
+    _doubles,  # position
+    _doubles,  # orientation
+    _doubles,  # inertial frame position
+    _doubles,  # inertial frame orientation
+)
+dynamics_init = bind(_cheap, "b3InitChangeDynamicsInfo", _command, _client)
+dynamics_set_lateral_friction = bind(
+    _cheap,
+    "b3ChangeDynamicsInfoSetLateralFriction",
+    c_int,
+    _command,
+    c_int,
+    c_int,
+    c_double,
+)
+dynamics_set_spinning_friction = bind(
+    _cheap,
+    "b3ChangeDynamicsInfoSetSpinningFriction",
+    c_int,
+    _command,
+    c_int,
+    c_int,
+    c_double,
+)
+joint_count = bind(_cheap, "b3GetNumJoints", c_int, _client, c_int)
+joint_info = bind(
+    _cheap, "b3GetJointInfo", c_int, _client, c_int, c_int, POINTER(JointInfo)
+)
+
+# Poses
+pose_init = bind(_cheap, "b3CreatePoseCommandInit", _command, _client, c_int)
+pose_set_position = bind(
+    _cheap,
+    "b3CreatePoseCommandSetBasePosition",
+    c_int,
+    _command,
+    c_double,
+    c_double,
+    c_double,
+)
+pose_set_orientation = bind(
+    _cheap,
+    "b3CreatePoseCommandSetBaseOrientation",
+    c_int,
+    _command,
+    c_double,
+    c_double,
+    c_double,
+    c_double,
+)
+pose_set_linear_velocity = bind(
+    _cheap, "b3CreatePoseCommandSetBaseLinearVelocity", c_int, _command, _doubles
+)
+pose_set_angular_velocity = bind(
+    _cheap, "b3CreatePoseCommandSetBaseAngularVelocity", c_int, _command, _doubles
+)
+pose_set_joint_positions = bind(
+    _cheap, "b3CreatePoseCommandSetJointPositions", c_int, _command, c_int, _doubles
+)
+pose_set_joint_velocities = bind(
+    _cheap,
+    "b3CreatePoseCommandSetJointVelocities",
+    c_int,
+    _client,
+    _command,
+    c_int,
+    _doubles,
+)
+
+# Motors
+motor_init = bind(_cheap, "b3JointControlCommandInit2", _command, _client, c_int, c_int)
+motor_set_positions = bind(
+    _cheap,
+    "b3JointControlSetDesiredPositionMultiDof",
+    c_int,
+    _command,
+    c_int,
+    _doubles,
+    c_int,
+)
+motor_set_velocities = bind(
+    _cheap,
+    "b3JointControlSetDesiredVelocityMultiDof",
+    c_int,
+    _command,
+    c_int,
+    _doubles,
+    c_int,
+)
+motor_set_kp = bind(
+    _cheap, "b3JointControlSetKpMultiDof", c_int, _command, c_int, _doubles, c_int
+)
+motor_set_kd = bind(
+    _cheap, "b3JointControlSetKdMultiDof", c_int, _command, c_int, _doubles, c_int
+)
+motor_set_forces = bind(
+    _cheap,
+    "b3JointControlSetDesiredForceTorqueMultiDof",
+    c_int,
+    _command,
+    c_int,
+    _doubles,
+    c_int,
+)
+
+# Inverse kinematics
+ik_init = bind(
+    _cheap, "b3CalculateInverseKinematicsCommandInit", _command, _client, c_int
+)
+ik_set_target = bind(
+    _cheap,
+    "b3CalculateInverseKinematicsAddTargetPositionWithOrientation",
+    None,
+    _command,
+    c_int,
+    _doubles,
+    _doubles,
+)
+ik_result = bind(
+    _cheap,
+    "b3GetStatusInverseKinematicsJointPositions",
+    c_int,
+    _status,
+    POINTER(c_int),
+    POINTER(c_int),
+    _doubles,
+)
+
+# State
+state_init = bind(_cheap, "b3RequestActualStateCommandInit", _command, _client, c_int)
+state_want_link_velocity = bind(
+    _cheap, "b3RequestActualStateCommandComputeLinkVelocity", c_int, _command, c_int
+)
+state_result = bind(
+    _cheap,
+    "b3GetStatusActualState2",
+    c_int,
+    _status,
+    POINTER(c_int),  # body
+    POINTER(c_int),  # number of links
+    POINTER(c_int),  # number of q
+    POINTER(c_int),  # number of u
+    _address,  # root inertial frame
+    _address,  # q: base pose (7), then one per degree of freedom
+    _address,  # u: base velocity (6), then one per degree of freedom
+    _address,  # joint reaction forces (6 per joint)
+    _address,  # link inertial frames (7 per link)
+    _address,  # joint motor forces
+    _address,  # link poses (7 per link), centre of mass, world frame
+    _address,  # link velocities (6 per link), world frame
+)
+contact_init = bind(_cheap, "b3InitRequestContactPointInformation", _command, _client)
+contact_set_body_a = bind(_cheap, "b3SetContactFilterBodyA", None, _command, c_int)
+contact_set_body_b = bind(_cheap, "b3SetContactFilterBodyB", None, _command, c_int)
+contact_result = bind(
+    _cheap,
+    "b3GetContactPointInformation",
+    None,
+    _client,
+    POINTER(ContactInformation),
+)

@@ -1,0 +1,456 @@
+"""One DIRECT physics client of Bullet."""
+
+import importlib.util
+from collections.abc import Sequence
+from ctypes import Array, byref, c_double, c_int, c_size_t, c_void_p
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from torch_panda.bullet import _capi
+
+_MAX_DOF = _capi.MAX_MULTI_DOF
+# pybullet's defaults for setJointMotorControlArray(POSITION_CONTROL).
+_KP = (c_double * _MAX_DOF)(*[0.1] * _MAX_DOF)
+_KD = (c_double * _MAX_DOF)(*[1.0] * _MAX_DOF)
+_TARGET_VELOCITY = (c_double * _MAX_DOF)()
+# Joints follow the base in Bullet's coordinates: 7 of its pose, 6 of its velocity.
+_Q_OFFSET = 7
+_U_OFFSET = 6
+
+_DOUBLE = 8  # bytes
+
+_ORIGIN = (0.0, 0.0, 0.0)
+_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+
+class BulletError(RuntimeError):
+    """Bullet refused a command, or a simulation was used after ``close``."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a body, as its URDF describes it."""
+
+    index: int
+    name: str
+    link_name: str
+    is_movable: bool
+
+
+class ContactPoint(NamedTuple):
+    """A contact of two bodies; vectors are in the world frame."""
+
+    body_a: int
+    body_b: int
+    link_a: int
+    link_b: int
+    position_on_b: tuple[float, float, float]  # [m]
+    normal_on_b: tuple[float, float, float]  # from b towards a
+    distance: float  # [m], negative where the bodies penetrate
+    normal_force: float  # [N]
+
+
+class BodyState(NamedTuple):
+    """Addresses of the state of a body, valid until the client's next command.
+
+    All are arrays of doubles in the world frame, with n joints of one degree of
+    freedom and m links:
+
+    Attributes:
+        q: base pose (7: position [m], quaternion xyzw), then n joint positions.
+        u: base velocity (6: linear [m/s], angular [rad/s]), then n joint velocities.
+        link_poses: (m, 7), of the centres of mass.
+        link_velocities: (m, 6), filled only if they were asked for.
+    """
+
+    q: int
+    u: int
+    link_poses: int
+    link_velocities: int
+
+    @property
+    def joint_positions(self) -> int:
+        """Address of the n joint positions [rad] or [m]."""
+        return self.q + _DOUBLE * _Q_OFFSET
+
+    @property
+    def joint_velocities(self) -> int:
+        """Address of the n joint velocities [rad/s] or [m/s]."""
+        return self.u + _DOUBLE * _U_OFFSET
+
+    def link_pose(self, link: int) -> int:
+        """Address of the pose (7) of a link."""
+        return self.link_poses + _DOUBLE * 7 * link
+
+    def link_velocity(self, link: int) -> int:
+        """Address of the velocity (6) of a link."""
+        return self.link_velocities + _DOUBLE * 6 * link
+
+
+def doubles(values: Sequence[float]) -> Array[c_double]:
+    """A C array of doubles."""
+    return (c_double * len(values))(*values)
+
+
+def find_urdf(path: str | Path) -> str:
+    """A URDF file by its path, or by its place among those pybullet ships.
+
+    Raises:
+        FileNotFoundError: there is no such file in either place.
+    """
+    spec = importlib.util.find_spec("pybullet_data")
+    assert spec is not None and spec.origin is not None  # part of pybullet's wheel
+    shipped = Path(spec.origin).parent
+    for candidate in (Path(path), shipped / path):
+        if candidate.is_file():
+            return str(candidate)
+    raise FileNotFoundError(f"no URDF file at {path}, nor at {shipped / path}")
+
+
+class PhysicsClient:
+    """One DIRECT client: a world of bodies, and the owner of its handle.
+
+    A client must be used by one thread at a time. Clients of one process are
+    independent: in different threads they step in parallel.
+
+    Methods that run in every step take and give addresses of doubles, for instance
+    of a row of a float64 tensor, so that no number passes through a Python object.
+
+    Args:
+        timestep: length of one step [s].
+        gravity: acceleration along the world's z axis [m/s^2].
+
+    Raises:
+        ImportError: the installed pybullet has another C API.
+    """
+
+    def __init__(self, *, timestep: float = 1 / 500, gravity: float = -9.81) -> None:
+        self._handle: int | None = _capi.connect_direct()
+        if not self._handle:
+            raise BulletError("Bullet could not create a DIRECT client")
+        # The last status code in use: it moves when another version adds one before.
+        try:
+            self.detect_collisions()
+        except BulletError as error:
+            self.close()
+            raise _capi.wrong_pybullet(f"its status codes differ: {error}") from None
+        command = _capi.physics_init(self._handle)
+        _capi.physics_set_timestep(command, timestep)
+        _capi.physics_set_gravity(command, 0.0, 0.0, gravity)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the world is gone."""
+        return self._handle is None
+
+    def close(self) -> None:
+        """Free the world. Closing again does nothing."""
+        if self._handle is not None:
+            _capi.disconnect(self._handle)
+            self._handle = None
+
+    def __enter__(self) -> "PhysicsClient":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __reduce__(self) -> "tuple[object, ...]":
+        raise TypeError("a PhysicsClient owns native memory and cannot be pickled")
+
+    # ---- building a world --------------------------------------------------------
+
+    def load_urdf(
+        self,
+        path: str | Path,
+        *,
+        position: Sequence[float] = _ORIGIN,
+        orientation: Sequence[float] = _NO_ROTATION,
+        fixed_base: bool = False,
+    ) -> int:
+        """Load a URDF without its visual shapes, and return its body id.
+
+        Args:
+            path: a file, or a name among those that pybullet ships.
+            position: of the base, world frame [m].
+            orientation: of the base, quaternion xyzw.
+            fixed_base: whether the base cannot move.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            BulletError: Bullet cannot read it.
+        """
+        command = _capi.urdf_init(self._open(), find_urdf(path).encode())
+        _capi.urdf_set_position(command, *position)
+        _capi.urdf_set_orientation(command, *orientation)
+        _capi.urdf_set_fixed_base(command, int(fixed_base))
+        _capi.urdf_set_flags(command, _capi.URDF_IGNORE_VISUAL_SHAPES)
+        status = self._submit(command, _capi.CMD_URDF_LOADING_COMPLETED, f"load {path}")
+        return _capi.status_body(status)
+
+    def create_box(
+        self, half_extents: Sequence[float], *, mass: float, position: Sequence[float]
+    ) -> int:
+        """Create a box and return its body id.
+
+        Args:
+            half_extents: along x, y and z [m].
+            mass: [kg]; 0 makes a body that never moves.
+            position: of its centre, world frame [m].
+        """
+        command = _capi.shape_init(self._open())
+        _capi.shape_add_box(command, doubles(half_extents))
+        return self._create_body(command, mass, position)
+
+    def create_cylinder(
+        self, radius: float, height: float, *, mass: float, position: Sequence[float]
+    ) -> int:
+        """Create an upright cylinder and return its body id; see `create_box`."""
+        command = _capi.shape_init(self._open())
+        _capi.shape_add_cylinder(command, radius, height)
+        return self._create_body(command, mass, position)
+
+    def create_sphere(
+        self, radius: float, *, mass: float, position: Sequence[float]
+    ) -> int:
+        """Create a sphere and return its body id; see `create_box`."""
+        command = _capi.shape_init(self._open())
+        _capi.shape_add_sphere(command, radius)
+        return self._create_body(command, mass, position)
+
+    def set_friction(
+        self,
+        body: int,
+        link: int = -1,
+        *,
+        lateral: float | None = None,
+        spinning: float | None = None,
+    ) -> None:
+        """Set friction coefficients of a link (-1 is the base); None leaves one."""
+        command = _capi.dynamics_init(self._open())
+        if lateral is not None:
+            _capi.dynamics_set_lateral_friction(command, body, link, lateral)
+        if spinning is not None:
+            _capi.dynamics_set_spinning_friction(command, body, link, spinning)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set friction")
+
+    def joints(self, body: int) -> list[Joint]:
+        """The joints of a body, in the order of its URDF."""
+        handle = self._open()
+        info = _capi.JointInfo()
+        joints = []
+        for index in range(_capi.joint_count(handle, body)):
+            _capi.joint_info(handle, body, index, byref(info))
+            name, link = info.joint_name.decode(), info.link_name.decode()
+            joints.append(Joint(index, name, link, info.u_size == 1))
+        return joints
+
+    # ---- moving it ---------------------------------------------------------------
+
+    def set_joints(
+        self, body: int, positions: int, velocities: int, count: int
+    ) -> None:
+        """Put the movable joints at a state.
+
+        Args:
+            body: the body.
+            positions: address of ``count`` positions [rad] or [m].
+            velocities: address of ``count`` velocities [rad/s] or [m/s].
+            count: number of movable joints.
+        """
+        command = _capi.pose_init(self._open(), body)
+        _capi.pose_set_joint_positions(command, count, positions)
+        _capi.pose_set_joint_velocities(self._handle, command, count, velocities)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set joints")
+
+    def set_base(
+        self,
+        body: int,
+        position: Sequence[float],
+        orientation: Sequence[float] = _NO_ROTATION,
+        linear_velocity: Sequence[float] = _ORIGIN,
+        angular_velocity: Sequence[float] = _ORIGIN,
+    ) -> None:
+        """Put a body somewhere, with a velocity, in the world frame.
+
+        Args:
+            body: the body.
+            position: of its centre of mass [m].
+            orientation: quaternion xyzw.
+            linear_velocity: [m/s].
+            angular_velocity: [rad/s].
+        """
+        command = _capi.pose_init(self._open(), body)
+        _capi.pose_set_linear_velocity(command, doubles(linear_velocity))
+        _capi.pose_set_angular_velocity(command, doubles(angular_velocity))
+        _capi.pose_set_position(command, *position)
+        _capi.pose_set_orientation(command, *orientation)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set a base pose")
+
+    def control_joints(self, body: int, targets: int, forces: Array[c_double]) -> None:
+        """Drive all movable joints to target positions.
+
+        Does what pybullet's ``setJointMotorControlArray`` does in position control.
+
+        Args:
+            body: the body.
+            targets: address of as many target positions as there are forces.
+            forces: the most each motor may exert [N m] or [N].
+        """
+        command = _capi.motor_init(
+            self._open(), body, _capi.CONTROL_MODE_POSITION_VELOCITY_PD
+        )
+        for first in range(0, len(forces), _MAX_DOF):
+            count = min(_MAX_DOF, len(forces) - first)
+            q, u = first + _Q_OFFSET, first + _U_OFFSET
+            _capi.motor_set_positions(command, q, targets + _DOUBLE * first, count)
+            _capi.motor_set_kp(command, u, _KP, count)
+            _capi.motor_set_velocities(command, u, _TARGET_VELOCITY, count)
+            _capi.motor_set_kd(command, u, _KD, count)
+            _capi.motor_set_forces(command, u, byref(forces, _DOUBLE * first), count)
+        self._submit(
+            command, _capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
+        )
+
+    def step(self, count: int = 1) -> None:
+        """Advance the world by ``count`` time steps."""
+        handle = self._open()
+        command = _capi.step_init(handle)
+        # A client has one command buffer, and stepping leaves it as it was: submitting
+        # it again steps again.
+        failed = _capi.repeat(handle, command, byref(c_size_t(count)), 0, _capi.submit)
+        if failed:
+            raise BulletError("Bullet could not step: it gave no answer")
+
+    def detect_collisions(self) -> None:
+        """Run collision detection without advancing time."""
+        self._submit(
+            _capi.detect_init(self._open()),
+            _capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED,
+            "detect collisions",
+        )
+
+    # ---- asking it ---------------------------------------------------------------
+
+    def inverse_kinematics(
+        self, body: int, link: int, position: int, orientation: int, result: int
+    ) -> None:
+        """Joint positions that bring a link to a pose, by damped least squares.
+
+        The default solver, because the others share a static work vector.
+
+        Args:
+            body: the body.
+            link: whose centre of mass is to be moved.
+            position: address of the target position (3), world frame [m].
+            orientation: address of the target quaternion (4), xyzw.
+            result: address that receives one position per movable joint.
+        """
+        command = _capi.ik_init(self._open(), body)
+        _capi.ik_set_target(command, link, position, orientation)
+        status = self._submit(
+            command,
+            _capi.CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED,
+            "solve the inverse kinematics",
+        )
+        _capi.ik_result(status, byref(c_int()), byref(c_int()), result)
+
+    def state(self, body: int, *, link_velocities: bool = False) -> BodyState:
+        """The state of a body's base, joints and links."""
+        command = _capi.state_init(self._open(), body)
+        if link_velocities:
+            _capi.state_want_link_velocity(command, 1)
+        status = self._submit(
+            command, _capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED, "report a state"
+        )
+        q, u, poses, velocities = c_void_p(), c_void_p(), c_void_p(), c_void_p()
+        _capi.state_result(
+            status,
+            None,
+            None,
+            None,
+            None,
+            None,
+            byref(q),
+            byref(u),
+            None,
+            None,
+            None,
+            byref(poses),
+            byref(velocities),
+        )
+        return BodyState(q.value, u.value, poses.value, velocities.value)  # type: ignore[arg-type]
+
+    def contact_points(
+        self, body_a: int | None = None, body_b: int | None = None
+    ) -> list[ContactPoint]:
+        """Contacts of the last step, of all bodies or of those given."""
+        command = _capi.contact_init(self._open())
+        if body_a is not None:
+            _capi.contact_set_body_a(command, body_a)
+        if body_b is not None:
+            _capi.contact_set_body_b(command, body_b)
+        self._submit(
+            command, _capi.CMD_CONTACT_POINT_INFORMATION_COMPLETED, "report contacts"
+        )
+        found = _capi.ContactInformation()
+        _capi.contact_result(self._handle, byref(found))
+        return [
+            ContactPoint(
+                point.body_a,
+                point.body_b,
+                point.link_a,
+                point.link_b,
+                tuple(point.position_on_b),
+                tuple(point.normal_on_b),
+                point.distance,
+                point.normal_force,
+            )
+            for point in found.points[: found.count]
+        ]
+
+    # ---- commands ----------------------------------------------------------------
+
+    def _open(self) -> int:
+        if self._handle is None:
+            raise BulletError("the physics client is closed")
+        return self._handle
+
+    def _submit(self, command: int, expected: int, action: str) -> int:
+        status = _capi.submit(self._open(), command)
+        self._check(status, expected, action)
+        return status
+
+    def _check(self, status: int | None, expected: int, action: str) -> None:
+        """Raise unless Bullet answered with the expected status code."""
+        code = _capi.status_type(status) if status else None
+        if code != expected:
+            raise BulletError(
+                f"Bullet could not {action}: it answered with status {code}, "
+                f"expected {expected}"
+            )
+
+    def _create_body(
+        self, shape_command: int, mass: float, position: Sequence[float]
+    ) -> int:
+        status = self._submit(
+            shape_command, _capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
+        )
+        shape = _capi.status_shape(status)
+        rotation, origin = doubles(_NO_ROTATION), doubles(_ORIGIN)
+        command = _capi.body_init(self._open())
+        _capi.body_set_base(
+            command, mass, shape, -1, doubles(position), rotation, origin, rotation
+        )
+        status = self._submit(
+            command, _capi.CMD_CREATE_MULTI_BODY_COMPLETED, "create a body"
+        )
+        return _capi.status_body(status)

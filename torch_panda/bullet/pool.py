@@ -1,0 +1,135 @@
+"""Threads that share out the clients of a vector step."""
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+
+Work = Callable[[int], None]
+
+
+class _Job:
+    """One parallel loop: indices that the threads draw from, and its outcome."""
+
+    def __init__(self, work: Work, indices: Sequence[int], num_threads: int) -> None:
+        self.work = work
+        # Drawing from an iterator over a sequence is atomic under the GIL.
+        self.indices: Iterator[int] = iter(indices)
+        self.errors: list[tuple[int, Exception]] = []
+        self.finished = threading.Event()
+        self._running = num_threads
+        self._lock = threading.Lock()
+
+    def take_part(self) -> None:
+        """Work until no index is left; the last thread to leave says so."""
+        for index in self.indices:
+            try:
+                self.work(index)
+            except Exception as error:
+                self.errors.append((index, error))
+        with self._lock:
+            self._running -= 1
+            is_last = self._running == 0
+        if is_last:
+            self.finished.set()
+
+
+class _Worker:
+    """A thread and the mailbox through which it gets jobs; None ends it."""
+
+    def __init__(self, name: str) -> None:
+        self._job: _Job | None = None
+        self._wake = threading.Semaphore(0)
+        # A daemon thread: it does not keep the interpreter alive.
+        self._thread = threading.Thread(target=self._loop, name=name, daemon=True)
+        self._thread.start()
+
+    def send(self, job: _Job | None) -> None:
+        self._job = job
+        self._wake.release()
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def _loop(self) -> None:
+        while True:
+            self._wake.acquire()
+            job, self._job = self._job, None
+            if job is None:
+                return
+            job.take_part()
+            # An idle thread must not keep the environment alive.
+            del job
+
+
+class WorkerError(RuntimeError):
+    """The work on one index failed; the work on the other indices was done."""
+
+    def __init__(self, index: int, error: Exception) -> None:
+        super().__init__(f"environment {index}: {type(error).__name__}: {error}")
+        self.index = index
+
+
+class WorkerPool:
+    """Persistent threads that run a function on many indices.
+
+    A thread that is done with an index draws the next one, so a slow client does not
+    hold back the clients that would have followed it.
+
+    Args:
+        num_threads: how many threads work at the same time.
+    """
+
+    def __init__(self, num_threads: int) -> None:
+        self.num_threads = num_threads
+        self._workers: list[_Worker] = []
+        self._process = os.getpid()
+        self._last_job: _Job | None = None
+
+    def run(self, work: Work, indices: Sequence[int]) -> None:
+        """Call ``work(index)`` for every index, and return when all are done.
+
+        An exception in the calling thread (Ctrl-C) is raised after the running work
+        is done, so that no client is left in the middle of a step.
+
+        Raises:
+            WorkerError: ``work`` raised; all other indices are done nevertheless.
+        """
+        self._wait()
+        self._start()
+        job = _Job(work, indices, self.num_threads)
+        self._last_job = job
+        for worker in self._workers:
+            worker.send(job)
+        try:
+            job.finished.wait()
+        finally:
+            self._wait()
+        if job.errors:
+            index, error = min(job.errors, key=lambda failed: failed[0])
+            raise WorkerError(index, error) from error
+
+    def close(self) -> None:
+        """End the threads. Closing again does nothing."""
+        self._wait()
+        workers, self._workers = self._workers, []
+        if self._process != os.getpid():
+            return  # a forked child: these threads live in its parent
+        for worker in workers:
+            worker.send(None)
+        for worker in workers:
+            worker.join()
+
+    def _wait(self) -> None:
+        """Wait until no thread touches a client, also after a second Ctrl-C."""
+        if self._last_job is not None and self._process == os.getpid():
+            self._last_job.finished.wait()
+        self._last_job = None
+
+    def _start(self) -> None:
+        if self._process != os.getpid():  # a forked child has no threads yet
+            self._process = os.getpid()
+            self._workers = []
+        if not self._workers:
+            self._workers = [
+                _Worker(f"torch_panda-{k}") for k in range(self.num_threads)
+            ]

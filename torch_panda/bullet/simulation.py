@@ -1,0 +1,229 @@
+"""Many copies of one scene, stepped in parallel."""
+
+import os
+from collections.abc import Callable, Sequence
+from ctypes import memmove
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
+from torch_panda.bullet.pool import WorkerPool
+
+ControlType = Literal["ee", "joints"]
+
+TIMESTEP = 1 / 500  # [s], panda-gym 3.0.7
+N_SUBSTEPS = 20  # so 25 Hz, as the paper
+GRAVITY = -9.81  # [m/s^2]
+
+_DOUBLE = 8  # bytes
+# Where objects wait while contacts are forgotten: apart from all, and from each other.
+_FAR_AWAY = 1000.0  # [m]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a simulation drives and reads; the same ids in every client.
+
+    Attributes:
+        robot: body id of the robot.
+        ee_link: its link whose centre of mass is the end-effector.
+        ee_orientation: quaternion xyzw that inverse kinematics aims at, world frame.
+        num_arm_joints: how many of its joints, the first ones, inverse kinematics sets.
+        joint_forces: the most each movable joint's motor may exert [N m] or [N].
+        objects: body ids of the movable objects.
+    """
+
+    robot: int
+    ee_link: int
+    ee_orientation: tuple[float, float, float, float]
+    num_arm_joints: int
+    joint_forces: tuple[float, ...]
+    objects: tuple[int, ...]
+
+
+class VectorSimulation:
+    """``num_envs`` clients that hold the same scene, and the threads that step them.
+
+    The state of all clients lies in float64 tensors that `step` and `reset`
+    overwrite in place; copy what is to be kept. Positions are of centres of mass, in
+    the world frame.
+
+    Args:
+        build: builds the scene in a client; called once per client, in one thread.
+        num_envs: number of clients.
+        num_threads: number of threads; None means one per core, at most ``num_envs``.
+        timestep: length of one substep [s].
+        n_substeps: substeps per step.
+        gravity: along z [m/s^2].
+
+    Attributes:
+        joint_position: (num_envs, n_joints) [rad] or [m].
+        joint_velocity: (num_envs, n_joints) [rad/s] or [m/s].
+        ee_position: (num_envs, 3) [m].
+        ee_velocity: (num_envs, 3) [m/s].
+        object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
+        object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
+        joint_target: (num_envs, n_joints), what `step` drives the joints to.
+        ee_target: (num_envs, 3) [m], what `step` solves the arm's targets for when
+            the control type is "ee".
+    """
+
+    def __init__(
+        self,
+        build: Callable[[PhysicsClient], Scene],
+        num_envs: int,
+        *,
+        num_threads: int | None = None,
+        timestep: float = TIMESTEP,
+        n_substeps: int = N_SUBSTEPS,
+        gravity: float = GRAVITY,
+    ) -> None:
+        if num_threads is None:
+            num_threads = os.cpu_count() or 1
+        self.n_substeps = n_substeps
+        self.dt = timestep * n_substeps
+        self._clients: list[PhysicsClient] = []
+        self._pool = WorkerPool(min(num_threads, num_envs))
+        try:
+            for _ in range(num_envs):
+                client = PhysicsClient(timestep=timestep, gravity=gravity)
+                self._clients.append(client)
+                scene = build(client)
+                if client is self._clients[0]:
+                    self.scene = scene
+                elif scene != self.scene:
+                    raise BulletError(
+                        f"the scene must be the same in every client, got {scene} "
+                        f"after {self.scene}"
+                    )
+            self._allocate()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def num_envs(self) -> int:
+        """Number of clients."""
+        return len(self._clients)
+
+    @property
+    def num_threads(self) -> int:
+        """Number of threads that step them."""
+        return self._pool.num_threads
+
+    def step(
+        self, control_type: ControlType, envs: Sequence[int] | None = None
+    ) -> None:
+        """Control the joints, advance time and read the state.
+
+        Args:
+            control_type: "joints" drives the joints to ``joint_target``; "ee" first
+                replaces the arm's targets by the inverse kinematics of ``ee_target``.
+            envs: which clients; None means all.
+
+        Raises:
+            WorkerError: Bullet failed in one client; it names the client.
+        """
+        work = self._step_ee if control_type == "ee" else self._step_joints
+        self._pool.run(work, range(self.num_envs) if envs is None else envs)
+
+    def reset(self, envs: Sequence[int]) -> None:
+        """Start an episode from what the state tensors hold for these clients.
+
+        Bullet remembers the contacts of the last episode. They are forgotten when all
+        objects are out of reach for one collision detection, so that what follows
+        depends on the start state and the actions alone.
+
+        Raises:
+            WorkerError: Bullet failed in one client; it names the client.
+        """
+        self._pool.run(self._reset_one, envs)
+
+    def close(self) -> None:
+        """Free all clients and end the threads. Closing again does nothing."""
+        self._pool.close()
+        for client in self._clients:
+            client.close()
+
+    def _allocate(self) -> None:
+        n, scene = self.num_envs, self.scene
+        n_joints, n_objects = len(scene.joint_forces), len(scene.objects)
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(n, *shape, dtype=torch.float64)
+
+        self.joint_position, self.joint_velocity = zeros(n_joints), zeros(n_joints)
+        self.joint_target = zeros(n_joints)
+        self.ee_position, self.ee_velocity = zeros(3), zeros(3)
+        self.ee_target = zeros(3)
+        self.object_pose, self.object_velocity = (
+            zeros(n_objects, 7),
+            zeros(n_objects, 6),
+        )
+        self._ik_result = zeros(n_joints)
+        self._forces = doubles(scene.joint_forces)
+        self._ee_orientation = torch.tensor(scene.ee_orientation, dtype=torch.float64)
+
+    def _step_ee(self, env: int) -> None:
+        scene = self.scene
+        solution = _row(self._ik_result, env)
+        self._clients[env].inverse_kinematics(
+            scene.robot,
+            scene.ee_link,
+            _row(self.ee_target, env),
+            self._ee_orientation.data_ptr(),
+            solution,
+        )
+        memmove(_row(self.joint_target, env), solution, _DOUBLE * scene.num_arm_joints)
+        self._step_joints(env)
+
+    def _step_joints(self, env: int) -> None:
+        client = self._clients[env]
+        client.control_joints(
+            self.scene.robot, _row(self.joint_target, env), self._forces
+        )
+        client.step(self.n_substeps)
+        self._read(env)
+
+    def _reset_one(self, env: int) -> None:
+        client, scene = self._clients[env], self.scene
+        for k, body in enumerate(scene.objects):
+            client.set_base(body, (0.0, _FAR_AWAY * k, _FAR_AWAY))
+        client.detect_collisions()
+        client.set_joints(
+            scene.robot,
+            _row(self.joint_position, env),
+            _row(self.joint_velocity, env),
+            len(scene.joint_forces),
+        )
+        poses = self.object_pose[env].tolist()
+        velocities = self.object_velocity[env].tolist()
+        for body, pose, velocity in zip(scene.objects, poses, velocities, strict=True):
+            client.set_base(body, pose[:3], pose[3:], velocity[:3], velocity[3:])
+        self._read(env)
+
+    def _read(self, env: int) -> None:
+        """Copy the state of one client into the tensors."""
+        client, scene = self._clients[env], self.scene
+        state = client.state(scene.robot, link_velocities=True)
+        size = _DOUBLE * len(scene.joint_forces)
+        memmove(_row(self.joint_position, env), state.joint_positions, size)
+        memmove(_row(self.joint_velocity, env), state.joint_velocities, size)
+        position, velocity = _row(self.ee_position, env), _row(self.ee_velocity, env)
+        memmove(position, state.link_pose(scene.ee_link), _DOUBLE * 3)
+        memmove(velocity, state.link_velocity(scene.ee_link), _DOUBLE * 3)
+        pose, velocity = _row(self.object_pose, env), _row(self.object_velocity, env)
+        for body in scene.objects:
+            state = client.state(body)
+            memmove(pose, state.q, _DOUBLE * 7)
+            memmove(velocity, state.u, _DOUBLE * 6)
+            pose += _DOUBLE * 7
+            velocity += _DOUBLE * 6
+
+
+def _row(tensor: Tensor, env: int) -> int:
+    """Address of one environment's part of a contiguous float64 tensor."""
+    return tensor.data_ptr() + _DOUBLE * tensor.stride(0) * env

@@ -1,0 +1,355 @@
+"""A robot and a task, as one batched TorchRL environment."""
+
+import functools
+import operator
+import secrets
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torch_panda.bullet import BulletError, PhysicsClient, Scene, VectorSimulation
+from torch_panda.envs.state import read_state
+from torch_panda.robots import Robot
+from torch_panda.tasks import Task
+from torch_panda.tasks.base import RewardFunction
+
+
+class RobotTaskEnv(EnvBase):
+    """Goal-conditioned environments of one robot and one task, stepped in parallel.
+
+    What an environment draws depends on (``seed``, its index, the number of its
+    episode) only, and an episode on what is drawn and on the actions only.
+
+    A step takes ``action``, float32 in [-1, 1] (values beyond are clipped), and gives
+    under ``next``: ``observation``, ``achieved_goal``, ``desired_goal`` (float32),
+    ``success``, ``terminated``, ``truncated`` and ``done`` (bool) and ``reward``
+    (float32), the last five of shape (*batch, 1).
+
+    Args:
+        robot: the robot.
+        task: the task.
+        num_envs: number of environments: the batch size is [num_envs]; None makes one
+            environment of batch size [].
+        num_threads: threads that step them; None means one per core, at most
+            ``num_envs``.
+        seed: of all random draws; None takes one from the operating system.
+        device: where the outputs are placed; None means the CPU. Physics and states
+            stay on the CPU.
+        max_episode_steps: steps until ``truncated``; None means the task's number.
+        terminate_on_success: whether success ends an episode, as in panda-gym 3; the
+            paper's episodes go on.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        *,
+        robot: Robot,
+        task: Task,
+        num_envs: int | None = None,
+        num_threads: int | None = None,
+        seed: int | None = None,
+        device: torch.device | str | int | None = None,
+        max_episode_steps: int | None = None,
+        terminate_on_success: bool = False,
+    ) -> None:
+        _check_positive(num_envs=num_envs, num_threads=num_threads)
+        _check_positive(max_episode_steps=max_episode_steps)
+        batch_size = () if num_envs is None else (num_envs,)
+        super().__init__(
+            device="cpu" if device is None else device, batch_size=batch_size
+        )
+        self.robot = robot
+        self.task = task
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps or task.max_episode_steps
+        self.terminate_on_success = terminate_on_success
+        self._make_specs()
+        self._constructor_seed = seed
+        self._set_seed(seed)
+        count = num_envs or 1
+        self._step_count = torch.zeros(count, 1, dtype=torch.int64)
+        self._goal = torch.zeros(count, task.goal_dim, dtype=torch.float64)
+        self._simulation = VectorSimulation(
+            self._build_scene, count, num_threads=num_threads
+        )
+        # EnvBase closes a forgotten environment only if this is its own attribute.
+        self.is_closed = False
+
+    @property
+    def num_threads(self) -> int:
+        """Number of threads that step the environments."""
+        return self._simulation.num_threads
+
+    @property
+    def compute_reward(self) -> RewardFunction:
+        """The task's pure reward function; see `Task.compute_reward`."""
+        return self.task.compute_reward
+
+    @property
+    def is_success(self) -> RewardFunction:
+        """The task's pure success function; see `Task.is_success`."""
+        return self.task.is_success
+
+    def get_state(self) -> TensorDict:
+        """The physical state, from which ``reset(state, set_state=True)`` starts.
+
+        Returns:
+            ``joint_position`` and ``joint_velocity`` (*batch, n_joints),
+            ``object_pose`` (*batch, n_objects, 7), ``object_velocity`` (*batch,
+            n_objects, 6), ``desired_goal`` (*batch, goal_dim), all float64, and
+            ``step_count`` (*batch, 1), int64.
+
+        Raises:
+            BulletError: the environment is closed.
+        """
+        state = self._current_state()
+        values = {key: self._emit(value.clone()) for key, value in state.items()}
+        return TensorDict(values, batch_size=self.batch_size, device=self.device)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free all clients and threads. Closing again does nothing."""
+        if not self.is_closed:
+            super().close(raise_if_closed=raise_if_closed)
+            self._simulation.close()
+
+    def __enter__(self) -> "RobotTaskEnv":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Physics cannot be copied: a pickle holds how to build the environment anew.
+        build = functools.partial(
+            type(self),
+            robot=self.robot,
+            task=self.task,
+            num_envs=self.num_envs,
+            num_threads=self.num_threads,
+            seed=self._constructor_seed,
+            device=self.device,
+            max_episode_steps=self.max_episode_steps,
+            terminate_on_success=self.terminate_on_success,
+        )
+        return build, ()
+
+    # ---- what torchrl calls ------------------------------------------------------
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._check_open()
+        action = self._read_action(tensordict)
+        stepped = self._read_mask(tensordict, "_step")
+        self.robot.set_action(action, self._simulation)
+        self._step_count += 1 if stepped is None else stepped
+        envs = None if stepped is None else _indices(stepped)
+        self._simulation.step(self.robot.control_type, envs)
+
+        observation = self._observe()
+        reward = self.compute_reward(
+            observation["achieved_goal"], observation["desired_goal"]
+        )
+        if stepped is not None:
+            reward = reward * stepped
+        return self._make_tensordict({**observation, "reward": reward})
+
+    def _reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        set_state: bool | None = None,
+        **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
+    ) -> TensorDict:
+        self._check_open()
+        state = self._current_state()
+        mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
+        envs = list(range(len(self._goal))) if mask is None else _indices(mask)
+        if set_state and tensordict is not None:
+            given = read_state(tensordict, like=state, envs=envs)
+        else:
+            given = {}
+        for env in envs:
+            self._start_episode(env)
+        for key, value in given.items():
+            state[key][envs] = value
+        self._simulation.reset(envs)
+        return self._make_tensordict(self._observe())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            # Different in every process, also in those that unpickle this environment.
+            seed = secrets.randbits(63)
+        elif operator.index(seed) < 0:
+            raise ValueError(f"seed must be a non-negative integer, got {seed}")
+        self._seed = operator.index(seed)
+        self._episodes = [0] * (self.num_envs or 1)
+
+    # ---- parts of a step -----------------------------------------------------------
+
+    def _build_scene(self, client: PhysicsClient) -> Scene:
+        robot = self.robot.build(client)
+        return Scene(
+            robot=robot,
+            ee_link=self.robot.ee_link,
+            ee_orientation=self.robot.ee_orientation,
+            num_arm_joints=self.robot.num_arm_joints,
+            joint_forces=self.robot.joint_forces,
+            objects=self.task.build(client),
+        )
+
+    def _start_episode(self, env: int) -> None:
+        """Put the start of an environment's next episode into the state tensors."""
+        simulation = self._simulation
+        rng = np.random.default_rng((self._seed, env, self._episodes[env]))
+        self._episodes[env] += 1
+        self._step_count[env] = 0
+        self._goal[env] = torch.as_tensor(self.task.sample_goal(rng))
+        simulation.joint_position[env] = torch.tensor(
+            self.robot.neutral_joint_position, dtype=torch.float64
+        )
+        simulation.joint_velocity[env] = 0.0
+        if self.task.num_objects:
+            simulation.object_pose[env] = torch.as_tensor(
+                self.task.sample_objects(rng), dtype=torch.float64
+            )
+            simulation.object_velocity[env] = 0.0
+
+    def _observe(self) -> dict[str, Tensor]:
+        """Observation, goals, success and ends, (n, ...), in new tensors."""
+        simulation = self._simulation
+        observation = torch.cat(
+            (self.robot.observation(simulation), self.task.observation(simulation)),
+            dim=1,
+        )
+        achieved_goal = self.task.achieved_goal(simulation).float()
+        desired_goal = self._goal.float()
+        success = self.is_success(achieved_goal, desired_goal)
+        started = self._step_count > 0
+        truncated = self._step_count >= self.max_episode_steps
+        terminated = success & started & self.terminate_on_success
+        return {
+            "observation": observation.float(),
+            "achieved_goal": achieved_goal,
+            "desired_goal": desired_goal,
+            "success": success,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+
+    def _current_state(self) -> dict[str, Tensor]:
+        """The tensors that hold the physical state, (n, ...); not copies."""
+        self._check_open()
+        simulation = self._simulation
+        return {
+            "joint_position": simulation.joint_position,
+            "joint_velocity": simulation.joint_velocity,
+            "object_pose": simulation.object_pose,
+            "object_velocity": simulation.object_velocity,
+            "desired_goal": self._goal,
+            "step_count": self._step_count,
+        }
+
+    # ---- tensors in and out ----------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        batch, device = self.batch_size, self.device
+
+        def numbers(size: int) -> Unbounded:
+            return Unbounded((*batch, size), device=device, dtype=torch.float32)
+
+        def flag() -> Binary:
+            return Binary(shape=(*batch, 1), device=device, dtype=torch.bool)
+
+        size = self.robot.observation_dim + self.task.observation_dim
+        self.observation_spec = Composite(
+            observation=numbers(size),
+            achieved_goal=numbers(self.task.goal_dim),
+            desired_goal=numbers(self.task.goal_dim),
+            success=flag(),
+            shape=batch,
+            device=device,
+        )
+        self.action_spec = Bounded(
+            low=-1.0,
+            high=1.0,
+            shape=(*batch, self.robot.action_dim),
+            device=device,
+            dtype=torch.float32,
+        )
+        self.reward_spec = numbers(1)
+        self.done_spec = Composite(
+            done=flag(), terminated=flag(), truncated=flag(), shape=batch, device=device
+        )
+
+    def _read_action(self, tensordict: TensorDictBase) -> Tensor:
+        """The clipped action on the CPU: (n, action_dim) float32."""
+        action = tensordict.get("action", None)
+        shape = tuple(self.action_spec.shape)
+        if not isinstance(action, Tensor):
+            raise ValueError(f"the action must be a tensor of shape {shape}, got none")
+        if tuple(action.shape) != shape:
+            raise ValueError(
+                f"the action must have shape {shape}, got {tuple(action.shape)}"
+            )
+        if not action.dtype.is_floating_point:
+            raise TypeError(f"the action must be float32, got {action.dtype}")
+        if action.device.type != self.device.type:
+            raise ValueError(
+                f"the action must be on device {self.device}, got {action.device}"
+            )
+        action = action.detach().to("cpu", torch.float32).reshape(-1, shape[-1])
+        finite = action.isfinite().all(dim=1)
+        if not finite.all():
+            env = int((~finite).nonzero()[0])
+            raise ValueError(
+                f"the action of environment {env} is not finite: {action[env].tolist()}"
+            )
+        return action.clamp(-1.0, 1.0)
+
+    def _read_mask(self, tensordict: TensorDictBase, key: str) -> Tensor | None:
+        """A mask of environments, (n, 1) bool; None where there is none."""
+        mask = tensordict.get(key, None)
+        if mask is None:
+            return None
+        return mask.to("cpu").reshape(len(self._goal), 1)
+
+    def _emit(self, value: Tensor) -> Tensor:
+        """Shape (n, ...) to (*batch, ...), on the environment's device."""
+        return value.reshape(*self.batch_size, *value.shape[1:]).to(self.device)
+
+    def _make_tensordict(self, values: dict[str, Tensor]) -> TensorDict:
+        return TensorDict(
+            {key: self._emit(value) for key, value in values.items()},
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise BulletError("the environment is closed")
+
+
+def _indices(mask: Tensor) -> list[int]:
+    return mask.flatten().nonzero().flatten().tolist()
+
+
+def _check_positive(**arguments: int | None) -> None:
+    for name, value in arguments.items():
+        if value is not None and operator.index(value) < 1:
+            raise ValueError(f"{name} must be at least 1 or None, got {value}")

@@ -1,0 +1,49 @@
+"""Reading a start state that a user gives."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+_QUATERNION_TOLERANCE = 1e-3
+
+
+def read_state(
+    tensordict: TensorDictBase, *, like: dict[str, Tensor], envs: list[int]
+) -> dict[str, Tensor]:
+    """Check the state entries of a tensordict, and return those that are there.
+
+    Args:
+        tensordict: of the environment's batch size; other entries are ignored.
+        like: the environment's own state, (n, ...).
+        envs: which environments are to start from it.
+
+    Returns:
+        Entries of (len(envs), ...), in the dtypes of ``like``.
+
+    Raises:
+        ValueError: an entry has a wrong shape, is not finite, or holds no rotation.
+    """
+    state = {}
+    for key, own in like.items():
+        value = tensordict.get(key, None)
+        if value is None:
+            continue
+        shape = (*tensordict.batch_size, *own.shape[1:])
+        if tuple(value.shape) != shape:
+            raise ValueError(f"{key} must have shape {shape}, got {tuple(value.shape)}")
+        value = value.detach().to("cpu", own.dtype).reshape(own.shape)[envs]
+        _check_rows(key, value.isfinite(), envs, "finite")
+        if key == "object_pose":
+            norm = torch.linalg.vector_norm(value[..., 3:], dim=-1)
+            is_unit = (norm - 1).abs() < _QUATERNION_TOLERANCE
+            _check_rows(key, is_unit, envs, "a position and a unit quaternion")
+        if key == "step_count":
+            _check_rows(key, value >= 0, envs, "at least 0")
+        state[key] = value
+    return state
+
+
+def _check_rows(key: str, is_right: Tensor, envs: list[int], wanted: str) -> None:
+    wrong = (~is_right).flatten(1).any(dim=1).nonzero()
+    if len(wrong):
+        raise ValueError(f"{key} of environment {envs[int(wrong[0])]} must be {wanted}")

@@ -1,0 +1,119 @@
+"""A robot arm on a fixed base."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import ControlType, PhysicsClient, VectorSimulation
+
+# An action of 1 moves the end-effector by this [m], or a joint by this [rad].
+ACTION_SCALE = 0.05
+
+
+class Robot:
+    """A robot arm on a fixed base, described by a URDF.
+
+    It is usable as it stands for an arm without a gripper; a gripper takes a subclass
+    (see `Panda`). One description serves all clients of a simulation.
+
+    Args:
+        urdf: a file, or its name among those that pybullet ships.
+        neutral_joint_position: where every movable joint starts [rad] or [m].
+        joint_forces: the most each movable joint's motor may exert [N m] or [N].
+        ee_link: index of the link whose centre of mass is the end-effector.
+        ee_orientation: quaternion xyzw that the end-effector keeps, world frame.
+        num_arm_joints: how many movable joints, the first ones, are the arm; None
+            means all.
+        control_type: "ee": an action displaces the end-effector along x, y, z;
+            "joints": it displaces the arm's joints.
+        base_position: of the base, world frame [m].
+    """
+
+    def __init__(
+        self,
+        *,
+        urdf: str | Path,
+        neutral_joint_position: Sequence[float],
+        joint_forces: Sequence[float],
+        ee_link: int,
+        ee_orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+        num_arm_joints: int | None = None,
+        control_type: ControlType = "ee",
+        base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+    ) -> None:
+        if control_type not in get_args(ControlType):
+            raise ValueError(
+                f"control_type must be one of {get_args(ControlType)}, "
+                f"got {control_type!r}"
+            )
+        if len(neutral_joint_position) != len(joint_forces):
+            raise ValueError(
+                f"neutral_joint_position and joint_forces must name the same joints, "
+                f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
+            )
+        self.urdf = urdf
+        self.neutral_joint_position = tuple(map(float, neutral_joint_position))
+        self.joint_forces = tuple(map(float, joint_forces))
+        self.ee_link = ee_link
+        x, y, z, w = ee_orientation
+        self.ee_orientation = (float(x), float(y), float(z), float(w))
+        self.num_arm_joints = num_arm_joints or len(self.joint_forces)
+        self.control_type: ControlType = control_type
+        self.base_position = tuple(map(float, base_position))
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action entries."""
+        return 3 if self.control_type == "ee" else self.num_arm_joints
+
+    @property
+    def observation_dim(self) -> int:
+        """Number of entries of its part of the observation."""
+        return 6
+
+    def build(self, client: PhysicsClient) -> int:
+        """Load the robot into a client and return its body id.
+
+        Raises:
+            FileNotFoundError: the URDF does not exist.
+            ValueError: the URDF has another number of movable joints.
+        """
+        body = client.load_urdf(self.urdf, position=self.base_position, fixed_base=True)
+        joints = client.joints(body)
+        movable = [joint.name for joint in joints if joint.is_movable]
+        if len(movable) != len(self.joint_forces):
+            raise ValueError(
+                f"{self.urdf} has {len(movable)} movable joints {movable}, but "
+                f"joint_forces has {len(self.joint_forces)} values"
+            )
+        if not 0 <= self.ee_link < len(joints):
+            raise ValueError(
+                f"ee_link must be a link of {self.urdf}, 0 to {len(joints) - 1}, "
+                f"got {self.ee_link}"
+            )
+        return body
+
+    def set_action(self, action: Tensor, simulation: VectorSimulation) -> None:
+        """Turn actions into the targets of the next step.
+
+        Args:
+            action: (num_envs, action_dim) float32 in [-1, 1].
+            simulation: whose ``ee_target`` or ``joint_target`` is set.
+        """
+        if self.control_type == "ee":
+            target = simulation.ee_target
+            torch.add(simulation.ee_position, action[:, :3] * ACTION_SCALE, out=target)
+            # The end-effector must not be sent below the table.
+            target[:, 2].clamp_(min=0.0)
+        else:
+            arm = self.num_arm_joints
+            simulation.joint_target[:, :arm] = (
+                simulation.joint_position[:, :arm] + action[:, :arm] * ACTION_SCALE
+            )
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """End-effector position [m] and velocity [m/s]: (num_envs, 6), float64."""
+        return torch.cat((simulation.ee_position, simulation.ee_velocity), dim=1)

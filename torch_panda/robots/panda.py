@@ -1,0 +1,95 @@
+"""The Franka Emika Panda arm with its gripper."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import ControlType, PhysicsClient, VectorSimulation
+from torch_panda.robots.base import Robot
+
+# All numbers from panda-gym 3.0.7.
+NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
+JOINT_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
+EE_LINK = 11
+FINGER_LINKS = (9, 10)
+FINGER_LATERAL_FRICTION = 1.0
+FINGER_SPINNING_FRICTION = 0.001
+# An action of 1 opens the fingers by this much [m].
+GRIPPER_SCALE = 0.2
+
+
+class Panda(Robot):
+    """The Franka Emika Panda arm: 7 joints and two fingers.
+
+    Actions are 3 displacements of the end-effector or 7 of the joints, and one of the
+    fingers unless the gripper is blocked. Observations are the end-effector's position
+    [m] and velocity [m/s], and the distance between the fingers [m] unless the gripper
+    is blocked.
+
+    Args:
+        control_type: "ee" or "joints".
+        block_gripper: keep the gripper closed.
+        base_position: of the base, world frame [m].
+    """
+
+    def __init__(
+        self,
+        *,
+        control_type: ControlType = "ee",
+        block_gripper: bool = False,
+        base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+    ) -> None:
+        super().__init__(
+            urdf="franka_panda/panda.urdf",
+            neutral_joint_position=NEUTRAL_JOINT_POSITION,
+            joint_forces=JOINT_FORCES,
+            ee_link=EE_LINK,
+            num_arm_joints=7,
+            control_type=control_type,
+            base_position=base_position,
+        )
+        self.block_gripper = block_gripper
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action entries."""
+        return super().action_dim + (not self.block_gripper)
+
+    @property
+    def observation_dim(self) -> int:
+        """Number of entries of its part of the observation."""
+        return super().observation_dim + (not self.block_gripper)
+
+    def build(self, client: PhysicsClient) -> int:
+        """Load the arm, and let its fingers grip."""
+        body = super().build(client)
+        for link in FINGER_LINKS:
+            client.set_friction(
+                body,
+                link,
+                lateral=FINGER_LATERAL_FRICTION,
+                spinning=FINGER_SPINNING_FRICTION,
+            )
+        return body
+
+    def set_action(self, action: Tensor, simulation: VectorSimulation) -> None:
+        """Turn actions into targets; see `Robot.set_action`."""
+        super().set_action(action, simulation)
+        fingers = simulation.joint_target[:, self.num_arm_joints :]
+        if self.block_gripper:
+            fingers.zero_()
+        else:
+            width = self.fingers_width(simulation) + action[:, -1:] * GRIPPER_SCALE
+            fingers.copy_(width / 2)
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""
+        observation = super().observation(simulation)
+        if self.block_gripper:
+            return observation
+        return torch.cat((observation, self.fingers_width(simulation)), dim=1)
+
+    def fingers_width(self, simulation: VectorSimulation) -> Tensor:
+        """Distance between the fingers [m]: (num_envs, 1), float64."""
+        return simulation.joint_position[:, self.num_arm_joints :].sum(1, keepdim=True)

@@ -1,0 +1,169 @@
+"""A goal-conditioned task."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+
+RewardType = Literal["sparse", "dense"]
+# (achieved_goal, desired_goal), both (..., goal_dim), to (..., 1).
+RewardFunction = Callable[[Tensor, Tensor], Tensor]
+
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+# panda-gym's table; its top is the plane z = 0.
+TABLE_LENGTH = 1.1  # [m], along x
+TABLE_X_OFFSET = -0.3  # [m], of its centre
+TABLE_WIDTH = 0.7  # [m]
+TABLE_HEIGHT = 0.4  # [m]
+
+
+class Task(ABC):
+    """What is to be done: scene, goals, observation, success, reward.
+
+    One description serves all clients of a simulation. Sampling is done for one
+    episode of one environment with its own random generator; all else is batched over
+    the state tensors of the simulation. Lengths are in metres, in the world frame.
+
+    A task sets ``goal_dim``, ``observation_dim``, ``num_objects`` and, unless it is 50,
+    ``max_episode_steps``.
+
+    Args:
+        reward_type: "sparse": 0 on success and -1 otherwise; "dense": -distance.
+        distance_threshold: success is a distance below it.
+    """
+
+    goal_dim: int
+    observation_dim: int
+    num_objects: int
+    max_episode_steps: int = 50
+
+    def __init__(
+        self, *, reward_type: RewardType = "sparse", distance_threshold: float = 0.05
+    ) -> None:
+        if reward_type not in get_args(RewardType):
+            raise ValueError(
+                f"reward_type must be one of {get_args(RewardType)}, "
+                f"got {reward_type!r}"
+            )
+        self.reward_type = reward_type
+        self.distance_threshold = distance_threshold
+
+    @abstractmethod
+    def build(self, client: PhysicsClient) -> tuple[int, ...]:
+        """Build the scene in a client and return the ids of the movable objects."""
+
+    @abstractmethod
+    def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
+        """Draw a goal: (goal_dim,)."""
+
+    def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
+        """Draw start poses: (num_objects, 7), position and quaternion xyzw."""
+        return ()
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """The task's part of the observation: (num_envs, observation_dim), float64."""
+        return torch.zeros(simulation.num_envs, 0, dtype=torch.float64)
+
+    @abstractmethod
+    def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
+        """What has been achieved: (num_envs, goal_dim), float64."""
+
+    def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """How far the goal is, (..., 1); minus this is the dense reward."""
+        return torch.linalg.vector_norm(
+            achieved_goal - desired_goal, dim=-1, keepdim=True
+        )
+
+    def success_distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """What is compared with ``distance_threshold``, (..., 1)."""
+        return self.distance(achieved_goal, desired_goal)
+
+    def is_success(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Whether the goal is reached.
+
+        A pure function on any device, without a simulator.
+
+        Args:
+            achieved_goal: (..., goal_dim).
+            desired_goal: (..., goal_dim).
+
+        Returns:
+            (..., 1), bool.
+
+        Raises:
+            ValueError: a last dimension is not ``goal_dim``.
+        """
+        self._check_goals(achieved_goal, desired_goal)
+        distance = self.success_distance(achieved_goal, desired_goal)
+        return distance < self.distance_threshold
+
+    def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The reward for an achieved goal; see `is_success`.
+
+        Returns:
+            (..., 1), float32.
+        """
+        self._check_goals(achieved_goal, desired_goal)
+        if self.reward_type == "dense":
+            return -self.distance(achieved_goal, desired_goal).float()
+        distance = self.success_distance(achieved_goal, desired_goal)
+        return (distance > self.distance_threshold).float().neg()
+
+    def _check_goals(self, achieved_goal: Tensor, desired_goal: Tensor) -> None:
+        shapes = tuple(achieved_goal.shape), tuple(desired_goal.shape)
+        if any(shape[-1:] != (self.goal_dim,) for shape in shapes):
+            raise ValueError(
+                f"achieved_goal and desired_goal must have shape "
+                f"(..., {self.goal_dim}), got {shapes[0]} and {shapes[1]}"
+            )
+
+
+def create_table(
+    client: PhysicsClient,
+    *,
+    length: float = TABLE_LENGTH,
+    x_offset: float = TABLE_X_OFFSET,
+) -> None:
+    """Create the ground, and a table centred at x = ``x_offset`` [m]."""
+    client.create_box(
+        (3.0, 3.0, 0.01), mass=0.0, position=(0.0, 0.0, -TABLE_HEIGHT - 0.01)
+    )
+    client.create_box(
+        (length / 2, TABLE_WIDTH / 2, TABLE_HEIGHT / 2),
+        mass=0.0,
+        position=(x_offset, 0.0, -TABLE_HEIGHT / 2),
+    )
+
+
+def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
+    """Position, Euler angles [rad] and velocity of an object: (num_envs, 12)."""
+    pose = simulation.object_pose[:, index]  # (num_envs, 7)
+    velocity = simulation.object_velocity[:, index]  # (num_envs, 6)
+    return torch.cat((pose[:, :3], quaternion_to_euler(pose[:, 3:]), velocity), dim=1)
+
+
+def quaternion_to_euler(quaternion: Tensor) -> Tensor:
+    """Roll, pitch and yaw [rad] of quaternions xyzw: (..., 4) -> (..., 3).
+
+    As pybullet's ``getEulerFromQuaternion``: near a pitch of 90 degrees, where only the
+    sum or difference of the others is defined, roll is 0.
+    """
+    x, y, z, w = quaternion.unbind(-1)
+    sine = -2 * (x * z - w * y)
+    roll = torch.atan2(2 * (y * z + w * x), w * w - x * x - y * y + z * z)
+    pitch = torch.asin(sine.clamp(-1.0, 1.0))
+    yaw = torch.atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
+    up, down = sine >= 0.99999, sine <= -0.99999
+    vertical = up | down
+    side = torch.where(up, 1.0, -1.0)
+    roll = torch.where(vertical, 0.0, roll)
+    pitch = torch.where(vertical, side * (math.pi / 2), pitch)
+    yaw = torch.where(vertical, 2 * torch.atan2(-side * x, side * y), yaw)
+    return torch.stack((roll, pitch, yaw), dim=-1)

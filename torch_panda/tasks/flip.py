@@ -1,0 +1,66 @@
+"""Flip: turn a cube to an orientation."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.tasks.base import NO_ROTATION, RewardType, Task, create_table
+from torch_panda.tasks.push import CUBE_SIZE, create_cube, sample_on_table
+
+
+class Flip(Task):
+    """Turn a cube to an orientation, wherever it lies.
+
+    Goals are unit quaternions xyzw. The distance of two is 1 - <q, q'>^2, the squared
+    sine of half the angle between them: q and -q are one orientation.
+
+    Args:
+        reward_type: "sparse" or "dense".
+        distance_threshold: success is a distance below it.
+        obj_xy_range: edge length of the square of start positions [m].
+    """
+
+    goal_dim = 4
+    observation_dim = 13
+    num_objects = 1
+
+    def __init__(
+        self,
+        *,
+        reward_type: RewardType = "sparse",
+        distance_threshold: float = 0.2,
+        obj_xy_range: float = 0.3,
+    ) -> None:
+        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
+        self.obj_xy_range = obj_xy_range
+
+    def build(self, client: PhysicsClient) -> tuple[int, ...]:
+        """Build the table and the cube."""
+        create_table(client)
+        return (create_cube(client),)
+
+    def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
+        """Draw an orientation, all equally likely: (4,)."""
+        quaternion = rng.standard_normal(4)
+        return (quaternion / np.linalg.norm(quaternion)).tolist()
+
+    def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
+        """Draw the cube's pose on the table: (1, 7)."""
+        position = sample_on_table(rng, self.obj_xy_range, height=CUBE_SIZE / 2)
+        return ((*position, *NO_ROTATION),)
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """The cube's position, quaternion and velocity: (num_envs, 13)."""
+        pose, velocity = simulation.object_pose[:, 0], simulation.object_velocity[:, 0]
+        return torch.cat((pose, velocity), dim=1)
+
+    def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
+        """The cube's orientation: (num_envs, 4)."""
+        return simulation.object_pose[:, 0, 3:]
+
+    def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """1 - <q, q'>^2, in [0, 1]: (..., 1)."""
+        return 1 - (achieved_goal * desired_goal).sum(-1, keepdim=True).square()

@@ -1,0 +1,83 @@
+"""Push: move a cube over the table."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.tasks.base import (
+    NO_ROTATION,
+    RewardType,
+    Task,
+    create_table,
+    object_observation,
+)
+
+CUBE_SIZE = 0.04  # [m]
+CUBE_MASS = 1.0  # [kg]
+
+
+class Push(Task):
+    """Push a cube to a point of the table.
+
+    Args:
+        reward_type: "sparse" or "dense".
+        distance_threshold: success is a distance below it [m].
+        goal_xy_range: edge length of the square of goals [m].
+        obj_xy_range: edge length of the square of start positions [m].
+    """
+
+    goal_dim = 3
+    observation_dim = 12
+    num_objects = 1
+
+    def __init__(
+        self,
+        *,
+        reward_type: RewardType = "sparse",
+        distance_threshold: float = 0.05,
+        goal_xy_range: float = 0.3,
+        obj_xy_range: float = 0.3,
+    ) -> None:
+        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
+        self.goal_xy_range = goal_xy_range
+        self.obj_xy_range = obj_xy_range
+
+    def build(self, client: PhysicsClient) -> tuple[int, ...]:
+        """Build the table and the cube."""
+        create_table(client)
+        return (create_cube(client),)
+
+    def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
+        """Draw a position of the cube on the table: (3,)."""
+        return sample_on_table(rng, self.goal_xy_range, height=CUBE_SIZE / 2)
+
+    def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
+        """Draw the cube's pose on the table: (1, 7)."""
+        position = sample_on_table(rng, self.obj_xy_range, height=CUBE_SIZE / 2)
+        return ((*position, *NO_ROTATION),)
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """The cube's position, Euler angles and velocity: (num_envs, 12)."""
+        return object_observation(simulation, 0)
+
+    def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
+        """The cube's position: (num_envs, 3)."""
+        return simulation.object_pose[:, 0, :3]
+
+
+def create_cube(
+    client: PhysicsClient, *, mass: float = CUBE_MASS, x: float = 0.0
+) -> int:
+    """Create a cube on the table and return its body id."""
+    half = CUBE_SIZE / 2
+    return client.create_box((half, half, half), mass=mass, position=(x, 0.0, half))
+
+
+def sample_on_table(
+    rng: np.random.Generator, xy_range: float, *, height: float, x_offset: float = 0.0
+) -> tuple[float, float, float]:
+    """Draw a point at a height, in a square centred at (x_offset, 0) [m]."""
+    x, y = rng.uniform(-xy_range / 2, xy_range / 2, size=2)
+    return float(x) + x_offset, float(y), height

@@ -1,0 +1,48 @@
+"""Reach: bring the end-effector to a point."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.tasks.base import RewardType, Task, create_table
+
+
+class Reach(Task):
+    """Bring the end-effector to a point in a cube above the table.
+
+    Args:
+        reward_type: "sparse" or "dense".
+        distance_threshold: success is a distance below it [m].
+        goal_range: edge length of the cube [m].
+    """
+
+    goal_dim = 3
+    observation_dim = 0
+    num_objects = 0
+
+    def __init__(
+        self,
+        *,
+        reward_type: RewardType = "sparse",
+        distance_threshold: float = 0.05,
+        goal_range: float = 0.3,
+    ) -> None:
+        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
+        self.goal_range = goal_range
+
+    def build(self, client: PhysicsClient) -> tuple[int, ...]:
+        """Build the table."""
+        create_table(client)
+        return ()
+
+    def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
+        """Draw a point of the cube: (3,)."""
+        half = self.goal_range / 2
+        x, y = rng.uniform(-half, half, size=2)
+        return float(x), float(y), rng.uniform(0.0, self.goal_range)
+
+    def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
+        """The end-effector's position: (num_envs, 3)."""
+        return simulation.ee_position

@@ -1,0 +1,93 @@
+"""Stack: put one cube on another."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.tasks.base import (
+    NO_ROTATION,
+    RewardType,
+    Task,
+    create_table,
+    object_observation,
+)
+from torch_panda.tasks.push import CUBE_SIZE, create_cube, sample_on_table
+
+LOWER_MASS = 2.0  # [kg]
+UPPER_MASS = 1.0  # [kg]
+LOWER_HEIGHT = CUBE_SIZE / 2  # [m], of the centre
+UPPER_HEIGHT = 3 * CUBE_SIZE / 2  # [m]
+
+
+class Stack(Task):
+    """Stack two cubes at a point of the table.
+
+    Goals are the position of the lower cube, then of the upper one. The second cube
+    starts one cube's height above the table, so it may start on the first.
+
+    Args:
+        reward_type: "sparse" or "dense".
+        distance_threshold: success is a distance below it [m].
+        per_object: compare the distance of each cube with the threshold, as the paper
+            does; otherwise the norm of both, as panda-gym 3.
+        goal_xy_range: edge length of the square of goals [m].
+        obj_xy_range: edge length of the square of start positions [m].
+    """
+
+    goal_dim = 6
+    observation_dim = 24
+    num_objects = 2
+    max_episode_steps = 100
+
+    def __init__(
+        self,
+        *,
+        reward_type: RewardType = "sparse",
+        distance_threshold: float = 0.05,
+        per_object: bool = True,
+        goal_xy_range: float = 0.3,
+        obj_xy_range: float = 0.3,
+    ) -> None:
+        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
+        self.per_object = per_object
+        self.goal_xy_range = goal_xy_range
+        self.obj_xy_range = obj_xy_range
+
+    def build(self, client: PhysicsClient) -> tuple[int, ...]:
+        """Build the table and the cubes, the lower one first."""
+        create_table(client)
+        return (
+            create_cube(client, mass=LOWER_MASS),
+            create_cube(client, mass=UPPER_MASS, x=0.5),
+        )
+
+    def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
+        """Draw where the stack should be: (6,)."""
+        x, y, _ = sample_on_table(rng, self.goal_xy_range, height=0.0)
+        return (x, y, LOWER_HEIGHT, x, y, UPPER_HEIGHT)
+
+    def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
+        """Draw the poses of both cubes: (2, 7)."""
+        return tuple(
+            (*sample_on_table(rng, self.obj_xy_range, height=height), *NO_ROTATION)
+            for height in (LOWER_HEIGHT, UPPER_HEIGHT)
+        )
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """Position, Euler angles and velocity of both cubes: (num_envs, 24)."""
+        cubes = (object_observation(simulation, 0), object_observation(simulation, 1))
+        return torch.cat(cubes, dim=1)
+
+    def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
+        """The positions of both cubes: (num_envs, 6)."""
+        return simulation.object_pose[:, :, :3].flatten(1)
+
+    def success_distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """The distance of the cube that is farther off, or the norm of both."""
+        if not self.per_object:
+            return self.distance(achieved_goal, desired_goal)
+        offset = (achieved_goal - desired_goal).unflatten(-1, (2, 3))
+        return torch.linalg.vector_norm(offset, dim=-1).amax(-1, keepdim=True)
