@@ -273,17 +273,23 @@ pose_set_linear_velocity = bind(
 pose_set_angular_velocity = bind(
     _cheap, "b3CreatePoseCommandSetBaseAngularVelocity", c_int, _command, _doubles
 )
-pose_set_joint_positions = bind(
-    _cheap, "b3CreatePoseCommandSetJointPositions", c_int, _command, c_int, _doubles
-)
-pose_set_joint_velocities = bind(
+pose_set_joint_position = bind(
     _cheap,
-    "b3CreatePoseCommandSetJointVelocities",
+    "b3CreatePoseCommandSetJointPosition",
     c_int,
     _client,
     _command,
     c_int,
-    _doubles,
+    c_double,
+)
+pose_set_joint_velocity = bind(
+    _cheap,
+    "b3CreatePoseCommandSetJointVelocity",
+    c_int,
+    _client,
+    _command,
+    c_int,
+    c_double,
 )
 
 # Motors

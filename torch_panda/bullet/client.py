@@ -226,6 +226,10 @@ class PhysicsClient:
         _capi.shape_add_sphere(command, radius)
         return self._create_body(command, mass, position)
 
+    def create_marker(self, position: Sequence[float]) -> int:
+        """Create a body without a shape, which nothing touches; return its id."""
+        return self._create_body(None, 0.0, position)
+
     def set_friction(
         self,
         body: int,
@@ -255,21 +259,14 @@ class PhysicsClient:
 
     # ---- moving it ---------------------------------------------------------------
 
-    def set_joints(
-        self, body: int, positions: int, velocities: int, count: int
+    def set_joint(
+        self, body: int, joint: int, position: float, velocity: float
     ) -> None:
-        """Put the movable joints at a state.
-
-        Args:
-            body: the body.
-            positions: address of ``count`` positions [rad] or [m].
-            velocities: address of ``count`` velocities [rad/s] or [m/s].
-            count: number of movable joints.
-        """
+        """Put a joint at a position [rad] or [m], with a velocity [rad/s] or [m/s]."""
         command = _capi.pose_init(self._open(), body)
-        _capi.pose_set_joint_positions(command, count, positions)
-        _capi.pose_set_joint_velocities(self._handle, command, count, velocities)
-        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set joints")
+        _capi.pose_set_joint_position(self._handle, command, joint, position)
+        _capi.pose_set_joint_velocity(self._handle, command, joint, velocity)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set a joint")
 
     def set_base(
         self,
@@ -439,12 +436,16 @@ class PhysicsClient:
             )
 
     def _create_body(
-        self, shape_command: int, mass: float, position: Sequence[float]
+        self, shape_command: int | None, mass: float, position: Sequence[float]
     ) -> int:
-        status = self._submit(
-            shape_command, _capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
-        )
-        shape = _capi.status_shape(status)
+        shape = -1
+        if shape_command is not None:
+            status = self._submit(
+                shape_command,
+                _capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED,
+                "create a shape",
+            )
+            shape = _capi.status_shape(status)
         rotation, origin = doubles(_NO_ROTATION), doubles(_ORIGIN)
         command = _capi.body_init(self._open())
         _capi.body_set_base(

@@ -33,15 +33,19 @@ class Scene:
         ee_orientation: quaternion xyzw that inverse kinematics aims at, world frame.
         num_arm_joints: how many of its joints, the first ones, inverse kinematics sets.
         joint_forces: the most each movable joint's motor may exert [N m] or [N].
+        joints: indices of its movable joints.
         objects: body ids of the movable objects.
+        targets: body ids of the markers that show where the objects should go.
     """
 
     robot: int
+    joints: tuple[int, ...]
     ee_link: int
     ee_orientation: tuple[float, float, float, float]
     num_arm_joints: int
     joint_forces: tuple[float, ...]
-    objects: tuple[int, ...]
+    objects: tuple[int, ...] = ()
+    targets: tuple[int, ...] = ()
 
 
 class VectorSimulation:
@@ -66,6 +70,7 @@ class VectorSimulation:
         ee_velocity: (num_envs, 3) [m/s].
         object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
+        target_pose: (num_envs, n_targets, 7), where `reset` puts the markers.
         joint_target: (num_envs, n_joints), what `step` drives the joints to.
         ee_target: (num_envs, 3) [m], what `step` solves the arm's targets for when
             the control type is "ee".
@@ -159,6 +164,7 @@ class VectorSimulation:
         self.joint_target = zeros(n_joints)
         self.ee_position, self.ee_velocity = zeros(3), zeros(3)
         self.ee_target = zeros(3)
+        self.target_pose = zeros(len(scene.targets), 7)
         self.object_pose, self.object_velocity = (
             zeros(n_objects, 7),
             zeros(n_objects, 6),
@@ -190,15 +196,20 @@ class VectorSimulation:
 
     def _reset_one(self, env: int) -> None:
         client, scene = self._clients[env], self.scene
-        for k, body in enumerate(scene.objects):
+        for k, body in enumerate(scene.objects + scene.targets):
             client.set_base(body, (0.0, _FAR_AWAY * k, _FAR_AWAY))
         client.detect_collisions()
-        client.set_joints(
-            scene.robot,
-            _row(self.joint_position, env),
-            _row(self.joint_velocity, env),
-            len(scene.joint_forces),
-        )
+        positions = self.joint_position[env].tolist()
+        velocities = self.joint_velocity[env].tolist()
+        # One by one and in panda-gym's order: Bullet's broad phase remembers the way.
+        for joint, position, velocity in zip(
+            scene.joints, positions, velocities, strict=True
+        ):
+            client.set_joint(scene.robot, joint, position, velocity)
+        for body, pose in zip(
+            scene.targets, self.target_pose[env].tolist(), strict=True
+        ):
+            client.set_base(body, pose[:3], pose[3:])
         poses = self.object_pose[env].tolist()
         velocities = self.object_velocity[env].tolist()
         for body, pose, velocity in zip(scene.objects, poses, velocities, strict=True):

@@ -187,6 +187,7 @@ class RobotTaskEnv(EnvBase):
             self._start_episode(env)
         for key, value in given.items():
             state[key][envs] = value
+        self._simulation.target_pose[envs] = self.task.target_pose(self._goal[envs])
         self._simulation.reset(envs)
         return self._make_tensordict(self._observe())
 
@@ -203,13 +204,16 @@ class RobotTaskEnv(EnvBase):
 
     def _build_scene(self, client: PhysicsClient) -> Scene:
         robot = self.robot.build(client)
+        bodies = self.task.build(client)
         return Scene(
             robot=robot,
+            joints=tuple(j.index for j in client.joints(robot) if j.is_movable),
             ee_link=self.robot.ee_link,
             ee_orientation=self.robot.ee_orientation,
             num_arm_joints=self.robot.num_arm_joints,
             joint_forces=self.robot.joint_forces,
-            objects=self.task.build(client),
+            objects=bodies.objects,
+            targets=bodies.targets,
         )
 
     def _start_episode(self, env: int) -> None:

@@ -80,8 +80,9 @@ class Panda(Robot):
         if self.block_gripper:
             fingers.zero_()
         else:
-            width = self.fingers_width(simulation) + action[:, -1:] * GRIPPER_SCALE
-            fingers.copy_(width / 2)
+            # In float32 throughout: so panda-gym computes it under NumPy 2.
+            width = self.fingers_width(simulation).float()
+            fingers.copy_((width + action[:, -1:] * GRIPPER_SCALE) / 2)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -22,6 +22,18 @@ TABLE_LENGTH = 1.1  # [m], along x
 TABLE_X_OFFSET = -0.3  # [m], of its centre
 TABLE_WIDTH = 0.7  # [m]
 TABLE_HEIGHT = 0.4  # [m]
+
+
+class Bodies(NamedTuple):
+    """What a task has built in a client, by body id.
+
+    Attributes:
+        objects: movable objects, in the order in which observations name them.
+        targets: markers that show the goal.
+    """
+
+    objects: tuple[int, ...] = ()
+    targets: tuple[int, ...] = ()
 
 
 class Task(ABC):
@@ -56,8 +68,8 @@ class Task(ABC):
         self.distance_threshold = distance_threshold
 
     @abstractmethod
-    def build(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the scene in a client and return the ids of the movable objects."""
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the scene in a client."""
 
     @abstractmethod
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
@@ -66,6 +78,15 @@ class Task(ABC):
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
         """Draw start poses: (num_objects, 7), position and quaternion xyzw."""
         return ()
+
+    def target_pose(self, goal: Tensor) -> Tensor:
+        """Where goals put the markers: (..., goal_dim) -> (..., n_targets, 7).
+
+        By default a goal is one position for each marker.
+        """
+        positions = goal.unflatten(-1, (-1, 3))
+        rotation = goal.new_tensor(NO_ROTATION).expand(*positions.shape[:-1], 4)
+        return torch.cat((positions, rotation), dim=-1)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation: (num_envs, observation_dim), float64."""

@@ -7,8 +7,11 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.tasks.base import NO_ROTATION, RewardType, Task, create_table
+from torch_panda.tasks.base import NO_ROTATION, Bodies, RewardType, Task, create_table
 from torch_panda.tasks.push import CUBE_SIZE, create_cube, sample_on_table
+
+# Where the target turns, out of the cube's way.
+TARGET_POSITION = (0.0, 0.0, 3 * CUBE_SIZE / 2)  # [m]
 
 
 class Flip(Task):
@@ -37,10 +40,18 @@ class Flip(Task):
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.obj_xy_range = obj_xy_range
 
-    def build(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the table and the cube."""
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the table, the cube and the target."""
         create_table(client)
-        return (create_cube(client),)
+        return Bodies(
+            objects=(create_cube(client),),
+            targets=(client.create_marker(TARGET_POSITION),),
+        )
+
+    def target_pose(self, goal: Tensor) -> Tensor:
+        """The goal's orientation above the table: (..., 4) -> (..., 1, 7)."""
+        position = goal.new_tensor(TARGET_POSITION).expand(*goal.shape[:-1], 3)
+        return torch.cat((position, goal), dim=-1).unsqueeze(-2)
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw an orientation, all equally likely: (4,)."""

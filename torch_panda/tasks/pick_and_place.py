@@ -22,6 +22,8 @@ class PickAndPlace(Push):
         obj_xy_range: edge length of the square of start positions [m].
     """
 
+    marker_height = 0.05
+
     def __init__(
         self,
         *,

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
     NO_ROTATION,
+    Bodies,
     RewardType,
     Task,
     create_table,
@@ -31,6 +32,8 @@ class Push(Task):
     goal_dim = 3
     observation_dim = 12
     num_objects = 1
+    # Where panda-gym creates the target, before it moves to the first goal [m].
+    marker_height = CUBE_SIZE / 2
 
     def __init__(
         self,
@@ -44,10 +47,13 @@ class Push(Task):
         self.goal_xy_range = goal_xy_range
         self.obj_xy_range = obj_xy_range
 
-    def build(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the table and the cube."""
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the table, the cube and the target."""
         create_table(client)
-        return (create_cube(client),)
+        return Bodies(
+            objects=(create_cube(client),),
+            targets=(client.create_marker((0.0, 0.0, self.marker_height)),),
+        )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a position of the cube on the table: (3,)."""

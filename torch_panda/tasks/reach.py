@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.tasks.base import RewardType, Task, create_table
+from torch_panda.tasks.base import Bodies, RewardType, Task, create_table
 
 
 class Reach(Task):
@@ -32,10 +32,10 @@ class Reach(Task):
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.goal_range = goal_range
 
-    def build(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the table."""
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the table and the target."""
         create_table(client)
-        return ()
+        return Bodies(targets=(client.create_marker((0.0, 0.0, 0.0)),))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a point of the cube: (3,)."""

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
     NO_ROTATION,
+    Bodies,
     RewardType,
     Task,
     create_table,
@@ -61,8 +62,8 @@ class Slide(Task):
         self.table_length = table_length
         self.table_x_offset = table_x_offset
 
-    def build(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the table and the puck."""
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the table, the puck and the target."""
         create_table(client, length=self.table_length, x_offset=self.table_x_offset)
         puck = client.create_cylinder(
             PUCK_RADIUS,
@@ -71,7 +72,8 @@ class Slide(Task):
             position=(0.0, 0.0, PUCK_START_HEIGHT),
         )
         client.set_friction(puck, lateral=PUCK_LATERAL_FRICTION)
-        return (puck,)
+        target = client.create_marker((0.0, 0.0, PUCK_START_HEIGHT))
+        return Bodies(objects=(puck,), targets=(target,))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a position of the puck out of reach: (3,)."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
     NO_ROTATION,
+    Bodies,
     RewardType,
     Task,
     create_table,
@@ -56,13 +57,14 @@ class Stack(Task):
         self.goal_xy_range = goal_xy_range
         self.obj_xy_range = obj_xy_range
 
-    def build(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the table and the cubes, the lower one first."""
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the table, the cubes, the lower one first, and their targets."""
         create_table(client)
-        return (
-            create_cube(client, mass=LOWER_MASS),
-            create_cube(client, mass=UPPER_MASS, x=0.5),
-        )
+        lower = create_cube(client, mass=LOWER_MASS)
+        lower_target = client.create_marker((0.0, 0.0, 0.05))
+        upper = create_cube(client, mass=UPPER_MASS, x=0.5)
+        upper_target = client.create_marker((0.5, 0.0, 0.05))
+        return Bodies(objects=(lower, upper), targets=(lower_target, upper_target))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw where the stack should be: (6,)."""

@@ -1,0 +1,276 @@
+"""Hindsight goals at sample time, as a transform of a replay buffer."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, MultiStepTransform, Transform
+
+from .memory import LOOKING_AHEAD, GoalMemory
+from .rewrite import GoalFunction, Rewriter
+from .strategies import Strategy, make_strategy
+from .trajectories import TRAJECTORY_KEY, streams_of, time_first, time_last
+
+SERIAL_KEY = "hindsight_serial"
+
+_MULTI_STEP = (
+    "HindsightRelabel cannot be combined with MultiStepTransform: the reward of n steps "
+    "cannot be recomputed from one transition. Sample slices with unit='slice' and sum "
+    "the rewards in the loss."
+)
+_ENV = "HindsightRelabel can only be applied to replay buffers, not to environments."
+
+
+class HindsightRelabel(Transform):
+    """Gives sampled transitions goals that their trajectory achieved later.
+
+    Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495) for a
+    replay buffer of any layout: on `extend` the transform notes to which trajectory
+    and step every transition belongs and what it achieved; on `sample` it relabels a
+    random `her_ratio` of the rows. The others come out as they were stored.
+
+    =====================  ====  ====  ====  ====  ====
+    k (goals a transition)    1     2     4     8    16
+    her_ratio = k / (k+1)   0.5  0.67   0.8  0.89  0.94
+    =====================  ====  ====  ====  ====  ====
+
+    Args:
+        reward_fn: the environment's reward, called once for all the relabelled rows,
+            on the batch's device: (achieved_goal, desired_goal), each (n, *goal), to
+            (n, 1). A row's reward may depend on that row only.
+
+    Keyword Args:
+        her_ratio: share of the rows that are relabelled, in [0, 1].
+        strategy: where the goal is from: "future" (this step or a later one of the
+            same episode), "final" (its last step), "episode" (any of its steps),
+            "random" (any stored transition), or a function
+            `(step, first, end, generator) -> goal step`, see `strategies`. It is what
+            the step led to, ("next", achieved_goal), of what is stored of the episode.
+        goal_key: the desired goal, rewritten in the root and under "next".
+        achieved_goal_key: the achieved goal, read under "next".
+        reward_key: the reward.
+        terminated_fn: maps as `reward_fn` does to (n, 1) bool, for tasks that end on
+            success: also ("next", "terminated") and ("next", "done") are rewritten.
+            A `SliceSampler` puts the stored flags back, unless truncated_key=None.
+        trajectory_key: ids that tell trajectories apart. Data without them are taken
+            for [*batch, time], one environment a row, in the same order every time.
+        single_env: takes 1-d data without ids, and those of `add`, for consecutive
+            steps of one environment.
+        unit: "row" draws a goal a row. "slice" gives all the rows of a slice (rows that
+            follow each other in the batch and in time) one goal, drawn for its last
+            row: for recurrent and n-step learners on a `SliceSampler`.
+        capacity: transitions that the buffer holds. By default it is found out from
+            the samples, and needed only if the rows carry no "index", as in a plain
+            `ReplayBuffer`; then call `empty` after emptying the buffer, too.
+        seed: seeds a generator of its own. By default torch's is used.
+
+    Raises:
+        ValueError: an argument is out of range; the data do not tell which trajectory a
+            transition belongs to; a function returned the wrong shape; the transform
+            is put into an environment.
+        KeyError: the data lack an entry that is needed.
+        RuntimeError: the buffer cannot be followed: it is not written round-robin,
+            shared between processes, or combined with `MultiStepTransform`.
+
+    Example:
+        >>> rb = TensorDictReplayBuffer(
+        ...     storage=LazyTensorStorage(1_000_000),
+        ...     transform=HindsightRelabel(env.compute_reward, her_ratio=0.8),
+        ...     batch_size=256,
+        ... )
+    """
+
+    # Tells torchrl that a buffer shared between processes needs share_memory_().
+    requires_shared_write_state = True
+
+    def __init__(
+        self,
+        reward_fn: GoalFunction,
+        *,
+        her_ratio: float = 0.8,
+        strategy: str | Strategy = "future",
+        goal_key: NestedKey = "desired_goal",
+        achieved_goal_key: NestedKey = "achieved_goal",
+        reward_key: NestedKey = ("next", "reward"),
+        terminated_fn: GoalFunction | None = None,
+        trajectory_key: NestedKey = TRAJECTORY_KEY,
+        single_env: bool = False,
+        unit: Literal["row", "slice"] = "row",
+        capacity: int | None = None,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        if not 0 <= her_ratio <= 1:
+            raise ValueError(f"her_ratio must be within [0, 1], got {her_ratio}.")
+        if unit not in ("row", "slice"):
+            raise ValueError(f'unit must be "row" or "slice", got {unit!r}.')
+        if capacity is not None and capacity < 1:
+            raise ValueError(f"capacity must be positive, got {capacity}.")
+        self.her_ratio = her_ratio
+        self.trajectory_key = trajectory_key
+        self.single_env = single_env
+        self.unit = unit
+        self.strategy = strategy
+        self._strategy = make_strategy(strategy)
+        self._rewriter = Rewriter(
+            reward_fn, terminated_fn, goal_key, achieved_goal_key, reward_key
+        )
+        self._memory = GoalMemory(capacity)
+        self._generator: torch.Generator | None = None
+        if seed is not None:
+            self._generator = torch.Generator().manual_seed(seed)
+        self._lock = threading.Lock()  # a prefetching buffer samples in threads
+
+    # -- a replay buffer's two calls --------------------------------------------------
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Notes the transitions that are about to be stored."""
+        self._check_chain()
+        shape = tensordict.batch_size
+        with self._lock:
+            if self._memory.head == 0:
+                self._check_data(tensordict)
+            achieved = tensordict.get(self._rewriter.next_achieved_key)
+            serial = self._memory.write(
+                streams_of(tensordict, self.trajectory_key, self.single_env),
+                time_first(tensordict.get(("next", "done")).reshape(shape), len(shape)),
+                time_first(achieved, len(shape)),
+                unit=shape[:-1].numel(),
+            )
+        return tensordict.set(SERIAL_KEY, time_last(serial, shape))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Relabels rows that a buffer has sampled."""
+        serial = tensordict.get(SERIAL_KEY).reshape(-1)
+        device = serial.device
+        tensordict.del_(SERIAL_KEY)
+        with self._lock:
+            memory = self._memory
+            serial = serial.to(memory.device)
+            floor = self._floor(serial, tensordict)
+            choose = self._choose_rows if self.unit == "row" else self._choose_slices
+            rows, last, place = choose(serial)
+            if not len(rows):
+                return tensordict
+            goals = memory.draw(last, self._strategy, self._generator, floor)
+        if place is not None:
+            goals = goals.index_select(0, place)
+        self._rewriter.rewrite(tensordict, rows.to(device), goals.to(device))
+        return tensordict
+
+    def _floor(self, serial: Tensor, tensordict: TensorDictBase) -> int:
+        """Returns the serial from which on goals may be drawn."""
+        memory = self._memory
+        if memory.capacity is not None and self._strategy in LOOKING_AHEAD:
+            return memory.floor  # these strategies need no other
+        index = tensordict.get("index", None)
+        if index is not None:
+            return memory.observe(serial, index.reshape(-1).to(serial.device))
+        if memory.capacity is None:
+            raise RuntimeError(
+                'the sampled rows have no "index": use a TensorDictReplayBuffer, or '
+                "pass capacity=, the number of transitions the buffer holds."
+            )
+        return memory.floor
+
+    def _choose_rows(self, serial: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Chooses rows (n,) of a batch and returns them with their serials (n,)."""
+        chosen = torch.rand(len(serial), generator=self._generator) < self.her_ratio
+        rows = chosen.nonzero().squeeze(1).to(serial.device)
+        serial = serial.index_select(0, rows)
+        if len(rows) and int(serial.min()) < self._memory.floor:
+            # Overwritten after they were prefetched: left as they are.
+            stored = serial >= self._memory.floor
+            rows, serial = rows[stored], serial[stored]
+        return rows, serial, None
+
+    def _choose_slices(self, serial: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Chooses slices of a batch.
+
+        Returns:
+            Their rows, (n,), the serials of their last rows, (slices,), and which of
+            these slices every row is in, (n,).
+        """
+        stored = serial >= self._memory.floor
+        trajectory, step = self._memory.find(serial.clamp(min=self._memory.floor))
+        ahead = step.diff()
+        # A padded slice repeats its last row: still the same slice.
+        goes_on = (trajectory.diff() == 0) & ((ahead == 0) | (ahead == 1))
+        last = torch.cat([~goes_on, goes_on.new_ones(1)])
+        ends = last.nonzero().squeeze(1)
+        slices = last.cumsum(0) - last.long()
+        chosen = torch.rand(len(ends), generator=self._generator) < self.her_ratio
+        chosen = chosen.to(serial.device)
+        chosen[slices[~stored]] = False
+        rows = chosen[slices].nonzero().squeeze(1)
+        place = (chosen.cumsum(0) - 1)[slices[rows]]
+        return rows, serial[ends[chosen]], place
+
+    def empty(self) -> None:
+        """Forgets all transitions, as after the buffer's own `empty`.
+
+        Buffers do not tell their transforms. Where the rows carry an "index" the next
+        sample shows it, unless a multiple of the capacity had been written.
+        """
+        with self._lock:
+            self._memory.clear()
+
+    # -- what torchrl's machinery asks for --------------------------------------------
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Joins a buffer's chain of transforms; raises ValueError for an env's."""
+        if isinstance(container, EnvBase) or container.parent is not None:
+            raise ValueError(_ENV)
+        super().set_container(container)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        raise ValueError(_ENV)
+
+    def _check_data(self, batch: TensorDictBase) -> None:
+        self._rewriter.check(batch)
+        if batch.get("steps_to_next_obs", None) is not None:
+            raise RuntimeError(_MULTI_STEP)
+
+    def _check_chain(self) -> None:
+        chain = self.__dict__["_container"]
+        chain = chain() if chain is not None else None
+        if isinstance(chain, Compose) and any(
+            isinstance(t, MultiStepTransform) for t in chain.transforms
+        ):
+            raise RuntimeError(_MULTI_STEP)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns the memory and the generator, for `state_dict` and `dumps`."""
+        with self._lock:
+            generator = self._generator
+            return {
+                "memory": self._memory.state(),
+                "generator": None if generator is None else generator.get_state(),
+            }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Takes what `get_extra_state` returned."""
+        with self._lock:
+            self._memory.load(state["memory"])
+            if state["generator"] is not None:
+                self._generator = self._generator or torch.Generator()
+                self._generator.set_state(state["generator"])
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        del state["_lock"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        return (
+            f"HindsightRelabel(her_ratio={self.her_ratio}, "
+            f"strategy={self.strategy!r}, unit={self.unit!r})"
+        )
