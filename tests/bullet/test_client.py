@@ -1,0 +1,177 @@
+"""The layer against the pybullet module itself: the same commands, equal numbers."""
+
+import ctypes
+from ctypes import c_double
+
+import numpy as np
+import pybullet
+import pybullet_data
+import pytest
+import torch
+
+from torch_panda.bullet import BulletError, PhysicsClient, _capi
+
+JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
+NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
+FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
+EE_LINK = 11
+
+
+def read(address, count):
+    return list((c_double * count).from_address(address))
+
+
+@pytest.fixture
+def reference():
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setAdditionalSearchPath(pybullet_data.getDataPath())
+    pybullet.setTimeStep(1 / 500)
+    pybullet.setGravity(0, 0, -9.81)
+    yield pybullet
+    pybullet.disconnect(client)
+
+
+def create(reference, client, kind, mass, position):
+    shapes = {
+        "box": (pybullet.GEOM_BOX, {"halfExtents": (0.02, 0.03, 0.04)}),
+        "cylinder": (pybullet.GEOM_CYLINDER, {"radius": 0.03, "height": 0.05}),
+        "sphere": (pybullet.GEOM_SPHERE, {"radius": 0.03}),
+        "ground": (pybullet.GEOM_BOX, {"halfExtents": (1.0, 1.0, 0.1)}),
+    }
+    geometry, arguments = shapes[kind]
+    theirs = reference.createMultiBody(
+        baseMass=mass,
+        baseCollisionShapeIndex=reference.createCollisionShape(geometry, **arguments),
+        basePosition=position,
+    )
+    if geometry == pybullet.GEOM_BOX:
+        size = arguments["halfExtents"]
+        ours = client.create_box(size, mass=mass, position=position)
+    elif geometry == pybullet.GEOM_CYLINDER:
+        ours = client.create_cylinder(0.03, 0.05, mass=mass, position=position)
+    else:
+        ours = client.create_sphere(0.03, mass=mass, position=position)
+    assert ours == theirs
+    return ours
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
+def test_falling_bodies(reference, kind):
+    with PhysicsClient() as client:
+        ground = create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
+        body = create(reference, client, kind, 1.0, (0.01, 0.02, 0.2))
+        reference.changeDynamics(body, -1, lateralFriction=0.3, spinningFriction=0.01)
+        client.set_friction(body, lateral=0.3, spinning=0.01)
+        rotation = (0.1, 0.2, 0.3, float(np.sqrt(1 - 0.14)))
+        velocity, spin = (0.5, 0.1, 0.0), (1.0, 2.0, 3.0)
+        reference.resetBasePositionAndOrientation(body, (0.0, 0.0, 0.2), rotation)
+        reference.resetBaseVelocity(body, velocity, spin)
+        client.set_base(body, (0.0, 0.0, 0.2), rotation, velocity, spin)
+        for _ in range(300):
+            reference.stepSimulation()
+            client.step()
+        state = client.state(body)
+        position, orientation = reference.getBasePositionAndOrientation(body)
+        assert read(state.q, 7) == [*position, *orientation]
+        linear, angular = reference.getBaseVelocity(body)
+        assert read(state.u, 6) == [*linear, *angular]
+        theirs = reference.getContactPoints(body, ground)
+        ours = client.contact_points(body, ground)
+        assert len(theirs) > 0
+        assert [tuple(c.position_on_b) for c in ours] == [c[6] for c in theirs]
+        assert [c.normal_force for c in ours] == [c[9] for c in theirs]
+        assert [c.distance for c in ours] == [c[8] for c in theirs]
+
+
+def test_arm_with_kinematics_and_motors(reference):
+    rng = np.random.default_rng(0)
+    with PhysicsClient() as client:
+        urdf, base = "franka_panda/panda.urdf", (-0.6, 0.0, 0.0)
+        arm = reference.loadURDF(urdf, basePosition=base, useFixedBase=True)
+        assert client.load_urdf(urdf, position=base, fixed_base=True) == arm
+        movable = [joint.index for joint in client.joints(arm) if joint.is_movable]
+        assert movable == list(JOINTS)
+        create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
+        body = create(reference, client, "box", 1.0, (0.0, 0.0, 0.04))
+        for joint, position in zip(JOINTS, NEUTRAL, strict=True):
+            reference.resetJointState(arm, joint, position)
+            client.set_joint(arm, joint, position, 0.0)
+        target = torch.zeros(3, dtype=torch.float64)
+        rotation = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        joints = torch.zeros(9, dtype=torch.float64)
+        forces = (c_double * 9)(*FORCES)
+        for _ in range(40):
+            ee = np.array(reference.getLinkState(arm, EE_LINK)[0])
+            goal = np.array(reference.getBasePositionAndOrientation(body)[0])
+            step = np.clip((goal - ee) * 20 + rng.normal(size=3) * 0.3, -1, 1)
+            target[:] = torch.from_numpy(ee + step * 0.05)
+            theirs = reference.calculateInverseKinematics(
+                arm, EE_LINK, target.tolist(), rotation.tolist()
+            )
+            client.inverse_kinematics(
+                arm,
+                EE_LINK,
+                target.data_ptr(),
+                rotation.data_ptr(),
+                joints.data_ptr(),
+            )
+            assert joints.tolist() == list(theirs)
+            reference.setJointMotorControlArray(
+                arm,
+                JOINTS,
+                pybullet.POSITION_CONTROL,
+                targetPositions=joints.tolist(),
+                forces=FORCES,
+            )
+            client.control_joints(arm, joints.data_ptr(), forces)
+            client.step(20)
+            for _ in range(20):
+                reference.stepSimulation()
+            state = client.state(arm, link_velocities=True)
+            states = reference.getJointStates(arm, JOINTS)
+            assert read(state.joint_positions, 9) == [s[0] for s in states]
+            assert read(state.joint_velocities, 9) == [s[1] for s in states]
+            link = reference.getLinkState(arm, EE_LINK, computeLinkVelocity=True)
+            assert read(state.link_pose(EE_LINK), 7) == [*link[0], *link[1]]
+            assert read(state.link_velocity(EE_LINK), 6) == [*link[6], *link[7]]
+        assert reference.getContactPoints(arm, body), "the arm must touch the box"
+
+
+def test_closed_client_raises_and_closes_again():
+    client = PhysicsClient()
+    client.close()
+    client.close()
+    with pytest.raises(BulletError, match="closed"):
+        client.step()
+
+
+def test_bad_urdf_is_named(tmp_path):
+    broken = tmp_path / "broken.urdf"
+    broken.write_text("<robot")
+    with PhysicsClient() as client:
+        with pytest.raises(FileNotFoundError, match=r"no_such\.urdf"):
+            client.load_urdf("no_such.urdf")
+        with pytest.raises(BulletError, match=r"load .*broken\.urdf"):
+            client.load_urdf(broken)
+        client.step()
+
+
+def test_unknown_body_raises():
+    with PhysicsClient() as client, pytest.raises(BulletError, match="report a state"):
+        client.state(7)
+
+
+def test_missing_symbol_names_the_version_that_works():
+    with pytest.raises(ImportError, match=r"b3NoSuch.*pybullet==3\.2\.7"):
+        _capi.bind(ctypes.CDLL(_capi.library_path()), "b3NoSuch", None)
+
+
+def test_missing_pybullet_names_the_version_that_works():
+    with pytest.raises(ImportError, match=r"not installed.*pybullet==3\.2\.7"):
+        _capi.library_path("no_such_pybullet")
+
+
+def test_other_status_codes_are_refused(monkeypatch):
+    monkeypatch.setattr(_capi, "CMD_PERFORM_COLLISION_DETECTION_COMPLETED", 111)
+    with pytest.raises(ImportError, match=r"status codes differ.*3\.2\.7"):
+        PhysicsClient()
