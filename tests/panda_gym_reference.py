@@ -1,6 +1,7 @@
 """panda-gym 3.0.7 as the reference, started where one of our environments starts."""
 
 import gymnasium
+import numpy as np
 import panda_gym.envs.panda_tasks
 from panda_gym.pybullet import PyBullet
 
@@ -22,12 +23,13 @@ def make_reference(env_id):
         tasks.PyBullet = PyBullet
 
 
-def start(reference, state):
-    """Start an episode from the state (of batch size []) and return the observation."""
-    reference.reset(seed=0)
-    reference.task.goal = state["desired_goal"].numpy()
-    bodies = reference.sim._bodies_idx
-    names = [name for name in ("object", "object1", "object2") if name in bodies]
-    for name, pose in zip(names, state["object_pose"].numpy(), strict=True):
-        reference.sim.set_base_pose(name, pose[:3], pose[3:])
-    return reference._get_obs()
+def start(reference, seed):
+    """Start an episode; return its observation, object poses and goal."""
+    observation, _ = reference.reset(seed=seed)
+    sim = reference.sim
+    names = [n for n in ("object", "object1", "object2") if n in sim._bodies_idx]
+    poses = [
+        (*sim.get_base_position(name), *sim.get_base_orientation(name))
+        for name in names
+    ]
+    return observation, np.reshape(poses, (len(names), 7)), reference.task.get_goal()

@@ -1,0 +1,320 @@
+"""The environment's contract beyond single ids."""
+
+import gc
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from torch_panda.bullet import PhysicsClient
+
+
+def push_towards(td, generator):
+    """Actions that go for the object: contact-rich."""
+    towards = (td["achieved_goal"] - td["observation"][..., :3]) * 20
+    noise = torch.randn(towards.shape, generator=generator) * 0.3
+    return towards + noise
+
+
+def run(env, steps=50, seed=0, td=None):
+    generator = torch.Generator().manual_seed(seed)
+    td, observations = env.reset() if td is None else td, []
+    for _ in range(steps):
+        td["action"] = push_towards(td, generator)
+        td = env.step(td)["next"]
+        observations.append(td["observation"])
+    return torch.stack(observations)
+
+
+@pytest.fixture
+def env():
+    with torch_panda.make("PandaPush-v1", num_envs=3, num_threads=2, seed=0) as env:
+        yield env
+
+
+# ---- reproducibility -------------------------------------------------------------------
+
+
+def test_environments_do_not_depend_on_their_number():
+    with torch_panda.make("PandaSlide-v1", num_envs=3, seed=4) as few:
+        with torch_panda.make("PandaSlide-v1", num_envs=8, seed=4) as many:
+            for _ in range(2):
+                td, others = few.reset(), many.reset()
+                for key in ("observation", "desired_goal"):
+                    assert torch.equal(td[key], others[key][:3])
+                action = torch.rand(8, 3) * 2 - 1
+                td = few.step(td.set("action", action[:3]))
+                others = many.step(others.set("action", action))
+                assert (td["next"] == others["next"][:3]).all()
+
+
+@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaSlide-v1"])
+def test_history_changes_nothing(env_id):
+    with torch_panda.make(env_id, num_envs=4, seed=0) as env:
+        start = env.reset()
+        state = env.get_state()
+        first = run(env, td=start)
+        for seed in range(3):
+            run(env, steps=20 + 11 * seed, seed=seed + 1)
+        again = run(env, td=env.reset(state.clone(), set_state=True))
+        assert torch.equal(first, again)
+
+
+def test_seed_restarts_the_episodes(env):
+    env.set_seed(5)
+    first = [env.reset()["desired_goal"] for _ in range(3)]
+    env.set_seed(5)
+    again = [env.reset()["desired_goal"] for _ in range(3)]
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    env.set_seed(6)
+    assert not torch.equal(env.reset()["desired_goal"], first[0])
+
+
+def test_across_processes():
+    code = (
+        "import torch, torch_panda; torch.manual_seed(0);"
+        "env = torch_panda.make('PandaPush-v1', num_envs=2, seed=3);"
+        "r = env.rollout(30)['next', 'observation'];"
+        "print(r.double().sum().item().hex()); env.close()"
+    )
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert outputs[0] == outputs[1] != ""
+
+
+def test_global_random_state_is_untouched(env):
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    env.reset()
+    env.step(TensorDict({"action": torch.zeros(3, 3)}, batch_size=[3]))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_default_seeds_differ():
+    goals = []
+    for _ in range(2):
+        with torch_panda.make("PandaReach-v1") as env:
+            goals.append(env.reset()["desired_goal"])
+    assert not torch.equal(*goals)
+
+
+# ---- resets and states -----------------------------------------------------------------
+
+
+def test_partial_reset_leaves_the_others_alone(env):
+    with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as other:
+        td, untouched = env.reset(), other.reset()
+        generator = torch.Generator().manual_seed(0)
+        for step in range(30):
+            action = push_towards(td, generator)
+            td = env.step(td.set("action", action))["next"]
+            untouched = other.step(untouched.set("action", action))["next"]
+            if step == 10:
+                td["_reset"] = torch.tensor([[False], [True], [False]])
+                td = env.reset(td)
+        for env_index in (0, 2):
+            assert (td[env_index] == untouched[env_index]).all()
+        assert env.get_state()["step_count"].flatten().tolist() == [30, 19, 30]
+
+
+def test_partial_step_leaves_the_others_alone(env):
+    td = env.reset()
+    before = env.get_state()
+    td["action"] = torch.ones(3, 3)
+    td["_step"] = torch.tensor([True, False, True])
+    after = env.step(td)["next"]
+    assert torch.equal(after["observation"][1], td["observation"][1])
+    assert after["reward"][1] == 0
+    assert not torch.equal(after["observation"][0], td["observation"][0])
+    assert env.get_state()["step_count"].flatten().tolist() == [1, 0, 1]
+    assert (env.get_state()[1] == before[1]).all()
+
+
+def test_state_round_trip_keeps_float64(env):
+    run(env, 20)
+    state = env.get_state()
+    assert state["object_pose"].dtype == torch.float64
+    env.reset()
+    env.reset(state.clone(), set_state=True)
+    again = env.get_state()
+    for key, value in state.items():
+        # Bullet reports rotations from a matrix: the last bit may differ.
+        tolerance = 1e-15 if key == "object_pose" else 0.0
+        torch.testing.assert_close(again[key], value, rtol=0.0, atol=tolerance)
+
+
+def test_partial_state_leaves_the_rest_neutral_or_sampled(env):
+    pose = torch.tensor([0.1, 0.0, 0.02, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    given = TensorDict({"object_pose": pose.expand(3, 1, 7)}, batch_size=[3])
+    td = env.reset(given, set_state=True)
+    state = env.get_state()
+    assert torch.equal(state["object_pose"], given["object_pose"])
+    neutral = torch.tensor(env.robot.neutral_joint_position, dtype=torch.float64)
+    assert torch.equal(state["joint_position"], neutral.expand(3, 9))
+    assert not state["object_velocity"].any()
+    assert len(td["desired_goal"].unique(dim=0)) == 3
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("object_pose", lambda x: x[:, :, :6], r"object_pose must have shape"),
+        ("object_pose", lambda x: x * 0, r"environment 0 .*unit quaternion"),
+        ("joint_position", lambda x: x / 0, r"joint_position of environment 0"),
+        ("step_count", lambda x: x - 1, r"step_count of environment 0"),
+    ],
+)
+def test_bad_state_changes_nothing(env, key, change, message):
+    env.reset()
+    state = env.get_state()
+    bad = state.clone().exclude(key)
+    bad[key] = change(state[key])
+    with pytest.raises(ValueError, match=message):
+        env.reset(bad, set_state=True)
+    assert (env.get_state() == state).all()
+
+
+def test_unbatched():
+    with torch_panda.make("PandaStack-v1", seed=0) as env:
+        assert env.batch_size == torch.Size([])
+        td = env.rollout(3)
+        assert td["next", "reward"].shape == (3, 1)
+        assert env.get_state()["object_pose"].shape == (2, 7)
+
+
+# ---- bad input -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("action", "error", "message"),
+    [
+        (torch.tensor([[0.0] * 3, [0.0, float("nan"), 0.0], [0.0] * 3]), 0, "ment 1"),
+        (torch.tensor([[0.0] * 3, [0.0] * 3, [float("inf")] * 3]), 0, "ment 2"),
+        (torch.zeros(3, 4), 0, r"shape \(3, 3\), got \(3, 4\)"),
+        (torch.zeros(3, 3, dtype=torch.int64), 1, "float32, got torch.int64"),
+        (torch.zeros(3, 3, device="meta"), 0, "device cpu, got meta"),
+    ],
+)
+def test_bad_action_changes_nothing(env, action, error, message):
+    td = env.reset()
+    state = env.get_state()
+    with pytest.raises((ValueError, TypeError)[error], match=message):
+        env.step(TensorDict({"action": action}, batch_size=[3]))
+    assert (env.get_state() == state).all()
+    env.step(td.set("action", torch.zeros(3, 3)))
+
+
+def test_large_actions_are_clipped(env):
+    td = env.reset()
+    state = env.get_state()
+    clipped = env.step(td.clone().set("action", torch.ones(3, 3)))["next"]
+    env.reset(state.clone(), set_state=True)
+    large = env.step(td.clone().set("action", torch.full((3, 3), 1e30)))["next"]
+    assert (clipped == large).all()
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"num_envs": 0}, {"num_threads": -1}, {"seed": -1}]
+)
+def test_bad_arguments(arguments):
+    (name,) = arguments
+    with pytest.raises(ValueError, match=name):
+        torch_panda.make("PandaReach-v1", **arguments)
+
+
+def test_unknown_id_suggests():
+    with pytest.raises(ValueError, match=r"did you mean PandaPush-v1.*Panda{Reach,"):
+        torch_panda.make("PandaPsh-v1")
+
+
+def test_unknown_options():
+    with pytest.raises(ValueError, match="control_type must be one of"):
+        torch_panda.Panda(control_type="torque")
+    with pytest.raises(ValueError, match="reward_type must be one of"):
+        torch_panda.Reach(reward_type="shaped")
+
+
+def test_goals_of_wrong_shape(env):
+    with pytest.raises(ValueError, match=r"\(\.\.\., 3\), got \(5, 4\)"):
+        env.compute_reward(torch.zeros(5, 4), torch.zeros(5, 4))
+
+
+def test_reward_functions_pickle_without_the_simulator(env):
+    reward, success = pickle.loads(pickle.dumps((env.compute_reward, env.is_success)))
+    goals = torch.zeros(2, 5, 3), torch.full((2, 5, 3), 0.01)
+    assert torch.equal(reward(*goals), torch.zeros(2, 5, 1))
+    assert success(*goals).all()
+
+
+def test_use_after_close():
+    env = torch_panda.make("PandaReach-v1", num_envs=2)
+    td = env.reset()
+    env.close()
+    env.close()
+    td["action"] = torch.zeros(2, 3)
+    for use in (env.reset, env.get_state, lambda: env.step(td)):
+        with pytest.raises(torch_panda.BulletError, match="closed"):
+            use()
+
+
+def test_nothing_is_left_behind():
+    before = threading.active_count()
+    for _ in range(3):
+        env = torch_panda.make("PandaReach-v1", num_envs=3, num_threads=3)
+        env.rollout(2)
+        del env  # a forgotten environment closes itself
+    gc.collect()
+    assert threading.active_count() == before
+
+
+def test_error_in_a_worker_names_the_environment(env, monkeypatch):
+    td = env.reset()
+    broken = env._simulation._clients[1]
+    original = PhysicsClient.step
+
+    def step(self, count=1):
+        if self is broken:
+            raise torch_panda.BulletError("no answer")
+        original(self, count)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PhysicsClient, "step", step)
+        with pytest.raises(RuntimeError, match="environment 1: BulletError"):
+            env.step(td.set("action", torch.zeros(3, 3)))
+    assert env.rollout(5).shape == (3, 5)
+
+
+def test_interrupt_in_a_step(env, monkeypatch):
+    td = env.reset()
+    original = PhysicsClient.step
+    main = threading.main_thread().ident
+
+    def step(self, count=1):
+        if self is env._simulation._clients[0]:
+            signal.pthread_kill(main, signal.SIGINT)
+        original(self, count)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PhysicsClient, "step", step)
+        with pytest.raises(KeyboardInterrupt):
+            env.step(td.set("action", torch.zeros(3, 3)))
+    assert env.get_state()["step_count"].flatten().tolist() == [1, 1, 1]
+    assert env.rollout(5).shape == (3, 5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_outputs_on_cuda():
+    with torch_panda.make("PandaPush-v1", num_envs=2, device="cuda") as env:
+        td = env.rollout(3)
+        assert td.device.type == td["next", "observation"].device.type == "cuda"
+        assert env.get_state()["object_pose"].device.type == "cuda"

@@ -1,0 +1,103 @@
+"""A user's own task and a user's own robot, as the README shows them."""
+
+import numpy as np
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torch_panda import Panda, Reach, Robot, RobotTaskEnv, Task
+from torch_panda.tasks.base import NO_ROTATION, Bodies, create_table, object_observation
+
+RADIUS = 0.03  # [m]
+
+
+class PushBall(Task):
+    """Push a ball of 0.5 kg to a point of the table."""
+
+    goal_dim = 3
+    observation_dim = 12
+    num_objects = 1
+    max_episode_steps = 30
+
+    def build(self, client):
+        create_table(client)
+        ball = client.create_sphere(RADIUS, mass=0.5, position=(0.0, 0.0, RADIUS))
+        client.set_friction(ball, lateral=0.5)
+        return Bodies(objects=(ball,))
+
+    def sample_goal(self, rng):
+        return (*rng.uniform(-0.15, 0.15, size=2), RADIUS)
+
+    def sample_objects(self, rng):
+        return ((*rng.uniform(-0.1, 0.1, size=2), RADIUS, *NO_ROTATION),)
+
+    def target_pose(self, goal):
+        return goal.new_zeros(*goal.shape[:-1], 0, 7)
+
+    def observation(self, simulation):
+        return object_observation(simulation, 0)
+
+    def achieved_goal(self, simulation):
+        return simulation.object_pose[:, 0, :3]
+
+
+def make_kuka(**arguments):
+    return Robot(
+        urdf="kuka_iiwa/model.urdf",
+        neutral_joint_position=(0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
+        joint_forces=(200.0,) * 7,
+        ee_link=6,
+        ee_orientation=(0.0, 1.0, 0.0, 0.0),
+        **arguments,
+    )
+
+
+def test_own_task():
+    task = PushBall(distance_threshold=0.03)
+    with RobotTaskEnv(
+        robot=Panda(block_gripper=True), task=task, num_envs=2, seed=0
+    ) as env:
+        check_env_specs(env)
+        td = env.reset()
+        start = td["achieved_goal"].clone()
+        for _ in range(29):
+            action = (td["achieved_goal"] - td["observation"][:, :3]) * 20
+            td = env.step(td.set("action", action))["next"]
+        assert not td["done"].any()
+        td = env.step(td.set("action", action))["next"]
+        assert td["truncated"].all()
+        # The arm is sent at the balls and moves them.
+        assert ((td["achieved_goal"] - start).norm(dim=1) > 0.005).all()
+
+
+def test_own_robot_reaches():
+    with RobotTaskEnv(robot=make_kuka(), task=Reach(), num_envs=4, seed=0) as env:
+        check_env_specs(env)
+        assert env.action_spec.shape == (4, 3)
+        td = env.reset()
+        for _ in range(40):
+            error = td["desired_goal"] - td["achieved_goal"]
+            td = env.step(td.set("action", error * 10))["next"]
+        assert td["success"].all()
+
+
+def test_own_robot_with_joint_control():
+    robot = make_kuka(control_type="joints")
+    with RobotTaskEnv(robot=robot, task=Reach(), seed=0) as env:
+        assert env.action_spec.shape == (7,)
+        td = env.reset()
+        before = env.get_state()["joint_position"]
+        env.step(td.set("action", torch.eye(7)[1]))
+        moved = (env.get_state()["joint_position"] - before).abs()
+        assert moved.argmax() == 1
+        assert np.isclose(moved[1], 0.05, atol=0.02)
+
+
+def test_wrong_joint_count_is_named():
+    robot = make_kuka()
+    robot.joint_forces = robot.joint_forces[:-1]
+    try:
+        RobotTaskEnv(robot=robot, task=Reach())
+    except ValueError as error:
+        assert "7 movable joints" in str(error)
+    else:
+        raise AssertionError("a robot with a joint too few was accepted")
