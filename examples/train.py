@@ -84,6 +84,12 @@ CLIP_NORMALIZED = 5.0  # OpenAI Baselines
 class Normalizer(nn.Module):
     """Running standardisation of what the networks see, as in OpenAI Baselines."""
 
+    count: Tensor
+    total: Tensor
+    total_squared: Tensor
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, size: int) -> None:
         super().__init__()
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))

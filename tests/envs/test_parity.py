@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tests.panda_gym_reference import make_reference, start
 
 import torch_panda
+from tests.panda_gym_reference import make_reference, start
 
 V3_IDS = [env_id for env_id in torch_panda.ENV_IDS if env_id.endswith("-v3")]
 STEPS = 60

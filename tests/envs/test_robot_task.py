@@ -38,20 +38,21 @@ def env():
         yield env
 
 
-# ---- reproducibility -------------------------------------------------------------------
+# ---- reproducibility ---------------------------------------------------------
 
 
 def test_environments_do_not_depend_on_their_number():
-    with torch_panda.make("PandaSlide-v1", num_envs=3, seed=4) as few:
-        with torch_panda.make("PandaSlide-v1", num_envs=8, seed=4) as many:
-            for _ in range(2):
-                td, others = few.reset(), many.reset()
-                for key in ("observation", "desired_goal"):
-                    assert torch.equal(td[key], others[key][:3])
-                action = torch.rand(8, 3) * 2 - 1
-                td = few.step(td.set("action", action[:3]))
-                others = many.step(others.set("action", action))
-                assert (td["next"] == others["next"][:3]).all()
+    few = torch_panda.make("PandaSlide-v1", num_envs=3, seed=4)
+    many = torch_panda.make("PandaSlide-v1", num_envs=8, seed=4)
+    with few, many:
+        for _ in range(2):
+            td, others = few.reset(), many.reset()
+            for key in ("observation", "desired_goal"):
+                assert torch.equal(td[key], others[key][:3])
+            action = torch.rand(8, 3) * 2 - 1
+            td = few.step(td.set("action", action[:3]))
+            others = many.step(others.set("action", action))
+            assert (td["next"] == others["next"][:3]).all()
 
 
 @pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaSlide-v1"])
@@ -108,7 +109,7 @@ def test_default_seeds_differ():
     assert not torch.equal(*goals)
 
 
-# ---- resets and states -----------------------------------------------------------------
+# ---- resets and states -------------------------------------------------------
 
 
 def test_partial_reset_leaves_the_others_alone(env):
@@ -192,7 +193,7 @@ def test_unbatched():
         assert env.get_state()["object_pose"].shape == (2, 7)
 
 
-# ---- bad input -------------------------------------------------------------------------
+# ---- bad input ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
