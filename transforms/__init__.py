@@ -1,5 +1,6 @@
 """Hindsight goal relabelling for any goal-conditioned TorchRL pipeline."""
 
-from .relabel import HindsightRelabel
+from torch_panda.transforms.augment import HindsightAugment
+from torch_panda.transforms.relabel import HindsightRelabel
 
-__all__ = ["HindsightRelabel"]
+__all__ = ["HindsightAugment", "HindsightRelabel"]

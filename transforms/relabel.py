@@ -8,24 +8,22 @@ from typing import Any, Literal
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, MultiStepTransform, Transform
 
-from .memory import LOOKING_AHEAD, GoalMemory
-from .rewrite import GoalFunction, Rewriter
-from .strategies import Strategy, make_strategy
-from .trajectories import TRAJECTORY_KEY, streams_of, time_first, time_last
+from torch_panda.transforms.buffer_only import BufferTransform
+from torch_panda.transforms.memory import LOOKING_AHEAD, GoalMemory
+from torch_panda.transforms.rewrite import GoalFunction, Rewriter
+from torch_panda.transforms.strategies import Strategy, make_strategy
+from torch_panda.transforms.trajectories import (
+    TRAJECTORY_KEY,
+    streams_of,
+    time_first,
+    time_last,
+)
 
 SERIAL_KEY = "hindsight_serial"
 
-_MULTI_STEP = (
-    "HindsightRelabel cannot be combined with MultiStepTransform: the reward of n steps "
-    "cannot be recomputed from one transition. Sample slices with unit='slice' and sum "
-    "the rewards in the loss."
-)
-_ENV = "HindsightRelabel can only be applied to replay buffers, not to environments."
 
-
-class HindsightRelabel(Transform):
+class HindsightRelabel(BufferTransform):
     """Gives sampled transitions goals that their trajectory achieved later.
 
     Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495) for a
@@ -84,9 +82,6 @@ class HindsightRelabel(Transform):
         ... )
     """
 
-    # Tells torchrl that a buffer shared between processes needs share_memory_().
-    requires_shared_write_state = True
-
     def __init__(
         self,
         reward_fn: GoalFunction,
@@ -133,7 +128,7 @@ class HindsightRelabel(Transform):
         shape = tensordict.batch_size
         with self._lock:
             if self._memory.head == 0:
-                self._check_data(tensordict)
+                self._rewriter.check(tensordict)
             achieved = tensordict.get(self._rewriter.next_achieved_key)
             serial = self._memory.write(
                 streams_of(tensordict, self.trajectory_key, self.single_env),
@@ -147,7 +142,7 @@ class HindsightRelabel(Transform):
         """Relabels rows that a buffer has sampled."""
         serial = tensordict.get(SERIAL_KEY).reshape(-1)
         device = serial.device
-        tensordict.del_(SERIAL_KEY)
+        tensordict = tensordict.exclude(SERIAL_KEY)
         with self._lock:
             memory = self._memory
             serial = serial.to(memory.device)
@@ -182,9 +177,8 @@ class HindsightRelabel(Transform):
         chosen = torch.rand(len(serial), generator=self._generator) < self.her_ratio
         rows = chosen.nonzero().squeeze(1).to(serial.device)
         serial = serial.index_select(0, rows)
-        if len(rows) and int(serial.min()) < self._memory.floor:
-            # Overwritten after they were prefetched: left as they are.
-            stored = serial >= self._memory.floor
+        stored = serial >= self._memory.floor
+        if not stored.all():  # overwritten after it was prefetched: left as it is
             rows, serial = rows[stored], serial[stored]
         return rows, serial, None
 
@@ -220,28 +214,6 @@ class HindsightRelabel(Transform):
             self._memory.clear()
 
     # -- what torchrl's machinery asks for --------------------------------------------
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        """Joins a buffer's chain of transforms; raises ValueError for an env's."""
-        if isinstance(container, EnvBase) or container.parent is not None:
-            raise ValueError(_ENV)
-        super().set_container(container)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        raise ValueError(_ENV)
-
-    def _check_data(self, batch: TensorDictBase) -> None:
-        self._rewriter.check(batch)
-        if batch.get("steps_to_next_obs", None) is not None:
-            raise RuntimeError(_MULTI_STEP)
-
-    def _check_chain(self) -> None:
-        chain = self.__dict__["_container"]
-        chain = chain() if chain is not None else None
-        if isinstance(chain, Compose) and any(
-            isinstance(t, MultiStepTransform) for t in chain.transforms
-        ):
-            raise RuntimeError(_MULTI_STEP)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the memory and the generator, for `state_dict` and `dumps`."""

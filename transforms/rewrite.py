@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
@@ -36,16 +35,26 @@ class Rewriter:
 
     def __post_init__(self) -> None:
         """Works out the keys under "next"."""
+        self.goal_key = unravel_key(self.goal_key)
+        self.reward_key = unravel_key(self.reward_key)
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
+        written = (self.goal_key, self.next_goal_key, self.reward_key, _DONE)
+        # The tensordicts written into besides the root, outer ones first, each with the
+        # name of an entry that is replaced in it.
+        self._nested = {
+            path[:n]: path[n]
+            for path in sorted(key for key in written if isinstance(key, tuple))
+            for n in range(1, len(path))
+        }
 
     def check(self, batch: TensorDictBase) -> None:
         """Raises a KeyError that names the entries that are missing in the batch."""
         needed = [
-            unravel_key(self.goal_key),
+            self.goal_key,
             self.next_goal_key,
             self.next_achieved_key,
-            unravel_key(self.reward_key),
+            self.reward_key,
             _DONE,
         ]
         if self.terminated_fn is not None:
@@ -60,7 +69,8 @@ class Rewriter:
     def rewrite(self, batch: TensorDictBase, rows: Tensor, goals: Tensor) -> None:
         """Sets the goals of some rows of the batch and recomputes the rest.
 
-        The entries are replaced and not written into: they may be the storage's own.
+        Tensors and nested tensordicts are replaced, not written into: they may be the
+        storage's own.
 
         Args:
             batch: transitions, any batch shape.
@@ -90,8 +100,15 @@ class Rewriter:
             new[_TERMINATED] = terminated.index_copy(0, rows, values)
             values = values | truncated.index_select(0, rows)
             new[_DONE] = done.index_copy(0, rows, values)
+        parents: dict[tuple[str, ...], TensorDictBase] = {(): batch}
+        for path, replaced in self._nested.items():
+            parents[path] = batch.get(path).exclude(replaced)  # a shallow copy
         for key, value in new.items():
-            batch.set(key, value if flat is batch else value.unflatten(0, batch.shape))
+            path = (key,) if isinstance(key, str) else key
+            value = value if flat is batch else value.unflatten(0, batch.shape)
+            parents[path[:-1]].set(path[-1], value)
+        for path in self._nested:
+            parents[path[:-1]].set(path[-1], parents[path])
 
 
 def _check_shape(function: str, values: Tensor, n: int, old: Tensor) -> None:

@@ -93,5 +93,5 @@ def choose_steps(
             f"got {goal_step.dtype} of shape {tuple(goal_step.shape)}."
         )
     if ((goal_step < first) | (goal_step >= end)).any():
-        raise ValueError("the strategy must return steps from first up to end, excluded.")
+        raise ValueError("the strategy must return steps from first up to end.")
     return goal_step

@@ -41,18 +41,18 @@ def split_runs(stream: Tensor, done: Tensor) -> Runs:
     """
     stream, order = torch.sort(stream, stable=True)
     done = done.index_select(0, order)
-    last = done.clone()
-    last[:-1] |= stream[1:] != stream[:-1]
-    last[-1] = True
-    end = last.nonzero().squeeze(1)
-    length = end.diff(prepend=end.new_tensor([-1])).int()
+    # Where a run begins, with one more entry for the end of the last one.
+    first = torch.ones(len(order) + 1, dtype=torch.bool, device=order.device)
+    torch.logical_or(stream[1:] != stream[:-1], done[:-1], out=first[1:-1])
+    bounds = first.nonzero().squeeze(1)
+    begin, end = bounds[:-1], bounds[1:]
     return Runs(
         order,
-        last.cumsum(0) - last.long(),
-        end.int() + 1 - length,
-        length,
-        stream.index_select(0, end).tolist(),
-        done.index_select(0, end).tolist(),
+        first[:-1].cumsum(0).sub_(1),
+        begin.int(),
+        (end - begin).int(),
+        stream.index_select(0, begin).tolist(),
+        done.index_select(0, end - 1).tolist(),
     )
 
 

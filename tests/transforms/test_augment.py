@@ -1,0 +1,130 @@
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.envs import GymEnv, MultiStepTransform, TransformedEnv
+
+from tests.transforms.identifiable import (
+    STORED_REWARD,
+    Envs,
+    check_batch,
+    relabelled,
+    reward_fn,
+    terminated_fn,
+)
+from torch_panda.transforms import HindsightAugment
+
+
+def make_buffer(capacity=10_000, buffer=TensorDictReplayBuffer, **options):
+    return buffer(
+        storage=LazyTensorStorage(capacity),
+        transform=HindsightAugment(reward_fn, **options),
+        batch_size=64,
+    )
+
+
+@pytest.mark.parametrize("layout", ["env_first", "time_first", "rows", "no_ids"])
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+@pytest.mark.parametrize("buffer", [TensorDictReplayBuffer, ReplayBuffer])
+def test_every_transition_of_ended_episodes_and_k_copies(layout, strategy, buffer):
+    k = 3
+    rb = make_buffer(buffer=buffer, strategy=strategy, k=k)
+    envs, written = Envs(4, [1, 5, 12]), []
+    for steps in (3, 1, 7, 2) * 4:
+        data = envs.chunk(steps)
+        written.append(data.reshape(-1))
+        if layout == "no_ids":
+            data = data.exclude("collector")
+        elif layout != "rows":
+            data = (data if layout == "env_first" else data.transpose(0, 1)).reshape(-1)
+        rb.extend(data)
+    stored, written = rb.storage[:], torch.cat(written)["next", "achieved_goal"]
+    check_batch(stored, stored, strategy)
+
+    open_episodes = {(i, int(e)) for i, e in enumerate(envs.episode)}
+    ended = [row for row in written.tolist() if (row[0], row[1]) not in open_episodes]
+    mask = relabelled(stored)
+    achieved = stored["next", "achieved_goal"]
+    assert sorted(achieved[~mask].tolist()) == sorted(ended)
+    assert sorted(achieved[mask].tolist()) == sorted(ended * k)
+    assert (stored["next", "reward"][~mask] == STORED_REWARD).all()
+
+
+def test_nothing_is_stored_until_an_episode_ends():
+    rb, envs = make_buffer(k=1), Envs(2, [6])
+    for _ in range(5):
+        rb.extend(envs.chunk(1))
+        assert len(rb) == 0
+    rb.extend(envs.chunk(1))
+    assert len(rb) == 2 * 6 * 2
+
+
+def test_future_goals_are_uniform():
+    length, k = 6, 500
+    rb = make_buffer(k=k, seed=0)
+    rb.extend(Envs(2, [length]).chunk(length))
+    stored = rb.storage[:]
+    stored = stored[relabelled(stored)]
+    step = stored["next", "achieved_goal"][:, 2].long() - 1
+    goal = stored["desired_goal"][:, 2].long() - 1
+    for s in range(length):
+        drawn = torch.bincount(goal[step == s], minlength=length)[s:].float()
+        assert drawn.sum() == 2 * k
+        expected = drawn.sum() / len(drawn)
+        freedom = len(drawn) - 1
+        chi2 = ((drawn - expected) ** 2 / expected).sum()
+        assert chi2 <= freedom + 5 * (2 * freedom) ** 0.5
+
+
+def test_terminated_is_rewritten_in_the_copies():
+    rb = make_buffer(k=2, terminated_fn=terminated_fn)
+    rb.extend(Envs(2, [4]).chunk(8))
+    stored = rb.storage[:]
+    mask = relabelled(stored)[:, None]
+    reached = terminated_fn(stored["next", "achieved_goal"], stored["desired_goal"])
+    assert (stored["next", "terminated"] == (reached & mask)).all()
+    done = stored["next", "terminated"] | stored["next", "truncated"]
+    assert (stored["next", "done"] == done).all()
+
+
+@pytest.mark.parametrize("how", ["state_dict", "dumps"])
+def test_held_episodes_are_saved(how, tmp_path):
+    rb, envs = make_buffer(k=2, seed=1), Envs(3, [5, 8])
+    for _ in range(3):
+        rb.extend(envs.chunk(3).reshape(-1))
+    new = make_buffer(k=2, seed=1)
+    if how == "dumps":
+        rb.dumps(tmp_path)
+        new.loads(tmp_path)
+    else:
+        new.load_state_dict(rb.state_dict())
+    more = envs.chunk(8).reshape(-1)
+    for buffer in (rb, new):
+        buffer.extend(more)
+    assert (rb.storage[:] == new.storage[:]).all()
+
+
+def test_empty_drops_what_is_held():
+    rb, envs = make_buffer(), Envs(1, [6])
+    rb.extend(envs.chunk(3))
+    rb.empty()
+    rb.transform[0].empty()
+    rb.extend(envs.chunk(3))
+    assert set(rb.storage[:]["next", "achieved_goal"][:, 2].tolist()) == {4, 5, 6}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"k": 0}, "k must be"), ({"strategy": "random"}, "one episode at a time")],
+)
+def test_bad_options_raise(options, message):
+    with pytest.raises(ValueError, match=message):
+        HindsightAugment(reward_fn, **options)
+
+
+def test_multi_step_and_environments_raise():
+    rb = make_buffer()
+    rb.append_transform(MultiStepTransform(n_steps=3, gamma=0.9))
+    with pytest.raises(RuntimeError, match="MultiStepTransform"):
+        rb.extend(Envs(3, [5]).chunk(20))
+    with pytest.raises(ValueError, match="replay buffers"):
+        TransformedEnv(GymEnv("Pendulum-v1"), HindsightAugment(reward_fn))

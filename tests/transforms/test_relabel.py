@@ -1,0 +1,632 @@
+import threading
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    SamplerWithoutReplacement,
+    SliceSampler,
+    TensorDictReplayBuffer,
+)
+from torchrl.data.replay_buffers import HERReplayBuffer
+from torchrl.envs import Compose, GymEnv, MultiStepTransform, TransformedEnv
+
+from tests.transforms.identifiable import (
+    Envs,
+    check_batch,
+    check_untouched,
+    relabelled,
+    reward_fn,
+    terminated_fn,
+)
+from torch_panda.transforms import HindsightRelabel
+
+STRATEGIES = ["future", "final", "episode", "random"]
+
+
+def make_buffer(capacity=1000, *, ndim=1, sampler=None, batch_size=64, **options):
+    buffer_options = {
+        key: options.pop(key) for key in ("prefetch", "shared") if key in options
+    }
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity, ndim=ndim),
+        sampler=sampler,
+        transform=HindsightRelabel(reward_fn, **options),
+        batch_size=batch_size,
+        **buffer_options,
+    )
+
+
+def flatten(data, how):
+    """[N, T] as an unflattened, an environment by environment or a stepwise batch."""
+    if how == "none":
+        return data
+    return (data if how == "env_first" else data.transpose(0, 1)).reshape(-1)
+
+
+def is_mixed(batch):
+    """Which relabelled rows have another trajectory's goal."""
+    other = batch["desired_goal"][..., :2] != batch["next", "achieved_goal"][..., :2]
+    return relabelled(batch) & other.any(-1)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    num_envs=st.integers(1, 7),
+    lengths=st.lists(st.integers(1, 30), min_size=1, max_size=4),
+    steps=st.lists(st.integers(1, 12), min_size=1, max_size=4),
+    capacity=st.integers(8, 400),
+    layout=st.sampled_from(["env_first", "time_first", "none", "no_ids"]),
+    sampler=st.sampled_from([None, SamplerWithoutReplacement]),
+    strategy=st.sampled_from(STRATEGIES),
+    batch_size=st.sampled_from([1, 7, 64]),
+    every=st.integers(1, 5),
+)
+def test_no_goal_is_wrong(
+    num_envs, lengths, steps, capacity, layout, sampler, strategy, batch_size, every
+):
+    ndim = 2 if layout in ("none", "no_ids") else 1
+    if ndim == 2:  # TensorDictReplayBuffer cannot write a single step there
+        steps = [max(2, s) for s in steps]
+    capacity = max(capacity, num_envs * max(steps))
+    envs = Envs(num_envs, lengths)
+    rb = make_buffer(
+        capacity,
+        ndim=ndim,
+        sampler=sampler() if sampler else None,
+        strategy=strategy,
+        batch_size=batch_size,
+    )
+    for i in range(60):
+        data = envs.chunk(steps[i % len(steps)])
+        if layout == "no_ids":
+            del data["collector"]
+        rb.extend(flatten(data, layout if ndim == 1 else "none"))
+        if i % every or len(rb) < batch_size:
+            continue
+        batch = rb.sample()
+        stored = rb.storage[:]
+        check_batch(batch, stored, strategy)
+        check_untouched(batch, stored)
+
+
+@pytest.mark.parametrize("layout", ["env_first", "time_first", "none"])
+@pytest.mark.parametrize("steps", [1, 10, 50])
+def test_no_mixed_goals_where_her_buffer_has_them(layout, steps, record_property):
+    def her_reward(td):
+        return reward_fn(td["next", "achieved_goal"], td["desired_goal"])
+
+    if layout == "none" and steps == 1:
+        pytest.skip("TensorDictReplayBuffer cannot write one step of ndim=2 data")
+    envs = Envs(4, [50])
+    storage = LazyTensorStorage(5000)
+    theirs = HERReplayBuffer(her_reward, storage=storage, batch_size=256)
+    ours = make_buffer(5000, ndim=2 if layout == "none" else 1, batch_size=256)
+    mixed = {"ours": [], "HERReplayBuffer": []}
+    for i in range(800 // steps):
+        data = envs.chunk(steps)
+        theirs.extend(flatten(data, "env_first" if layout == "none" else layout))
+        ours.extend(flatten(data, layout))
+        if i % max(1, 40 // steps) == 0:
+            for name, rb in [("ours", ours), ("HERReplayBuffer", theirs)]:
+                batch = rb.sample()
+                mixed[name].append(is_mixed(batch)[relabelled(batch)].float().mean())
+    share = {name: float(torch.stack(x).mean()) for name, x in mixed.items()}
+    for name, value in share.items():
+        record_property(name, value)
+        print(f"{layout}, {steps} steps a batch: {name} mixes {value:.0%}")
+    assert share["ours"] == 0
+
+
+@pytest.mark.parametrize("her_ratio", [0.0, 0.3, 0.8, 1.0])
+def test_share_and_position_of_relabelled_rows(her_ratio):
+    rb = make_buffer(500, her_ratio=her_ratio, seed=0, batch_size=50)
+    envs = Envs(4, [1, 7, 20])
+    mask = []
+    for _ in range(2000):
+        rb.extend(envs.chunk(3).reshape(-1))
+        if len(rb) >= 50:
+            mask.append(relabelled(rb.sample()))
+    mask = torch.stack(mask).float()
+    error = (her_ratio * (1 - her_ratio)) ** 0.5
+    assert abs(mask.mean() - her_ratio) <= 4 * error / mask.numel() ** 0.5
+    position = (mask.mean(0) - her_ratio).abs()
+    assert (position <= 5 * error / len(mask) ** 0.5).all()
+
+
+@pytest.mark.parametrize("her_ratio", [-0.1, 1.1])
+def test_her_ratio_out_of_range_raises(her_ratio):
+    with pytest.raises(ValueError, match="her_ratio must be within"):
+        HindsightRelabel(reward_fn, her_ratio=her_ratio)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize("strategy", ["future", "episode"])
+def test_goals_are_uniform(finished, strategy):
+    length = 10
+    rb = make_buffer(1000, her_ratio=1.0, strategy=strategy, seed=1, batch_size=500)
+    rb.extend(Envs(3, [length if finished else 99]).chunk(length).reshape(-1))
+    counts = torch.zeros(length, length)
+    for _ in range(200):
+        batch = rb.sample()
+        step = batch["next", "achieved_goal"][:, 2].long() - 1
+        goal = batch["desired_goal"][:, 2].long() - 1
+        counts += torch.bincount(step * length + goal, minlength=length**2).view(
+            length, length
+        )
+    first = torch.arange(length) if strategy == "future" else torch.zeros(length)
+    for step in range(length):
+        drawn = counts[step, int(first[step]) :]
+        assert drawn.sum() == counts[step].sum()
+        expected = drawn.sum() / len(drawn)
+        chi2 = ((drawn - expected) ** 2 / expected).sum()
+        freedom = len(drawn) - 1
+        assert chi2 <= freedom + 5 * (2 * freedom) ** 0.5, f"step {step}"
+
+
+def test_random_goals_are_uniform_over_what_is_stored():
+    rb = make_buffer(40, her_ratio=1.0, strategy="random", seed=1, batch_size=400)
+    envs = Envs(2, [5])
+    for _ in range(6):
+        rb.extend(envs.chunk(5).reshape(-1))
+        rb.sample()
+    stored = rb.storage[:]["next", "achieved_goal"]
+    goals = torch.cat([rb.sample()["desired_goal"] for _ in range(100)])
+    counts = (goals[:, None] == stored).all(-1).float().sum(0)
+    expected = len(goals) / 40
+    assert counts.sum() == len(goals)
+    assert ((counts - expected) ** 2 / expected).sum() <= 39 + 5 * (2 * 39) ** 0.5
+
+
+def test_strategy_of_the_user():
+    def next_step(step, first, end, generator):
+        return torch.minimum(step + 1, end - 1)
+
+    rb = make_buffer(strategy=next_step, her_ratio=1.0)
+    rb.extend(Envs(3, [6]).chunk(18).reshape(-1))
+    batch = rb.sample()
+    step, goal = batch["next", "achieved_goal"][:, 2], batch["desired_goal"][:, 2]
+    assert (goal == (step + 1).clamp(max=6)).all()
+    assert not is_mixed(batch).any()
+
+
+@pytest.mark.parametrize(
+    ("strategy", "message"),
+    [
+        (lambda step, first, end, rng: end, "from first up to end"),
+        (lambda step, first, end, rng: step.float(), "integer steps"),
+        (lambda step, first, end, rng: step[:-1], "integer steps"),
+    ],
+)
+def test_bad_strategy_of_the_user_raises(strategy, message):
+    rb = make_buffer(strategy=strategy)
+    rb.extend(Envs(3, [6]).chunk(6).reshape(-1))
+    with pytest.raises(ValueError, match=message):
+        rb.sample()
+
+
+def test_unknown_strategy_raises():
+    with pytest.raises(ValueError, match=r"must be one of.*'past'"):
+        HindsightRelabel(reward_fn, strategy="past")
+
+
+def test_terminated_and_done_are_rewritten():
+    rb = make_buffer(strategy="future", her_ratio=0.7, terminated_fn=terminated_fn)
+    rb.extend(Envs(4, [3, 8]).chunk(40).reshape(-1))
+    batch, stored = rb.sample(), rb.storage[:]
+    mask = relabelled(batch)[:, None]
+    reached = terminated_fn(batch["next", "achieved_goal"], batch["desired_goal"])
+    assert (batch["next", "terminated"] == (reached & mask)).all()
+    truncated = stored["next", "truncated"][batch["index"]]
+    assert (batch["next", "truncated"] == truncated).all()
+    assert (batch["next", "done"] == (batch["next", "terminated"] | truncated)).all()
+    assert batch["next", "terminated"].any()
+
+
+@pytest.mark.parametrize("which", ["reward_fn", "terminated_fn"])
+def test_wrong_shape_raises(which):
+    functions = {"reward_fn": reward_fn, "terminated_fn": terminated_fn}
+    right = functions[which]
+    functions[which] = lambda achieved, desired: right(achieved, desired).squeeze(-1)
+    transform = HindsightRelabel(**functions, her_ratio=1.0)
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100), transform=transform, batch_size=8
+    )
+    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    with pytest.raises(ValueError, match=rf"{which}.*\(8, 1\), got \(8,\)"):
+        rb.sample()
+
+
+def test_reward_fn_sees_the_relabelled_rows_once():
+    calls = []
+
+    def counting(achieved, desired):
+        calls.append(len(achieved))
+        return reward_fn(achieved, desired)
+
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100),
+        transform=HindsightRelabel(counting),
+        batch_size=64,
+    )
+    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    assert calls == []
+    batch = rb.sample()
+    assert calls == [int(relabelled(batch).sum())]
+
+
+# -- which trajectory -----------------------------------------------------------------
+
+
+def test_flat_data_without_ids_raise():
+    rb = make_buffer()
+    with pytest.raises(ValueError, match=r"trajectory_key=.*single_env=True"):
+        rb.extend(Envs(2, [5]).chunk(5).exclude("collector").reshape(-1))
+
+
+def test_missing_entries_raise():
+    rb = make_buffer()
+    with pytest.raises(KeyError, match="desired_goal"):
+        rb.extend(Envs(2, [5]).chunk(5).exclude("desired_goal").reshape(-1))
+
+
+@pytest.mark.parametrize("one_by_one", [True, False])
+def test_single_env(one_by_one):
+    rb = make_buffer(30, single_env=True, her_ratio=1.0)
+    envs = Envs(1, [1, 4, 9])
+    for _ in range(30):
+        data = envs.chunk(7)[0].exclude("collector")
+        if one_by_one:
+            for transition in data.unbind(0):
+                rb.add(transition)
+        else:
+            rb.extend(data)
+        check_batch(rb.sample(), rb.storage[:], "future")
+
+
+def test_add_with_ids():
+    rb = make_buffer(30)
+    envs = Envs(3, [1, 4, 9])
+    for _ in range(40):
+        for transition in envs.chunk(1).reshape(-1).unbind(0):
+            rb.add(transition)
+        check_batch(rb.sample(), rb.storage[:], "future")
+
+
+def test_own_trajectory_key():
+    rb = make_buffer(trajectory_key="episode")
+    data = Envs(3, [4]).chunk(12).reshape(-1)
+    data["episode"] = data.pop(("collector", "traj_ids"))[:, None]
+    rb.extend(data)
+    check_batch(rb.sample(), rb.storage[:], "future")
+
+
+def test_done_ends_a_trajectory_whose_id_stays():
+    rb = make_buffer(trajectory_key="env", strategy="final")
+    envs = Envs(3, [4, 2])
+    for _ in range(5):
+        data = envs.chunk(5)
+        data["env"] = torch.arange(3)[:, None].expand(3, 5).clone()
+        rb.extend(data.reshape(-1))
+    check_batch(rb.sample(), rb.storage[:], "final")
+
+
+def test_three_dimensional_data():
+    envs = Envs(6, [1, 5, 12])
+    rb = make_buffer(120, ndim=3)
+    for _ in range(40):
+        rb.extend(envs.chunk(4).exclude("collector").unflatten(0, (2, 3)))
+        batch = rb.sample()
+        check_batch(batch, rb.storage[:].flatten(0, 1), "future")
+    assert relabelled(batch).any()
+
+
+def test_workers_that_take_turns():
+    """Each worker's environments, with ids of a common pool, in no fixed order."""
+    workers = [Envs(2, [13, 7], seed=i) for i in range(3)]
+    rb = make_buffer(150)
+    for i in range(100):
+        worker = int(torch.randint(3, ()))
+        data = workers[worker].chunk(1 + i % 4)
+        for key in ("achieved_goal", ("next", "achieved_goal")):
+            data[key][..., 0] += 2 * worker
+        data["collector", "traj_ids"] = data["collector", "traj_ids"] * 3 + worker
+        rb.extend(data.reshape(-1))
+        check_batch(rb.sample(), rb.storage[:], "future")
+
+
+# -- storages, samplers, buffers ------------------------------------------------------
+
+
+def test_memmap_storage_and_reading_it_all(tmp_path):
+    rb = TensorDictReplayBuffer(
+        storage=LazyMemmapStorage(60, scratch_dir=tmp_path),
+        transform=HindsightRelabel(reward_fn),
+        batch_size=32,
+    )
+    envs = Envs(3, [5, 9])
+    for _ in range(20):
+        rb.extend(envs.chunk(4).reshape(-1))
+        before = rb.storage[:].clone()
+        check_batch(rb.sample(), before, "future")
+        check_batch(rb[:], before, "future")
+        assert (rb.storage[:] == before).all(), "the storage was written into"
+
+
+def test_two_dimensional_storage_read_whole():
+    rb = make_buffer(60, ndim=2)
+    rb.extend(Envs(3, [5, 9]).chunk(20))
+    batch = rb[:]
+    assert batch.shape == (3, 20)
+    assert not is_mixed(batch).any()
+    assert relabelled(batch).any()
+
+
+def test_plain_replay_buffer_needs_its_capacity():
+    def make(**options):
+        return ReplayBuffer(
+            storage=LazyTensorStorage(50),
+            transform=HindsightRelabel(reward_fn, **options),
+            batch_size=32,
+        )
+
+    rb = make()
+    rb.extend(Envs(3, [5]).chunk(5).reshape(-1))
+    with pytest.raises(RuntimeError, match="capacity="):
+        rb.sample()
+    for strategy in STRATEGIES:
+        rb, envs = make(capacity=50, strategy=strategy), Envs(3, [5, 9])
+        for _ in range(30):
+            rb.extend(envs.chunk(3).reshape(-1))
+            check_batch(rb.sample(), rb.storage[:], strategy)
+
+
+def test_chunks_as_items_raise():
+    """[N, T] data in a 1-d storage: its rows are not written one after the other."""
+    rb = make_buffer(30, batch_size=8)
+    envs = Envs(4, [5])
+    with pytest.raises(RuntimeError, match="several dimensions"):
+        for _ in range(20):
+            rb.extend(envs.chunk(5))
+            rb.sample()
+
+
+@pytest.mark.parametrize("strict", [True, False])
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_slices_share_a_goal(strategy, strict):
+    sampler = SliceSampler(
+        slice_len=4, traj_key=("collector", "traj_ids"), strict_length=strict
+    )
+    rb = make_buffer(
+        200, sampler=sampler, unit="slice", strategy=strategy, seed=0, batch_size=64
+    )
+    envs = Envs(1, [4, 9, 16])
+    share = []
+    for _ in range(60):
+        rb.extend(envs.chunk(16).reshape(-1))
+        batch = rb.sample()
+        check_batch(batch, rb.storage[:], strategy)
+        ends = batch["next", "truncated"].squeeze(-1).nonzero().flatten().tolist()
+        start = 0
+        for end in ends:
+            piece = batch[start : end + 1]
+            assert (piece["desired_goal"] == piece["desired_goal"][0]).all()
+            if relabelled(piece).any() and strategy in ("future", "final"):
+                last = piece["next", "achieved_goal"][-1, 2]
+                assert (piece["desired_goal"][:, 2] >= last).all()
+            share.append(relabelled(piece)[0].float())
+            start = end + 1
+    share = torch.stack(share)
+    # Neighbouring slices that follow each other count as one, hence 6 errors, not 4.
+    assert abs(share.mean() - 0.8) <= 6 * 0.4 / len(share) ** 0.5
+
+
+def test_padded_slices():
+    sampler = SliceSampler(
+        slice_len=6,
+        traj_key=("collector", "traj_ids"),
+        strict_length=False,
+        pad_output=True,
+    )
+    rb = make_buffer(100, sampler=sampler, unit="slice", her_ratio=1.0, batch_size=60)
+    envs = Envs(1, [2, 9])
+    for _ in range(10):
+        rb.extend(envs.chunk(20).reshape(-1))
+        pieces = rb.sample()["desired_goal"].view(10, 6, 3)
+        assert (pieces == pieces[:, :1]).all()
+
+
+def test_prioritized_sampler():
+    from torchrl.data import PrioritizedSampler
+
+    try:
+        sampler = PrioritizedSampler(100, alpha=0.7, beta=0.5)
+    except (ImportError, RuntimeError) as error:
+        pytest.skip(f"torchrl's compiled extension is missing: {error}")
+    rb = make_buffer(100, sampler=sampler)
+    envs = Envs(3, [5, 9])
+    for _ in range(30):
+        rb.extend(envs.chunk(4).reshape(-1))
+        batch = rb.sample()
+        check_batch(batch, rb.storage[:], "future")
+        check_untouched(batch, rb.storage[:])
+        batch["td_error"] = torch.rand(len(batch))
+        rb.update_tensordict_priority(batch)
+
+
+def test_prefetch_beside_writing():
+    rb = make_buffer(100, prefetch=3)
+    envs = Envs(3, [5, 9, 30])
+    failures = []
+
+    def write():
+        try:
+            for _ in range(200):
+                rb.extend(envs.chunk(3).reshape(-1))
+        except Exception as error:
+            failures.append(error)
+
+    rb.extend(envs.chunk(3).reshape(-1))
+    writer = threading.Thread(target=write)
+    writer.start()
+    while writer.is_alive():
+        batch = rb.sample()
+        assert not is_mixed(batch).any()
+        goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
+        assert (goal[:, 2] >= achieved[:, 2])[relabelled(batch)].all()
+    writer.join()
+    assert not failures
+    rb.shutdown()
+
+
+# -- saving, emptying, sharing --------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["state_dict", "dumps"])
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_reloaded_buffer_draws_the_same_goals(how, seed, strategy, tmp_path):
+    def sample(rb, envs):
+        torch.manual_seed(5)
+        batches = []
+        for _ in range(5):
+            batches.append(rb.sample())
+            rb.extend(envs.chunk(3).reshape(-1))
+        return torch.stack(batches)
+
+    rb, envs = make_buffer(100, seed=seed, strategy=strategy), Envs(3, [5, 9])
+    for _ in range(30):
+        rb.extend(envs.chunk(4).reshape(-1))
+        rb.sample()
+    new = make_buffer(100, seed=seed, strategy=strategy)
+    if how == "dumps":
+        rb.dumps(tmp_path)
+        new.loads(tmp_path)
+    else:
+        state = {k: v for k, v in rb.state_dict().items()}
+        new.extend(Envs(3, [5]).chunk(1).reshape(-1))  # a storage is made lazily
+        new.load_state_dict(state)
+    more = [Envs(3, [5, 9], seed=1) for _ in range(2)]
+    for source in more:
+        source.trajectory += 1000
+    expected, got = sample(rb, more[0]), sample(new, more[1])
+    assert (expected == got).all()
+    check_batch(new.sample(), new.storage[:], strategy)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("before", [7, 33, 60, 75])  # the last: 9 x capacity
+def test_emptied_buffer(strategy, before):
+    rb, envs = make_buffer(100, strategy=strategy), Envs(3, [5, 9, 40])
+    for _ in range(before):
+        rb.extend(envs.chunk(4).reshape(-1))
+        rb.sample()
+    if before * 12 % 100 == 0:
+        rb.transform[0].empty()
+    rb.empty()
+    for _ in range(30):
+        rb.extend(envs.chunk(4).reshape(-1))
+        check_batch(rb.sample(), rb.storage[:], strategy)
+
+
+def test_shared_buffer_raises():
+    with pytest.raises(RuntimeError, match="share_memory_"):
+        make_buffer(100, shared=True)
+
+
+def test_seed_does_not_touch_torchs_generator():
+    def goals(rb):
+        torch.manual_seed(0)
+        index = rb.sample()["index"]
+        return index, torch.rand(3)
+
+    plain = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=64)
+    rb = make_buffer(100, seed=0)
+    data = Envs(3, [5]).chunk(10).reshape(-1)
+    plain.extend(data)
+    rb.extend(data)
+    for a, b in zip(goals(plain), goals(rb), strict=True):
+        assert (a == b).all()
+
+
+def test_random_numbers_are_reproducible():
+    def sample(seed):
+        rb = make_buffer(100, seed=seed)
+        rb.extend(Envs(3, [5, 9]).chunk(20).reshape(-1))
+        torch.manual_seed(0)
+        return rb.sample()["desired_goal"]
+
+    assert (sample(1) == sample(1)).all()
+    assert (sample(1) != sample(2)).any()
+
+
+# -- what it cannot be combined with --------------------------------------------------
+
+
+def test_multi_step_raises():
+    rb = make_buffer(100)
+    rb.append_transform(MultiStepTransform(n_steps=3, gamma=0.9))
+    with pytest.raises(RuntimeError, match="MultiStepTransform"):
+        rb.extend(Envs(3, [5]).chunk(20))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_environment_raises(nested):
+    transform = HindsightRelabel(reward_fn)
+    with pytest.raises(ValueError, match="replay buffers"):
+        TransformedEnv(
+            GymEnv("Pendulum-v1"), Compose(transform) if nested else transform
+        )
+    env = TransformedEnv(GymEnv("Pendulum-v1"))
+    with pytest.raises(ValueError, match="replay buffers"):
+        env.append_transform(HindsightRelabel(reward_fn))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("data_device", ["cpu", "cuda"])
+@pytest.mark.parametrize("storage_device", ["cpu", "cuda"])
+def test_devices(data_device, storage_device):
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100, device=storage_device),
+        transform=HindsightRelabel(reward_fn),
+        batch_size=64,
+    )
+    envs = Envs(3, [5, 9])
+    for _ in range(30):
+        rb.extend(envs.chunk(4).reshape(-1).to(data_device))
+        batch = rb.sample()
+        assert batch["desired_goal"].device.type == storage_device
+        check_batch(batch, rb.storage[:], "future")
+    assert isinstance(batch, TensorDict)
+
+
+def test_nested_goal_keys():
+    transform = HindsightRelabel(
+        reward_fn,
+        her_ratio=1.0,
+        goal_key=("goals", "desired"),
+        achieved_goal_key=("goals", "achieved"),
+    )
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(30), transform=transform, batch_size=30
+    )
+    data = Envs(3, [5]).chunk(10).reshape(-1)
+    for part in (data, data["next"]):
+        part["goals"] = TensorDict(
+            achieved=part.pop("achieved_goal"),
+            desired=part.pop("desired_goal"),
+            batch_size=[30],
+        )
+    rb.extend(data)
+    before = rb.storage[:].clone()
+    for batch in (rb.sample(), rb[:]):
+        goal, achieved = batch["goals", "desired"], batch["next", "goals", "achieved"]
+        assert (goal[:, :2] == achieved[:, :2]).all()
+        assert (batch["next", "goals", "desired"] == goal).all()
+        assert (batch["next", "reward"] == reward_fn(achieved, goal)).all()
+    assert (rb.storage[:] == before).all()

@@ -1,0 +1,162 @@
+"""Hindsight goals at write time, as a transform of a replay buffer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+
+from torch_panda.transforms.buffer_only import BufferTransform
+from torch_panda.transforms.rewrite import GoalFunction, Rewriter
+from torch_panda.transforms.strategies import (
+    RANDOM,
+    Strategy,
+    choose_steps,
+    make_strategy,
+)
+from torch_panda.transforms.trajectories import TRAJECTORY_KEY, split_runs, streams_of
+
+
+class HindsightAugment(BufferTransform):
+    """Stores every transition once more for each of k goals achieved in its episode.
+
+    The paper's own way (Andrychowicz et al. 2017, arXiv 1707.01495, algorithm 1): "for
+    each stored transition, it stores k identical transitions with a different goal".
+    An episode is held back until it ends; then `extend` stores its transitions and k
+    relabelled copies of each, k + 1 times the memory of `HindsightRelabel`, which draws
+    new goals at every sample instead. What comes out is flat: the storage has one
+    dimension. An episode that never ends is never stored, and the copies keep the
+    original's trajectory id, so trajectories cannot be told apart in the buffer.
+
+    Args:
+        reward_fn: as in `HindsightRelabel`, called once an `extend`.
+
+    Keyword Args:
+        k: number of relabelled copies of a transition.
+        strategy: "future", "final", "episode", or a function, see `strategies`;
+            "random" would need the other episodes: `HindsightRelabel` has it.
+        goal_key: the desired goal, rewritten in the root and under "next".
+        achieved_goal_key: the achieved goal, read under "next".
+        reward_key: the reward.
+        terminated_fn: as in `HindsightRelabel`.
+        trajectory_key: as in `HindsightRelabel`.
+        single_env: as in `HindsightRelabel`.
+        seed: seeds a generator of its own. By default torch's is used.
+
+    Raises:
+        ValueError: an argument is out of range; the data do not tell which trajectory a
+            transition belongs to; a function returned the wrong shape; the transform
+            is put into an environment.
+        KeyError: the data lack an entry that is needed.
+        RuntimeError: the buffer is shared between processes, or the transform combined
+            with `MultiStepTransform`.
+    """
+
+    def __init__(
+        self,
+        reward_fn: GoalFunction,
+        *,
+        k: int = 4,
+        strategy: str | Strategy = "future",
+        goal_key: NestedKey = "desired_goal",
+        achieved_goal_key: NestedKey = "achieved_goal",
+        reward_key: NestedKey = ("next", "reward"),
+        terminated_fn: GoalFunction | None = None,
+        trajectory_key: NestedKey = TRAJECTORY_KEY,
+        single_env: bool = False,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        if k < 1:
+            raise ValueError(f"k must be at least 1, got {k}.")
+        chosen = make_strategy(strategy)
+        if chosen is None:
+            raise ValueError(
+                "HindsightAugment sees one episode at a time and cannot draw "
+                f"{RANDOM!r} goals; HindsightRelabel can."
+            )
+        self.k = k
+        self.strategy = strategy
+        self.trajectory_key = trajectory_key
+        self.single_env = single_env
+        self._strategy = chosen
+        self._rewriter = Rewriter(
+            reward_fn, terminated_fn, goal_key, achieved_goal_key, reward_key
+        )
+        self._held: dict[
+            int, list[TensorDictBase]
+        ] = {}  # stream -> parts of its episode
+        self._generator: torch.Generator | None = None
+        if seed is not None:
+            self._generator = torch.Generator().manual_seed(seed)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """Takes transitions in and returns those of the episodes that have ended."""
+        self._check_chain()
+        self._rewriter.check(tensordict)
+        shape = tensordict.batch_size
+        stream = streams_of(tensordict, self.trajectory_key, self.single_env)
+        if len(shape) > 1:  # time first, as the streams are
+            tensordict = tensordict.permute(len(shape) - 1, *range(len(shape) - 1))
+        flat = tensordict.reshape(-1)
+        runs = split_runs(stream, flat.get(("next", "done")).reshape(-1))
+        rows = runs.order.split(runs.length.tolist())
+        episodes = []
+        for name, ended, part in zip(runs.stream, runs.ended, rows, strict=True):
+            self._held.setdefault(name, []).append(flat[part])
+            if ended:
+                episodes.append(TensorDict.cat(self._held.pop(name)))
+        if not episodes:
+            return None
+        return self._augment(episodes)
+
+    def _augment(self, episodes: list[TensorDictBase]) -> TensorDictBase:
+        """Returns the episodes' transitions, then their k relabelled copies."""
+        original = TensorDict.cat(episodes)
+        device = original.get(self._rewriter.next_achieved_key).device
+        length = torch.tensor([len(e) for e in episodes], dtype=torch.int32)
+        start = (length.cumsum(0, dtype=torch.int32) - length).repeat_interleave(length)
+        end = length.repeat_interleave(length)
+        step = torch.arange(len(original), dtype=torch.int32) - start
+        step, start, end = (x.repeat(self.k).to(device) for x in (step, start, end))
+        goal_step = choose_steps(
+            self._strategy, step, torch.zeros_like(step), end, self._generator
+        )
+        goals = original.get(self._rewriter.next_achieved_key)[start + goal_step]
+        copies = TensorDict.cat([original] * self.k)
+        rows = torch.arange(len(copies), device=device)
+        self._rewriter.rewrite(copies, rows, goals)
+        return TensorDict.cat([original, copies])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Leaves what is sampled as it is."""
+        return tensordict
+
+    def empty(self) -> None:
+        """Drops the episodes held back, which the buffer's own `empty` does not."""
+        self._held.clear()
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns the episodes held back and the generator, for `state_dict`."""
+        generator = self._generator
+        return {
+            "held": {
+                s: TensorDict.cat(parts).to_dict() for s, parts in self._held.items()
+            },
+            "generator": None if generator is None else generator.get_state(),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Takes what `get_extra_state` returned."""
+        done = ("next", "done")
+        self._held = {
+            stream: [TensorDict(part, [len(part[done[0]][done[1]])])]
+            for stream, part in state["held"].items()
+        }
+        if state["generator"] is not None:
+            self._generator = self._generator or torch.Generator()
+            self._generator.set_state(state["generator"])
+
+    def __repr__(self) -> str:
+        return f"HindsightAugment(k={self.k}, strategy={self.strategy!r})"
