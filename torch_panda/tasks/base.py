@@ -177,14 +177,15 @@ def quaternion_to_euler(quaternion: Tensor) -> Tensor:
     sum or difference of the others is defined, roll is 0.
     """
     x, y, z, w = quaternion.unbind(-1)
+    xx, yy, zz, ww = quaternion.square().unbind(-1)
     sine = -2 * (x * z - w * y)
-    roll = torch.atan2(2 * (y * z + w * x), w * w - x * x - y * y + z * z)
+    roll = torch.atan2(2 * (y * z + w * x), ww - xx - yy + zz)
     pitch = torch.asin(sine.clamp(-1.0, 1.0))
-    yaw = torch.atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
-    up, down = sine >= 0.99999, sine <= -0.99999
-    vertical = up | down
-    side = torch.where(up, 1.0, -1.0)
-    roll = torch.where(vertical, 0.0, roll)
-    pitch = torch.where(vertical, side * (math.pi / 2), pitch)
-    yaw = torch.where(vertical, 2 * torch.atan2(-side * x, side * y), yaw)
+    yaw = torch.atan2(2 * (x * y + w * z), ww + xx - yy - zz)
+    vertical = sine.abs() >= 0.99999
+    if vertical.any():
+        side = sine.sign()
+        roll = torch.where(vertical, 0.0, roll)
+        pitch = torch.where(vertical, side * (math.pi / 2), pitch)
+        yaw = torch.where(vertical, 2 * torch.atan2(-side * x, side * y), yaw)
     return torch.stack((roll, pitch, yaw), dim=-1)

@@ -1,0 +1,58 @@
+"""Rotations against pybullet, rewards by hand."""
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torch_panda import Flip, Push, Stack
+from torch_panda.tasks.base import quaternion_to_euler
+
+angle = st.floats(-math.pi, math.pi)
+
+
+def assert_same_euler(quaternion):
+    ours = quaternion_to_euler(torch.tensor(quaternion, dtype=torch.float64))
+    theirs = pybullet.getEulerFromQuaternion(quaternion)
+    np.testing.assert_allclose(ours.numpy(), theirs, rtol=0, atol=1e-12)
+
+
+@given(angle, angle, angle)
+def test_euler_equals_pybullet(roll, pitch, yaw):
+    assert_same_euler(pybullet.getQuaternionFromEuler((roll, pitch, yaw)))
+
+
+@pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
+@given(roll=angle, yaw=angle)
+def test_euler_equals_pybullet_when_vertical(pitch, roll, yaw):
+    assert_same_euler(pybullet.getQuaternionFromEuler((roll, pitch, yaw)))
+
+
+def test_rewards_by_hand():
+    goal = torch.zeros(2, 3)
+    achieved = torch.tensor([[0.03, 0.0, 0.04], [0.03, 0.0, 0.039]])
+    assert Push().is_success(achieved, goal).flatten().tolist() == [False, True]
+    dense = Push(reward_type="dense").compute_reward(achieved[:1], goal[:1])
+    torch.testing.assert_close(dense, torch.tensor([[-0.05]]))
+
+
+def test_stack_compares_each_cube_or_both():
+    goal = torch.zeros(6)
+    achieved = torch.tensor([0.04, 0.0, 0.0, 0.0, 0.06, 0.0])
+    assert not Stack().is_success(achieved, goal)
+    norm = Stack(distance_threshold=0.1, per_object=False)
+    assert norm.is_success(achieved, goal)
+    dense = Stack(reward_type="dense").compute_reward(achieved, goal)
+    torch.testing.assert_close(dense, torch.tensor([-math.sqrt(0.0052)]))
+
+
+def test_flip_takes_opposite_quaternions_for_one_orientation():
+    quaternion = torch.tensor([0.5, 0.5, 0.5, 0.5])
+    assert Flip().is_success(quaternion, -quaternion)
+    other = torch.tensor([0.5, -0.5, 0.5, -0.5])
+    assert not Flip().is_success(quaternion, other)
+    assert Flip(reward_type="dense").compute_reward(quaternion, other) == -1.0
