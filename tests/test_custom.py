@@ -30,9 +30,6 @@ class PushBall(Task):
     def sample_objects(self, rng):
         return ((*rng.uniform(-0.1, 0.1, size=2), RADIUS, *NO_ROTATION),)
 
-    def target_pose(self, goal):
-        return goal.new_zeros(*goal.shape[:-1], 0, 7)
-
     def observation(self, simulation):
         return object_observation(simulation, 0)
 

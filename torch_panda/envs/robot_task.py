@@ -187,7 +187,9 @@ class RobotTaskEnv(EnvBase):
             self._start_episode(env)
         for key, value in given.items():
             state[key][envs] = value
-        self._simulation.target_pose[envs] = self.task.target_pose(self._goal[envs])
+        if self._simulation.scene.targets:
+            target_pose = self.task.target_pose(self._goal[envs])
+            self._simulation.target_pose[envs] = target_pose
         self._simulation.reset(envs)
         return self._make_tensordict(self._observe())
 

@@ -82,7 +82,7 @@ class Task(ABC):
     def target_pose(self, goal: Tensor) -> Tensor:
         """Where goals put the markers: (..., goal_dim) -> (..., n_targets, 7).
 
-        By default a goal is one position for each marker.
+        By default a goal is one position for each marker. Unused without markers.
         """
         positions = goal.unflatten(-1, (-1, 3))
         rotation = goal.new_tensor(NO_ROTATION).expand(*positions.shape[:-1], 4)
