@@ -15,7 +15,6 @@ class PushBall(Task):
 
     goal_dim = 3
     observation_dim = 12
-    num_objects = 1
     max_episode_steps = 30
 
     def build(self, client):

@@ -8,12 +8,11 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from torch_panda.transforms.buffer_only import BufferTransform
-from torch_panda.transforms.rewrite import GoalFunction, Rewriter
+from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import (
     RANDOM,
     Strategy,
     choose_steps,
-    make_strategy,
 )
 from torch_panda.transforms.trajectories import TRAJECTORY_KEY, split_runs, streams_of
 
@@ -67,29 +66,27 @@ class HindsightAugment(BufferTransform):
         single_env: bool = False,
         seed: int | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            reward_fn,
+            strategy=strategy,
+            goal_key=goal_key,
+            achieved_goal_key=achieved_goal_key,
+            reward_key=reward_key,
+            terminated_fn=terminated_fn,
+            trajectory_key=trajectory_key,
+            single_env=single_env,
+            seed=seed,
+        )
         if k < 1:
             raise ValueError(f"k must be at least 1, got {k}.")
-        chosen = make_strategy(strategy)
-        if chosen is None:
+        if self._strategy is None:
             raise ValueError(
                 "HindsightAugment sees one episode at a time and cannot draw "
                 f"{RANDOM!r} goals; HindsightRelabel can."
             )
         self.k = k
-        self.strategy = strategy
-        self.trajectory_key = trajectory_key
-        self.single_env = single_env
-        self._strategy = chosen
-        self._rewriter = Rewriter(
-            reward_fn, terminated_fn, goal_key, achieved_goal_key, reward_key
-        )
-        self._held: dict[
-            int, list[TensorDictBase]
-        ] = {}  # stream -> parts of its episode
-        self._generator: torch.Generator | None = None
-        if seed is not None:
-            self._generator = torch.Generator().manual_seed(seed)
+        # stream -> parts of its episode
+        self._held: dict[int, list[TensorDictBase]] = {}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Takes transitions in and returns those of the episodes that have ended."""
@@ -120,6 +117,7 @@ class HindsightAugment(BufferTransform):
         end = length.repeat_interleave(length)
         step = torch.arange(len(original), dtype=torch.int32) - start
         step, start, end = (x.repeat(self.k).to(device) for x in (step, start, end))
+        assert self._strategy is not None  # the constructor refuses "random"
         goal_step = choose_steps(
             self._strategy, step, torch.zeros_like(step), end, self._generator
         )
@@ -139,12 +137,11 @@ class HindsightAugment(BufferTransform):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the episodes held back and the generator, for `state_dict`."""
-        generator = self._generator
         return {
             "held": {
                 s: TensorDict.cat(parts).to_dict() for s, parts in self._held.items()
             },
-            "generator": None if generator is None else generator.get_state(),
+            "generator": self._generator_state(),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -154,9 +151,7 @@ class HindsightAugment(BufferTransform):
             stream: [TensorDict(part, [len(part[done[0]][done[1]])])]
             for stream, part in state["held"].items()
         }
-        if state["generator"] is not None:
-            self._generator = self._generator or torch.Generator()
-            self._generator.set_state(state["generator"])
+        self._load_generator(state["generator"])
 
     def __repr__(self) -> str:
         return f"HindsightAugment(k={self.k}, strategy={self.strategy!r})"

@@ -2,12 +2,41 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
+import torch
+from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import Compose, EnvBase, MultiStepTransform, Transform
+
+from torch_panda.transforms.rewrite import GoalFunction, Rewriter
+from torch_panda.transforms.strategies import Strategy, make_strategy
 
 
 class BufferTransform(Transform):
     """A transform that refuses environments, and n-step rewards beside it."""
+
+    def __init__(
+        self,
+        reward_fn: GoalFunction,
+        *,
+        strategy: str | Strategy,
+        goal_key: NestedKey,
+        achieved_goal_key: NestedKey,
+        reward_key: NestedKey,
+        terminated_fn: GoalFunction | None,
+        trajectory_key: NestedKey,
+        single_env: bool,
+        seed: int | None,
+    ) -> None:
+        super().__init__()
+        self.strategy = strategy
+        self.trajectory_key = trajectory_key
+        self.single_env = single_env
+        self._strategy = make_strategy(strategy)
+        self._rewriter = Rewriter(
+            reward_fn, terminated_fn, goal_key, achieved_goal_key, reward_key
+        )
+        self._generator: torch.Generator | None = None
+        if seed is not None:
+            self._generator = torch.Generator().manual_seed(seed)
 
     # Tells torchrl that a buffer shared between processes needs share_memory_(), which
     # is not there: every process would write to a memory of its own.
@@ -29,6 +58,14 @@ class BufferTransform(Transform):
     def _env_error(self) -> str:
         name = type(self).__name__
         return f"{name} can only be applied to replay buffers, not to environments."
+
+    def _generator_state(self) -> torch.Tensor | None:
+        return None if self._generator is None else self._generator.get_state()
+
+    def _load_generator(self, state: torch.Tensor | None) -> None:
+        if state is not None:
+            self._generator = self._generator or torch.Generator()
+            self._generator.set_state(state)
 
     def _check_chain(self) -> None:
         """Raises a RuntimeError if the buffer makes rewards of n steps."""

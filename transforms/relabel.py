@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torch_panda.transforms.buffer_only import BufferTransform
 from torch_panda.transforms.memory import LOOKING_AHEAD, GoalMemory
-from torch_panda.transforms.rewrite import GoalFunction, Rewriter
-from torch_panda.transforms.strategies import Strategy, make_strategy
+from torch_panda.transforms.rewrite import GoalFunction
+from torch_panda.transforms.strategies import Strategy
 from torch_panda.transforms.trajectories import (
     TRAJECTORY_KEY,
     streams_of,
@@ -98,7 +98,17 @@ class HindsightRelabel(BufferTransform):
         capacity: int | None = None,
         seed: int | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            reward_fn,
+            strategy=strategy,
+            goal_key=goal_key,
+            achieved_goal_key=achieved_goal_key,
+            reward_key=reward_key,
+            terminated_fn=terminated_fn,
+            trajectory_key=trajectory_key,
+            single_env=single_env,
+            seed=seed,
+        )
         if not 0 <= her_ratio <= 1:
             raise ValueError(f"her_ratio must be within [0, 1], got {her_ratio}.")
         if unit not in ("row", "slice"):
@@ -106,18 +116,8 @@ class HindsightRelabel(BufferTransform):
         if capacity is not None and capacity < 1:
             raise ValueError(f"capacity must be positive, got {capacity}.")
         self.her_ratio = her_ratio
-        self.trajectory_key = trajectory_key
-        self.single_env = single_env
         self.unit = unit
-        self.strategy = strategy
-        self._strategy = make_strategy(strategy)
-        self._rewriter = Rewriter(
-            reward_fn, terminated_fn, goal_key, achieved_goal_key, reward_key
-        )
         self._memory = GoalMemory(capacity)
-        self._generator: torch.Generator | None = None
-        if seed is not None:
-            self._generator = torch.Generator().manual_seed(seed)
         self._lock = threading.Lock()  # a prefetching buffer samples in threads
 
     # -- a replay buffer's two calls --------------------------------------------------
@@ -218,19 +218,16 @@ class HindsightRelabel(BufferTransform):
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the memory and the generator, for `state_dict` and `dumps`."""
         with self._lock:
-            generator = self._generator
             return {
                 "memory": self._memory.state(),
-                "generator": None if generator is None else generator.get_state(),
+                "generator": self._generator_state(),
             }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Takes what `get_extra_state` returned."""
         with self._lock:
             self._memory.load(state["memory"])
-            if state["generator"] is not None:
-                self._generator = self._generator or torch.Generator()
-                self._generator.set_state(state["generator"])
+            self._load_generator(state["generator"])
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()

@@ -229,7 +229,7 @@ class RobotTaskEnv(EnvBase):
             self.robot.neutral_joint_position, dtype=torch.float64
         )
         simulation.joint_velocity[env] = 0.0
-        if self.task.num_objects:
+        if simulation.scene.objects:
             simulation.object_pose[env] = torch.as_tensor(
                 self.task.sample_objects(rng), dtype=torch.float64
             )

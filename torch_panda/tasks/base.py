@@ -43,7 +43,7 @@ class Task(ABC):
     episode of one environment with its own random generator; all else is batched over
     the state tensors of the simulation. Lengths are in metres, in the world frame.
 
-    A task sets ``goal_dim``, ``observation_dim``, ``num_objects`` and, unless it is 50,
+    A task sets ``goal_dim``, ``observation_dim`` and, unless it is 50,
     ``max_episode_steps``.
 
     Args:
@@ -53,7 +53,6 @@ class Task(ABC):
 
     goal_dim: int
     observation_dim: int
-    num_objects: int
     max_episode_steps: int = 50
 
     def __init__(
@@ -76,7 +75,7 @@ class Task(ABC):
         """Draw a goal: (goal_dim,)."""
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
-        """Draw start poses: (num_objects, 7), position and quaternion xyzw."""
+        """Draw start poses: (n_objects, 7), position and quaternion xyzw."""
         return ()
 
     def target_pose(self, goal: Tensor) -> Tensor:

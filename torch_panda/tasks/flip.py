@@ -28,7 +28,6 @@ class Flip(Task):
 
     goal_dim = 4
     observation_dim = 13
-    num_objects = 1
 
     def __init__(
         self,

@@ -31,7 +31,6 @@ class Push(Task):
 
     goal_dim = 3
     observation_dim = 12
-    num_objects = 1
     # Where panda-gym creates the target, before it moves to the first goal [m].
     marker_height = CUBE_SIZE / 2
 

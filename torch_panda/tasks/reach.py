@@ -20,7 +20,6 @@ class Reach(Task):
 
     goal_dim = 3
     observation_dim = 0
-    num_objects = 0
 
     def __init__(
         self,

@@ -42,7 +42,6 @@ class Slide(Task):
 
     goal_dim = 3
     observation_dim = 12
-    num_objects = 1
 
     def __init__(
         self,

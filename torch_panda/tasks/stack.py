@@ -40,7 +40,6 @@ class Stack(Task):
 
     goal_dim = 6
     observation_dim = 24
-    num_objects = 2
     max_episode_steps = 100
 
     def __init__(
