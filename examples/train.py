@@ -1,305 +1,349 @@
-"""Train DDPG with hindsight experience replay on any task, Reach unless told otherwise.
+"""Train DDPG, TD3, SAC or TQC with hindsight experience replay on any task.
 
-    python examples/train.py --env-id PandaPush-v1 --total-steps 300000
+    python examples/train.py --env-id PandaPush-v1 --algo td3 --total-steps 300000
 
-Hyperparameters are those of the panda-gym paper (arXiv 2106.13687); where its table is
-silent they follow the HER of OpenAI Baselines, and the comment says so.
+The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687);
+where its table is silent they follow the HER of OpenAI Baselines. An iteration is one
+episode of every environment, then the gradient steps due for it, so that between two
+iterations a run is its weights, its buffer and its random numbers, and `--resume`
+continues it bit for bit.
 """
 
 import csv
 import json
+import signal
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Literal
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
-
-import matplotlib.pyplot as plt
 import torch
 import tyro
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule as Mod
-from tensordict.nn import TensorDictSequential as Seq
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MLP, AdditiveGaussianModule, EGreedyModule
-from torchrl.objectives import DDPGLoss, SoftUpdate
-from torchrl.objectives.value import TD0Estimator
+from torchrl.envs.utils import ExplorationType
+from torchrl.record import CSVLogger, TensorboardLogger
+from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 import torch_panda
-from torch_panda.transforms import HindsightRelabel
+from agents import Agent, Hyperparameters, replace, save_policy
+from evaluate import evaluate
+from plot import plot_curve
+from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 
 @dataclass
-class Args:
+class Args(Hyperparameters):
     """What to train, how long, and where to write."""
 
+    preset: Literal["paper", "tuned"] = "paper"
+    """where the defaults of the other options are from: the paper's table, or ours"""
     env_id: str = "PandaReach-v1"
     """one of torch_panda.ENV_IDS"""
+    her: Literal["relabel", "augment", "none"] = "relabel"
+    """hindsight goals when sampling, as stored copies, or none"""
+    her_ratio: float = 0.8
+    """share of relabelled transitions, k / (k + 1): k = 4 goals per transition"""
     seed: int = 0
     """of the environments, the networks and the sampling"""
     num_envs: int = 8
     """environments that are stepped in parallel"""
     num_threads: int | None = None
     """threads that step them; None means one per core"""
+    device: str = "cpu"
+    """of the networks and the replay buffer"""
     total_steps: int = 10_000
     """environment steps, over all environments"""
     updates_per_step: float = 0.5
     """gradient steps per environment step"""
+    batch_size: int = 256
+    """transitions per gradient step"""
+    buffer_size: int = 1_000_000
+    """transitions in the replay buffer"""
     eval_interval: int = 1_000
     """environment steps between evaluations"""
     eval_episodes: int = 80
     """fresh episodes per evaluation"""
+    save_interval: int = 20_000
+    """environment steps between the states that --resume starts from"""
     out: Path | None = None
-    """folder of the results; None means runs/<env-id>-<seed>"""
-
-    learning_rate: float = 1e-3
-    """of Adam, for actor and critic"""
-    batch_size: int = 256
-    """transitions per gradient step"""
-    tau: float = 0.05
-    """share of the new weights in the target networks (Polyak averaging 0.95)"""
-    her_ratio: float = 0.8
-    """share of relabelled transitions: k = 4 goals per transition"""
-    action_l2: float = 1.0
-    """weight of the mean squared action in the actor's loss"""
-    random_eps: float = 0.3
-    """probability of a random action"""
-    noise_eps: float = 0.2
-    """standard deviation of the Gaussian noise on actions"""
-    buffer_size: int = 1_000_000
-    """transitions in the replay buffer"""
+    """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
+    resume: bool = False
+    """continue the run in that folder, with the same other arguments"""
+    tensorboard: bool = False
+    """log to TensorBoard, too"""
 
 
-STATE_KEYS = ["observation", "desired_goal"]
-CLIP_OBSERVATION = 200.0  # the paper
-CLIP_NORMALIZED = 5.0  # OpenAI Baselines
+PRESETS = {
+    "paper": Args(),
+    "tuned": Args(preset="tuned"),
+}
+# What may differ between a run and its continuation.
+FREE_ARGUMENTS = {"resume", "out", "num_threads", "tensorboard", "save_interval"}
+STORED_KEYS = [
+    "observation",
+    "desired_goal",
+    "action",
+    ("collector", "traj_ids"),
+    ("next", "observation"),
+    ("next", "achieved_goal"),
+    ("next", "desired_goal"),
+    ("next", "reward"),
+    ("next", "terminated"),
+    ("next", "done"),
+]
 
 
-class Normalizer(nn.Module):
-    """Running standardisation of what the networks see, as in OpenAI Baselines."""
+class Run:
+    """A training: what it is made of, and what a continuation needs to know."""
 
-    count: Tensor
-    total: Tensor
-    total_squared: Tensor
-    mean: Tensor
-    std: Tensor
+    def __init__(self, args: Args, out: Path) -> None:
+        self.args = args
+        self.out = out
+        self.env = torch_panda.make(
+            args.env_id,
+            num_envs=args.num_envs,
+            num_threads=args.num_threads,
+            device=args.device,
+        )
+        self.eval_env = torch_panda.make(
+            args.env_id,
+            num_envs=min(16, args.eval_episodes),
+            num_threads=args.num_threads,
+            device=args.device,
+        )
+        torch.manual_seed(args.seed)
+        self.agent = Agent(
+            self.env,
+            args,
+            max_episode_steps=self.env.max_episode_steps,
+            sparse="Dense" not in args.env_id,
+        ).to(args.device)
+        self.buffer = make_buffer(args, self.env)
+        self.curve: list[dict[str, float]] = []
+        self.steps = 0
+        self.seconds = 0.0
+        # Made before `load`, because making it draws random numbers.
+        self.collector = self.make_collector()
 
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("std", torch.ones(size))
+    def train(self) -> None:
+        """Collect, learn and evaluate until the last step or Ctrl-C."""
+        args, out = self.args, self.out
+        loggers: list[Logger] = [CSVLogger("log", log_dir=str(out))]
+        if args.tensorboard:
+            loggers.append(TensorboardLogger("tensorboard", log_dir=str(out)))
+        started = time.perf_counter() - self.seconds
+        stop = StopSignal()
+        progress = tqdm(
+            initial=self.steps,
+            total=args.total_steps,
+            unit="step",
+            desc=f"{args.env_id} {args.algo}",
+        )
+        self.show(progress)
+        self.reseed(self.env)
+        for data in self.collector:
+            before, self.steps = self.steps, self.steps + data.numel()
+            losses = self.learn(data)
+            progress.update(data.numel())
+            self.seconds = time.perf_counter() - started
+            finished = self.steps >= args.total_steps
+            if finished or crossed(args.eval_interval, before, self.steps):
+                self.evaluate()
+                self.show(progress)
+                for logger in loggers:
+                    for key, value in {**self.curve[-1], **losses}.items():
+                        logger.log_scalar(key, value, step=self.steps)
+            if finished or stop or crossed(args.save_interval, before, self.steps):
+                replace(out / "resume.pt", self.save)
+            if finished or stop:
+                break
+            self.reseed(self.env)
+        progress.close()
 
-    def update(self, observation: Tensor, goal: Tensor) -> None:
-        """Take more rows, (..., size of each), into the statistics."""
-        rows = torch.cat((observation, goal), -1).flatten(0, -2).double()
-        rows = rows.clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
-        self.count += len(rows)
-        self.total += rows.sum(0)
-        self.total_squared += rows.square().sum(0)
-        mean = self.total / self.count
-        variance = (self.total_squared / self.count - mean.square()).clamp(min=1e-4)
-        self.mean.copy_(mean)
-        self.std.copy_(variance.sqrt())
+    def make_collector(self) -> Collector:
+        """Whole episodes of all environments, one batch [num_envs, steps] each time."""
+        return Collector(
+            self.env,
+            self.agent.explore,
+            frames_per_batch=self.args.num_envs * self.env.max_episode_steps,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            exploration_type=ExplorationType.RANDOM,
+            auto_register_policy_transforms=True,
+        )
 
-    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Standardise (..., size of each) to (..., size)."""
-        inputs = torch.cat((observation, goal), -1)
-        inputs = inputs.clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
-        normalized = (inputs - self.mean) / self.std
-        return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+    def learn(self, data: TensorDictBase) -> dict[str, float]:
+        """Store the episodes and take the gradient steps that are due for them.
 
+        Returns:
+            the mean of each loss.
+        """
+        # The next batch begins with a reset: an episode that is not over is cut here.
+        data["next", "done"][:, -1] = True
+        data = data.select(*STORED_KEYS)
+        stored = self.buffer[self.buffer.extend(data.reshape(-1))]
+        # As in Baselines, the statistics are of relabelled episodes.
+        self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
+        due = int(self.steps * self.args.updates_per_step) - self.agent.updates
+        losses: dict[str, list[Tensor]] = {}
+        for _ in range(due):
+            for key, loss in self.agent.update(self.buffer.sample()).items():
+                losses.setdefault(key, []).append(loss)
+        return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
 
-class ClippedTD0(TD0Estimator):
-    """TD(0) targets within what a return of rewards in [-1, 0] can be (Baselines)."""
-
-    def value_estimate(self, *args: object, **kwargs: object) -> Tensor:
-        """The target, clipped to [-1 / (1 - gamma), 0]."""
-        target = super().value_estimate(*args, **kwargs)
-        return target.clamp(float(-1 / (1 - self.gamma)), 0.0)
-
-
-def make_networks(env: torch_panda.RobotTaskEnv) -> tuple[Normalizer, Seq, Seq]:
-    """The normaliser, the actor and the critic: three layers of 256 units each."""
-    size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
-    action_size = env.action_spec.shape[-1]
-    normalizer = Normalizer(size)
-    hidden = {"num_cells": [256, 256, 256], "activation_class": nn.ReLU}
-    policy = nn.Sequential(
-        MLP(in_features=size, out_features=action_size, **hidden), nn.Tanh()
-    )
-    value = MLP(in_features=size + action_size, out_features=1, **hidden)
-    normalize = Mod(normalizer, STATE_KEYS, ["normalized"])
-    actor = Seq(normalize, Mod(policy, ["normalized"], ["action"]))
-    critic = Seq(
-        normalize, Mod(value, ["normalized", "action"], ["state_action_value"])
-    )
-    return normalizer, actor, critic
-
-
-def evaluate(env: torch_panda.RobotTaskEnv, actor: Seq, episodes: int) -> float:
-    """Share of fresh episodes that end in success."""
-    successes: list[bool] = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        while len(successes) < episodes:
-            rollout = env.rollout(
-                env.max_episode_steps, actor, break_when_any_done=False
-            )
-            # A -v3 episode ends at its first success, which `any` finds.
-            last = rollout["next", "success"]
-            done = last.any(1) if env.terminate_on_success else last[:, -1]
-            successes += done.flatten().tolist()
-    return sum(successes[:episodes]) / episodes
-
-
-def plot(curve: list[dict[str, float]], env_id: str, path: Path) -> None:
-    """Draw the learning curve."""
-    figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
-    axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
-    axes.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.05, 1.05))
-    axes.set_title(env_id)
-    axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
-def write_results(
-    out: Path, curve: list[dict[str, float]], args: Args, networks: nn.ModuleDict
-) -> None:
-    """Write the curve as CSV and PNG, and the checkpoint."""
-    if curve:
-        with (out / "curve.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(curve[0]))
+    def evaluate(self) -> None:
+        """Add a point to the curve, and write and draw it."""
+        self.reseed(self.eval_env)
+        result = evaluate(self.eval_env, self.agent.policy, self.args.eval_episodes)
+        row = {
+            "step": self.steps,
+            "success": float(result.success.float().mean()),
+            "ever_success": float(result.ever.float().mean()),
+            "return": float(result.episode_return.mean()),
+            "updates": self.agent.updates,
+            "seconds": round(self.seconds, 2),
+        }
+        self.curve.append(row)
+        with (self.out / "curve.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(row))
             writer.writeheader()
-            writer.writerows(curve)
-        plot(curve, args.env_id, out / "curve.png")
-    checkpoint = {"env_id": args.env_id, "networks": networks.state_dict()}
-    torch.save(checkpoint, out / "checkpoint.pt")
+            writer.writerows(self.curve)
+        plot_curve(self.curve, self.args.env_id, self.out / "curve.png")
+        save_policy(self.out / "checkpoint.pt", self.agent, self.args.env_id)
+
+    def reseed(self, env: torch_panda.RobotTaskEnv) -> None:
+        """Make the next episodes follow from the random state that is saved."""
+        env.set_seed(int(torch.randint(2**62, ())))
+
+    def show(self, progress: tqdm) -> None:
+        """Show the last success rate beside the progress."""
+        if self.curve:
+            progress.set_postfix(success=f"{self.curve[-1]['success']:.0%}")
+
+    def save(self, path: Path) -> None:
+        """Write all that changes in a run."""
+        state = {
+            "args": fixed(self.args),
+            "agent": self.agent.state_dict(),
+            "optimizer": self.agent.optimizer.state_dict(),
+            "updates": self.agent.updates,
+            "buffer": self.buffer.state_dict(),
+            "random": torch.get_rng_state(),
+            "cuda_random": torch.cuda.get_rng_state_all(),
+            "curve": self.curve,
+            "steps": self.steps,
+            "seconds": self.seconds,
+        }
+        torch.save(state, path)
+
+    def load(self, path: Path) -> None:
+        """Take what `save` wrote.
+
+        Raises:
+            ValueError: it is the state of a run with other arguments.
+        """
+        state = torch.load(path)
+        ours, theirs = fixed(self.args), state["args"]
+        differing = [
+            f"{key} was {theirs.get(key)!r}, is {value!r}"
+            for key, value in ours.items()
+            if theirs.get(key) != value
+        ]
+        if differing:
+            raise ValueError(f"cannot resume {path.parent}: {'; '.join(differing)}")
+        self.agent.load_state_dict(state["agent"])
+        self.agent.optimizer.load_state_dict(state["optimizer"])
+        self.agent.updates = state["updates"]
+        self.buffer.load_state_dict(state["buffer"])
+        torch.set_rng_state(state["random"])
+        torch.cuda.set_rng_state_all(state["cuda_random"])
+        self.curve = state["curve"]
+        self.steps = state["steps"]
+        self.seconds = state["seconds"]
+
+    def close(self) -> None:
+        """Free the environments."""
+        self.collector.shutdown()
+        self.eval_env.close()
+
+
+class StopSignal:
+    """True after Ctrl-C or a SIGTERM; a second one ends the program as usual."""
+
+    def __init__(self) -> None:
+        self.received = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._receive)
+
+    def _receive(self, number: int, frame: object) -> None:
+        self.received = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        tqdm.write("stopping after this iteration; again to stop at once")
+
+    def __bool__(self) -> bool:
+        return self.received
+
+
+def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBuffer:
+    """The replay buffer with the chosen kind of hindsight."""
+    iteration = args.num_envs * env.max_episode_steps
+    capacity = min(args.buffer_size, args.total_steps + iteration)
+    transform: HindsightRelabel | HindsightAugment | None = None
+    if args.her == "relabel":
+        transform = HindsightRelabel(
+            env.compute_reward, her_ratio=args.her_ratio, seed=args.seed
+        )
+    elif args.her == "augment":
+        k = round(args.her_ratio / (1 - args.her_ratio))
+        transform = HindsightAugment(env.compute_reward, k=k, seed=args.seed)
+        capacity *= k + 1
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity, device=args.device),
+        transform=transform,
+        batch_size=args.batch_size,
+    )
+
+
+def crossed(interval: int, before: int, after: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
+def fixed(args: Args) -> dict[str, Any]:
+    """The arguments that a continuation must share."""
+    return {
+        key: value for key, value in asdict(args).items() if key not in FREE_ARGUMENTS
+    }
 
 
 def main(args: Args) -> None:
-    """Collect, learn, evaluate, and write what came out."""
+    """Train, and say where the results are."""
     if args.total_steps < 1 or args.updates_per_step < 0:
         raise SystemExit("total_steps must be positive, updates_per_step not negative")
-    out = args.out or Path("runs") / f"{args.env_id}-{args.seed}"
-    torch.manual_seed(args.seed)
+    out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
     try:
-        env = torch_panda.make(
-            args.env_id, num_envs=args.num_envs, num_threads=args.num_threads
-        )
+        run = Run(args, out)
+        if args.resume:
+            run.load(out / "resume.pt")
+    except FileNotFoundError:
+        raise SystemExit(f"there is no run to resume in {out}") from None
     except ValueError as error:
         raise SystemExit(str(error)) from None
     out.mkdir(parents=True, exist_ok=True)
     (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
-    eval_env = torch_panda.make(
-        args.env_id,
-        num_envs=min(16, args.eval_episodes),
-        num_threads=args.num_threads,
-        seed=args.seed + 1_000_000,
-    )
-
-    normalizer, actor, critic = make_networks(env)
-    networks = nn.ModuleDict({"actor": actor, "critic": critic})
-    loss_module = DDPGLoss(actor, critic, loss_function="l2", delay_value=True)
-    gamma = 1 - 1 / env.max_episode_steps  # OpenAI Baselines
-    # The bounds that targets are clipped to hold for rewards of -1 and 0.
-    estimator = TD0Estimator if "Dense" in args.env_id else ClippedTD0
-    loss_module.make_value_estimator(
-        estimator, gamma=gamma, value_network=loss_module.actor_critic
-    )
-    loss_module.set_keys(state_action_value="state_action_value")
-    soft_update = SoftUpdate(loss_module, tau=args.tau)
-    actor_optimizer = torch.optim.Adam(
-        loss_module.actor_network_params.values(True, True), lr=args.learning_rate
-    )
-    critic_optimizer = torch.optim.Adam(
-        loss_module.value_network_params.values(True, True), lr=args.learning_rate
-    )
-
-    explore = Seq(
-        actor,
-        AdditiveGaussianModule(
-            env.action_spec, sigma_init=args.noise_eps, sigma_end=args.noise_eps
-        ),
-        EGreedyModule(
-            env.action_spec, eps_init=args.random_eps, eps_end=args.random_eps
-        ),
-    )
-    collector = Collector(
-        env,
-        explore,
-        frames_per_batch=args.num_envs * 5,
-        total_frames=args.total_steps,
-        exploration_type=ExplorationType.RANDOM,
-        auto_register_policy_transforms=True,
-    )
-    collector.set_seed(args.seed)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(min(args.buffer_size, args.total_steps + 1000)),
-        transform=HindsightRelabel(
-            env.compute_reward, her_ratio=args.her_ratio, seed=args.seed
-        ),
-        batch_size=args.batch_size,
-    )
-
-    def learn(batch: TensorDictBase) -> None:
-        """One gradient step of both networks."""
-        losses = loss_module(batch)
-        action = actor(batch.select(*STATE_KEYS))["action"]
-        actor_loss = losses["loss_actor"] + args.action_l2 * action.square().mean()
-        actor_optimizer.zero_grad()
-        critic_optimizer.zero_grad()
-        (actor_loss + losses["loss_value"]).backward()
-        actor_optimizer.step()
-        critic_optimizer.step()
-        soft_update.step()
-
-    curve: list[dict[str, float]] = []
-    steps, updates, next_evaluation = 0, 0, args.eval_interval
-    start = time.perf_counter()
-    progress = tqdm(total=args.total_steps, unit="step", desc=args.env_id)
-    try:
-        for data in collector:
-            data = data.exclude("normalized", ("next", "normalized"))
-            normalizer.update(data["observation"], data["desired_goal"])
-            buffer.extend(data.reshape(-1))
-            steps += data.numel()
-            while updates < steps * args.updates_per_step:
-                learn(buffer.sample())
-                updates += 1
-            progress.update(data.numel())
-            if steps >= next_evaluation or steps >= args.total_steps:
-                next_evaluation += args.eval_interval
-                success = evaluate(eval_env, actor, args.eval_episodes)
-                seconds = round(time.perf_counter() - start, 2)
-                curve.append(
-                    {
-                        "step": steps,
-                        "success": success,
-                        "updates": updates,
-                        "seconds": seconds,
-                    }
-                )
-                progress.set_postfix(success=f"{success:.0%}")
-                write_results(out, curve, args, networks)
-    except KeyboardInterrupt:
-        progress.write(f"interrupted after {steps} steps")
-    finally:
-        progress.close()
-        write_results(out, curve, args, networks)
-        collector.shutdown()
-        eval_env.close()
-    if curve:
-        print(f"success {curve[-1]['success']:.0%} after {steps} steps; see {out}")
+    run.train()
+    run.close()
+    if run.curve:
+        success = run.curve[-1]["success"]
+        print(f"success {success:.0%} after {run.steps} steps; see {out}")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    # Parsed twice: the preset says what the other options default to.
+    preset = tyro.cli(Args).preset
+    main(tyro.cli(Args, default=PRESETS[preset]))

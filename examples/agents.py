@@ -1,0 +1,325 @@
+"""DDPG, TD3, SAC and TQC for goal-conditioned tasks, from torchrl's losses."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule as Mod
+from tensordict.nn import TensorDictSequential as Seq
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.modules import (
+    MLP,
+    AdditiveGaussianModule,
+    EGreedyModule,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+)
+from torchrl.objectives import DDPGLoss, SACLoss, SoftUpdate, TD3Loss, TQCLoss
+from torchrl.objectives.value import TD0Estimator
+
+Algo = Literal["ddpg", "td3", "sac", "tqc"]
+
+STATE_KEYS = ["observation", "desired_goal"]
+CLIP_OBSERVATION = 200.0  # the panda-gym paper
+CLIP_NORMALIZED = 5.0  # OpenAI Baselines' HER
+POLICY_DELAY = 2  # TD3: critic updates per actor update (arXiv 1802.09477)
+NUM_QUANTILES = 25  # TQC: per critic (arXiv 2005.04269)
+
+
+@dataclass
+class Hyperparameters:
+    """Of the agents. The defaults are the panda-gym paper's (arXiv 2106.13687)."""
+
+    algo: Algo = "ddpg"
+    """algorithm"""
+    double_q: bool = True
+    """take the smaller of two Q networks' targets (TD3 and SAC) or the lower part of
+    both (TQC); without it there is one Q network. DDPG has one in any case"""
+    hidden_size: int = 256
+    """units of each of the three layers of actor and critic"""
+    learning_rate: float = 1e-3
+    """of Adam, for actor and critic"""
+    gamma: float | None = None
+    """discount; None means 1 - 1 / steps of an episode, as OpenAI Baselines"""
+    tau: float = 0.05
+    """share of the new weights in the target networks (Polyak averaging 0.95)"""
+    action_l2: float = 1.0
+    """DDPG, TD3: weight of the mean squared action in the actor's loss"""
+    random_eps: float = 0.3
+    """DDPG, TD3: probability of a random action"""
+    noise_eps: float = 0.2
+    """DDPG, TD3: standard deviation of the Gaussian noise on actions"""
+    policy_noise: float = 0.2
+    """TD3: standard deviation of the noise on target actions, clipped at 0.5"""
+    alpha: float = 0.2
+    """SAC, TQC: entropy coefficient, or its first value"""
+    learn_alpha: bool = False
+    """SAC, TQC: tune the entropy coefficient towards an entropy of -action size"""
+    drop_quantiles: int = 2
+    """TQC: quantiles per critic that the target leaves out, the highest ones"""
+
+
+class Normalizer(nn.Module):
+    """Running standardisation of what the networks see, as in OpenAI Baselines."""
+
+    count: Tensor
+    total: Tensor
+    total_squared: Tensor
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("std", torch.ones(size))
+
+    def update(self, observation: Tensor, goal: Tensor) -> None:
+        """Take more rows, (..., size of each), into the statistics."""
+        rows = torch.cat((observation, goal), -1).flatten(0, -2).double()
+        rows = rows.clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
+        self.count += len(rows)
+        self.total += rows.sum(0)
+        self.total_squared += rows.square().sum(0)
+        mean = self.total / self.count
+        variance = (self.total_squared / self.count - mean.square()).clamp(min=1e-4)
+        self.mean.copy_(mean)
+        self.std.copy_(variance.sqrt())
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Standardise (..., size of each) to (..., size)."""
+        inputs = torch.cat((observation, goal), -1)
+        inputs = inputs.clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
+        normalized = (inputs - self.mean) / self.std
+        return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+
+
+class ClippedTD0(TD0Estimator):
+    """TD(0) targets within what a return of rewards in [-1, 0] can be (Baselines)."""
+
+    def value_estimate(self, *args: object, **kwargs: object) -> Tensor:
+        """The target, clipped to [-1 / (1 - gamma), 0]."""
+        target = super().value_estimate(*args, **kwargs)
+        return target.clamp(float(-1 / (1 - self.gamma)), 0.0)
+
+
+class Agent(nn.Module):
+    """A policy, how it explores, and how it learns.
+
+    Args:
+        env: the environment, for the sizes of its spaces.
+        hyperparameters: what to build.
+        max_episode_steps: for the discount where ``gamma`` is None.
+        sparse: whether rewards are -1 and 0, so that DDPG's and TD3's targets can be
+            clipped.
+
+    Attributes:
+        normalizer: standardises observation and goal.
+        policy: TensorDictModule from ``observation`` and ``desired_goal`` to
+            ``action``; deterministic under ``ExplorationType.DETERMINISTIC``.
+        explore: the policy with the algorithm's exploration noise.
+        loss: torchrl's loss module; its state holds all the weights.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        hyperparameters: Hyperparameters,
+        *,
+        max_episode_steps: int,
+        sparse: bool,
+    ) -> None:
+        super().__init__()
+        hp = self.hyperparameters = hyperparameters
+        size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
+        action_size = env.action_spec.shape[-1]
+        stochastic = hp.algo in ("sac", "tqc")
+        num_q = 2 if hp.double_q and hp.algo != "ddpg" else 1
+
+        self.normalizer = Normalizer(size)
+        normalize = Mod(self.normalizer, STATE_KEYS, ["normalized"])
+        actor = _actor(size, action_size, hp.hidden_size, stochastic)
+        critic = Mod(
+            MLP(
+                in_features=size + action_size,
+                out_features=NUM_QUANTILES if hp.algo == "tqc" else 1,
+                num_cells=[hp.hidden_size] * 3,
+                activation_class=nn.ReLU,
+            ),
+            ["normalized", "action"],
+            ["state_action_value"],
+        )
+        self.policy = self.explore = Seq(normalize, actor)
+        action_spec = env.action_spec_unbatched
+        if stochastic:
+            loss_class = SACLoss if hp.algo == "sac" else TQCLoss
+            options: dict[str, object] = {
+                "num_qvalue_nets": num_q,
+                "deactivate_vmap": True,  # faster on CPU
+                "alpha_init": hp.alpha,
+                "fixed_alpha": not hp.learn_alpha,
+                "action_spec": action_spec,
+            }
+            if hp.algo == "sac":
+                options["loss_function"] = "l2"
+            else:
+                options["top_quantiles_to_drop_per_net"] = (
+                    hp.drop_quantiles if hp.double_q else 0
+                )
+            self.loss = loss_class(actor, critic, **options)
+        else:
+            sigma = {"sigma_init": hp.noise_eps, "sigma_end": hp.noise_eps}
+            eps = {"eps_init": hp.random_eps, "eps_end": hp.random_eps}
+            self.explore = Seq(
+                normalize,
+                actor,
+                AdditiveGaussianModule(env.action_spec, **sigma),
+                EGreedyModule(env.action_spec, **eps),
+            )
+            if hp.algo == "ddpg":
+                self.loss = DDPGLoss(
+                    actor,
+                    critic,
+                    loss_function="l2",
+                    delay_actor=True,
+                    delay_value=True,
+                )
+            else:
+                self.loss = TD3Loss(
+                    actor,
+                    critic,
+                    num_qvalue_nets=num_q,
+                    deactivate_vmap=True,  # faster on CPU
+                    loss_function="l2",
+                    policy_noise=hp.policy_noise,
+                    noise_clip=0.5,
+                    action_spec=action_spec,
+                )
+            actor.module.register_forward_hook(self._remember_action)
+        self._set_discount(hp.gamma or 1 - 1 / max_episode_steps, sparse)
+        self.soft_update = SoftUpdate(self.loss, tau=hp.tau)
+        self.optimizer = torch.optim.Adam(
+            self.loss.parameters(), lr=hp.learning_rate, fused=True
+        )
+        self.updates = 0
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """One gradient step on a batch of transitions.
+
+        Returns:
+            the losses, scalars.
+        """
+        batch = batch.set("normalized", self._normalize(batch))
+        batch.set(("next", "normalized"), self._normalize(batch["next"]))
+        losses = self._losses(batch)
+        self.optimizer.zero_grad()
+        torch.stack(tuple(losses.values())).sum().backward()
+        self.optimizer.step()
+        self.soft_update.step()
+        self.updates += 1
+        return {key: value.detach() for key, value in losses.items()}
+
+    def _losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Losses whose gradients touch only the network that each one trains."""
+        algo, loss = self.hyperparameters.algo, self.loss
+        if algo in ("sac", "tqc"):
+            every = loss(batch)
+            return {key: every[key] for key in loss.out_keys if key.startswith("loss_")}
+        if algo == "ddpg":
+            losses = {"loss_value": loss.loss_value(batch)[0]}
+            losses["loss_actor"] = loss.loss_actor(batch)[0]
+        else:
+            losses = {"loss_value": loss.value_loss(batch)[0]}
+            if self.updates % POLICY_DELAY == 0:
+                losses["loss_actor"] = loss.actor_loss(batch)[0]
+        if "loss_actor" in losses:
+            # The actor's loss has just computed the actions; see _remember_action.
+            penalty = self.hyperparameters.action_l2 * self._action.square().mean()
+            losses["loss_actor"] = losses["loss_actor"] + penalty
+        return losses
+
+    def _remember_action(self, module: nn.Module, inputs: object, out: Tensor) -> None:
+        """Keep the actions that gradients flow through: torchrl's losses do not."""
+        if out.requires_grad:
+            self._action = out
+
+    def _normalize(self, tensordict: TensorDictBase) -> Tensor:
+        return self.normalizer(*(tensordict[key] for key in STATE_KEYS))
+
+    def _set_discount(self, gamma: float, sparse: bool) -> None:
+        if self.hyperparameters.algo == "ddpg":
+            self.loss.make_value_estimator(
+                ClippedTD0 if sparse else TD0Estimator,
+                gamma=gamma,
+                value_network=self.loss.actor_critic,
+            )
+            self.loss.set_keys(state_action_value="state_action_value")
+        elif self.hyperparameters.algo == "td3" and sparse:
+            self.loss.make_value_estimator(ClippedTD0, gamma=gamma, value_network=None)
+            self.loss.set_keys(state_action_value="state_action_value")
+        else:
+            self.loss.make_value_estimator(gamma=gamma)
+
+
+def _actor(size: int, action_size: int, hidden_size: int, stochastic: bool) -> Mod:
+    """From ``normalized`` (..., size) to ``action`` (..., action_size)."""
+    net = MLP(
+        in_features=size,
+        out_features=action_size * (2 if stochastic else 1),
+        num_cells=[hidden_size] * 3,
+        activation_class=nn.ReLU,
+    )
+    if not stochastic:
+        return Mod(nn.Sequential(net, nn.Tanh()), ["normalized"], ["action"])
+    parameters = Mod(
+        nn.Sequential(net, NormalParamExtractor()), ["normalized"], ["loc", "scale"]
+    )
+    return ProbabilisticActor(
+        parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal
+    )
+
+
+def save_policy(path: Path, agent: Agent, env_id: str) -> None:
+    """Write what `load_policy` needs: weights, normaliser and how to build them."""
+    state = {
+        "env_id": env_id,
+        "hyperparameters": {
+            field.name: getattr(agent.hyperparameters, field.name)
+            for field in fields(Hyperparameters)
+        },
+        "policy": agent.policy.state_dict(),
+    }
+    replace(path, lambda temporary: torch.save(state, temporary))
+
+
+def load_policy(checkpoint: dict[str, Any], env: EnvBase) -> Seq:
+    """The policy of a checkpoint that `save_policy` wrote.
+
+    Raises:
+        ValueError: the environment's spaces are not those it was trained on.
+    """
+    hp = Hyperparameters(**checkpoint["hyperparameters"])
+    policy = Agent(env, hp, max_episode_steps=50, sparse=True).policy
+    try:
+        policy.load_state_dict(checkpoint["policy"])
+    except RuntimeError as error:
+        raise ValueError(
+            f"the policy was trained on {checkpoint['env_id']}, whose spaces are not "
+            f"those of this environment: {error}"
+        ) from None
+    return policy
+
+
+def replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file whole or not at all: a kill never leaves half of it."""
+    temporary = path.with_name(path.name + ".new")
+    write(temporary)
+    os.replace(temporary, path)

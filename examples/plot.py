@@ -1,0 +1,140 @@
+"""Draw success curves: a panel per task, a line per algorithm or ablation.
+
+    python examples/plot.py runs --out curves.png
+
+Reads every folder below the given ones that holds a run (args.json and curve.csv).
+Draws the median and the interquartile range over the seeds, as the panda-gym paper.
+"""
+
+import csv
+import json
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display is needed
+
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+
+Curve = list[dict[str, float]]
+
+
+def plot_curve(curve: Curve, title: str, path: Path) -> None:
+    """Draw one run's success over environment steps."""
+    figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
+    axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
+    _label(axes, title)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def plot_panels(
+    runs: dict[str, dict[str, list[Curve]]], metric: str, path: Path
+) -> None:
+    """Draw median and interquartile range over seeds.
+
+    Args:
+        runs: by task, then by line, the curves of the seeds.
+        metric: the column to draw.
+        path: where to write the picture.
+    """
+    figure, panels = plt.subplots(
+        1,
+        len(runs),
+        figsize=(4 * len(runs), 3.2),
+        squeeze=False,
+        sharey=True,
+        layout="constrained",
+    )
+    labels = sorted({label for lines in runs.values() for label in lines})
+    colors = {label: f"C{i}" for i, label in enumerate(labels)}
+    for axes, (task, lines) in zip(panels[0], sorted(runs.items()), strict=True):
+        for label, curves in sorted(lines.items()):
+            # Seeds that are still running end earlier: up to where all have come.
+            length = min(len(curve) for curve in curves)
+            steps = [row["step"] for row in curves[0][:length]]
+            values = np.array([[r[metric] for r in c[:length]] for c in curves])
+            low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+            name = f"{label} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
+            axes.plot(steps, median, color=colors[label], label=name)
+            axes.fill_between(steps, low, high, color=colors[label], alpha=0.2, lw=0)
+        _label(axes, task)
+        axes.legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def read_runs(folders: list[Path]) -> dict[str, dict[str, list[Curve]]]:
+    """Read the curves below some folders: by task, then by line.
+
+    Raises:
+        ValueError: there is no run.
+    """
+    runs: dict[str, dict[str, list[Curve]]] = defaultdict(lambda: defaultdict(list))
+    for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
+        args = json.loads((path.parent / "args.json").read_text())
+        with path.open() as file:
+            curve = [
+                {key: float(value) for key, value in row.items()}
+                for row in csv.DictReader(file)
+            ]
+        if curve:
+            runs[args["env_id"]][line_label(args)].append(curve)
+    if not runs:
+        raise ValueError(f"no run (args.json, curve.csv) below {folders}")
+    return runs
+
+
+def line_label(args: dict[str, object]) -> str:
+    """Name what sets a run apart from others of its task, but for the seed."""
+    parts = [str(args["algo"]).upper()]
+    if args["preset"] != "paper":
+        parts.append(str(args["preset"]))
+    parts.append(
+        {"relabel": "HER", "augment": "HER (stored copies)"}.get(
+            str(args["her"]), "no HER"
+        )
+    )
+    if not args["double_q"]:
+        parts.append("one Q")
+    return ", ".join(parts)
+
+
+def _label(axes: plt.Axes, title: str) -> None:
+    axes.set(
+        xlabel="environment steps",
+        ylabel="success rate",
+        ylim=(-0.05, 1.05),
+        title=title,
+    )
+    axes.grid(alpha=0.3)
+
+
+@dataclass
+class Args:
+    """Which runs to draw, and where."""
+
+    runs: Annotated[list[Path], tyro.conf.Positional]
+    """folders that hold runs, at any depth"""
+    metric: str = "success"
+    """column of the curves: success, ever_success or return"""
+    out: Path = Path("curves.png")
+    """picture to write"""
+
+
+def main(args: Args) -> None:
+    """Draw the runs."""
+    try:
+        plot_panels(read_runs(args.runs), args.metric, args.out)
+    except (ValueError, KeyError) as error:
+        raise SystemExit(f"cannot draw: {error}") from None
+    print(f"wrote {args.out}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
