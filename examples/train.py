@@ -61,6 +61,9 @@ class Args(Hyperparameters):
     """gradient steps per environment step"""
     batch_size: int = 256
     """transitions per gradient step"""
+    keep_unmoved: float = 1.0
+    """share of the episodes in which nothing moved that are stored (filtered HER, see
+    arXiv 2012.08850): every goal that they could be given is reached without acting"""
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
     eval_interval: int = 1_000
@@ -83,6 +86,7 @@ PRESETS = {
 }
 # What may differ between a run and its continuation.
 FREE_ARGUMENTS = {"resume", "out", "num_threads", "tensorboard", "save_interval"}
+SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
 STORED_KEYS = [
     "observation",
     "desired_goal",
@@ -185,6 +189,11 @@ class Run:
         # The next batch begins with a reset: an episode that is not over is cut here.
         data["next", "done"][:, -1] = True
         data = data.select(*STORED_KEYS)
+        if self.args.keep_unmoved < 1:
+            lucky = torch.rand(len(data)) < self.args.keep_unmoved
+            data = data[moved(data) | lucky.to(data.device)]
+            if not len(data):
+                return {}
         stored = self.buffer[self.buffer.extend(data.reshape(-1))]
         # As in Baselines, the statistics are of relabelled episodes.
         self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
@@ -307,6 +316,15 @@ def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBu
         transform=transform,
         batch_size=args.batch_size,
     )
+
+
+def moved(data: TensorDictBase) -> Tensor:
+    """Which episodes [num_envs, steps] saw their achieved goal change, (num_envs,).
+
+    By more than 1 cm (or 0.01 in a quaternion) after the objects have settled.
+    """
+    goal = data["next", "achieved_goal"]
+    return ((goal - goal[:, SETTLED : SETTLED + 1]).abs() > 0.01).flatten(1).any(1)
 
 
 def crossed(interval: int, before: int, after: int) -> bool:
