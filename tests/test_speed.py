@@ -1,6 +1,8 @@
-"""Steps per second beside panda-gym: pytest -m slow -s tests/test_speed.py."""
+"""Steps per second, memory and creation: pytest -m slow -s tests/test_speed.py."""
 
 import statistics
+import subprocess
+import sys
 import time
 
 import gymnasium
@@ -11,6 +13,7 @@ import torch
 from torchrl.envs import GymEnv, ParallelEnv
 
 import torch_panda
+from tests.bare_bullet import is_available, load_bare_bullet
 
 pytestmark = pytest.mark.slow
 NUM_ENVS = 16
@@ -26,11 +29,11 @@ def make_torchrl_env():
     return GymEnv(f"PandaPush-v{panda_gym.__version__[0]}")
 
 
-def time_steps(step):
+def time_steps(step, steps=STEPS):
     start = time.perf_counter()
-    for _ in range(STEPS):
+    for _ in range(steps):
         step()
-    return NUM_ENVS * STEPS / (time.perf_counter() - start)
+    return NUM_ENVS * steps / (time.perf_counter() - start)
 
 
 def test_faster_than_panda_gym():
@@ -81,3 +84,57 @@ def test_creation_and_reset():
     print(f"64 environments: {creation:.2f} s; a reset: {reset * 1e3:.3f} ms")
     assert creation < 6.0
     assert reset < 0.4e-3
+
+
+@pytest.mark.skipif(not is_available(), reason="needs Linux and a C compiler")
+def test_close_to_bare_bullet(tmp_path):
+    """At least 0.90 of C threads that submit the same commands and never wait."""
+    num_threads, steps, pairs = 2, 200, 7
+    bare_bullet = load_bare_bullet(tmp_path)
+    env = torch_panda.make(
+        "PandaPush-v3", num_envs=NUM_ENVS, num_threads=num_threads, seed=0
+    )
+    td = env.reset()
+
+    def step():
+        nonlocal td
+        td["action"] = torch.rand(NUM_ENVS, 3) * 2 - 1
+        _, td = env.step_and_maybe_reset(td)
+
+    time_steps(step)
+    ratios = []
+    for _ in range(pairs):
+        ours, bare = time_steps(step, steps), bare_bullet(NUM_ENVS, num_threads, steps)
+        ratios.append(ours / bare)
+        print(f"torch_panda: {ours:.0f}, bare Bullet: {bare:.0f} steps/s")
+    env.close()
+    ratio = statistics.median(ratios)
+    print(f"ratio: {ratio:.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
+    assert ratio >= 0.90
+
+
+# Prints the growth of the resident memory per environment [KiB].
+MEASURE_MEMORY = """
+from pathlib import Path
+import torch_panda
+
+def resident():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmRSS")).split()[1])
+
+first = torch_panda.make("PandaPush-v3", num_envs=1, num_threads=1)
+first.reset()
+before = resident()
+others = torch_panda.make("PandaPush-v3", num_envs=64, num_threads=1)
+others.reset()
+print((resident() - before) / 64)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_per_environment():
+    command = (sys.executable, "-c", MEASURE_MEMORY)
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    megabytes = float(done.stdout) * 1024 / 1e6
+    print(f"an environment: {megabytes:.1f} MB")
+    assert 10.0 < megabytes < 45.0

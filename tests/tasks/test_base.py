@@ -18,7 +18,7 @@ angle = st.floats(-math.pi, math.pi)
 def assert_same_euler(quaternion):
     ours = quaternion_to_euler(torch.tensor(quaternion, dtype=torch.float64))
     theirs = pybullet.getEulerFromQuaternion(quaternion)
-    np.testing.assert_allclose(ours.numpy(), theirs, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(ours.numpy(), theirs)
 
 
 @given(angle, angle, angle)
@@ -30,6 +30,17 @@ def test_euler_equals_pybullet(roll, pitch, yaw):
 @given(roll=angle, yaw=angle)
 def test_euler_equals_pybullet_when_vertical(pitch, roll, yaw):
     assert_same_euler(pybullet.getQuaternionFromEuler((roll, pitch, yaw)))
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (2,), (2, 3)])
+def test_euler_takes_any_leading_shape(shape):
+    quaternion = torch.rand(*shape, 4, dtype=torch.float64)
+    angles = quaternion_to_euler(quaternion)
+    assert angles.shape == (*shape, 3)
+    for single, found in zip(
+        quaternion.reshape(-1, 4), angles.reshape(-1, 3), strict=True
+    ):
+        assert torch.equal(quaternion_to_euler(single), found)
 
 
 def test_rewards_by_hand():

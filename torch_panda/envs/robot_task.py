@@ -306,7 +306,7 @@ class RobotTaskEnv(EnvBase):
     def _read_action(self, tensordict: TensorDictBase) -> Tensor:
         """The clipped action on the CPU: (n, action_dim) float32."""
         action = tensordict.get("action", None)
-        shape = tuple(self.action_spec.shape)
+        shape = (*self.batch_size, self.robot.action_dim)
         if not isinstance(action, Tensor):
             raise ValueError(f"the action must be a tensor of shape {shape}, got none")
         if tuple(action.shape) != shape:
@@ -320,9 +320,8 @@ class RobotTaskEnv(EnvBase):
                 f"the action must be on device {self.device}, got {action.device}"
             )
         action = action.detach().to("cpu", torch.float32).reshape(-1, shape[-1])
-        finite = action.isfinite().all(dim=1)
-        if not finite.all():
-            env = int((~finite).nonzero()[0])
+        if not np.isfinite(action.numpy()).all():
+            env = int((~action.isfinite()).any(dim=1).nonzero()[0])
             raise ValueError(
                 f"the action of environment {env} is not finite: {action[env].tolist()}"
             )
@@ -337,7 +336,8 @@ class RobotTaskEnv(EnvBase):
 
     def _emit(self, value: Tensor) -> Tensor:
         """Shape (n, ...) to (*batch, ...), on the environment's device."""
-        return value.reshape(*self.batch_size, *value.shape[1:]).to(self.device)
+        value = value if self.batch_size else value.squeeze(0)
+        return value.to(self.device)
 
     def _make_tensordict(self, values: dict[str, Tensor]) -> TensorDict:
         return TensorDict(
