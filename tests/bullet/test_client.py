@@ -175,3 +175,60 @@ def test_other_status_codes_are_refused(monkeypatch):
     monkeypatch.setattr(_capi, "CMD_PERFORM_COLLISION_DETECTION_COMPLETED", 111)
     with pytest.raises(ImportError, match=r"status codes differ.*3\.2\.7"):
         PhysicsClient()
+
+
+def test_mass(reference):
+    with PhysicsClient() as client:
+        panda = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        reference.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
+        cube = create(reference, client, "box", 0.3, (0.0, 0.0, 1.0))
+        for body, link in ((panda, -1), (panda, 4), (cube, -1)):
+            assert client.mass(body, link) == reference.getDynamicsInfo(body, link)[0]
+        assert client.mass(panda) == 0.0  # a fixed base, which has a mass in its URDF
+        assert client.mass(cube) == 0.3
+
+
+@pytest.mark.parametrize(
+    ("group", "mask", "falls"),
+    [
+        (*_capi.FILTER_DYNAMIC, False),
+        (*_capi.FILTER_STATIC, True),  # what cannot move does not touch the ground
+        (0, -1, False),
+        (1, 0, False),
+        (0, 0, True),
+    ],
+)
+def test_collision_filter(reference, group, mask, falls):
+    with PhysicsClient() as client:
+        create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
+        cube = create(reference, client, "box", 0.3, (0.0, 0.0, 0.05))
+        client.set_collision_filter(cube, -1, group, mask)
+        reference.setCollisionFilterGroupMask(cube, -1, group, mask)
+        for _ in range(200):
+            client.step()
+            reference.stepSimulation()
+        position, _ = reference.getBasePositionAndOrientation(cube)
+        assert read(client.state(cube).q, 3) == list(position)
+        assert (position[2] < -0.1) == falls
+
+
+def test_urdf_with_a_collision_filter_is_refused():
+    with PhysicsClient() as client:
+        with pytest.raises(ValueError, match=r"cube_collisionfilter\.urdf"):
+            client.load_urdf("cube_collisionfilter.urdf")
+        assert client.bodies == ()
+
+
+def test_bodies_and_detections_are_counted():
+    with PhysicsClient() as client:
+        before = client.num_detections
+        bodies = tuple(
+            client.create_sphere(0.1, mass=1.0, position=(0.0, 0.0, height))
+            for height in (1.0, 2.0)
+        )
+        assert client.bodies == bodies
+        client.step(3)
+        client.detect_collisions()
+        client.detect_collisions(5)
+        client.detect_collisions(0)
+        assert client.num_detections == before + 9

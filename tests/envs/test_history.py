@@ -1,7 +1,8 @@
-"""Hard-contact episodes before and after other ones: pytest -m slow -s on this file.
+"""Hard-contact episodes are the same whatever the client did before.
 
-The default suite has a lighter version, `test_history_changes_nothing`. Stack and Flip
-fail here, each for an episode or two: see the README on limits.
+The arm is sent at the objects, often out of range, and presses on the table: then the
+order in which Bullet solves contacts shows. `test_history_changes_nothing` covers every
+id with lighter episodes.
 """
 
 import numpy as np
@@ -11,8 +12,9 @@ import torch
 import torch_panda
 from tests.envs.test_parity import choose_action
 
-EPISODES = 30
 STEPS = 60
+# Of other episodes. Times 20 substeps they differ modulo any power of two above 4.
+HISTORY = (41, 50, 57)
 
 
 def play(env, td, actions):
@@ -23,14 +25,12 @@ def play(env, td, actions):
     return torch.stack(observations, dim=1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ["Push", "Slide", "PickAndPlace", "Stack", "Flip"])
-def test_hard_contacts_after_another_history(task):
-    env_id = f"Panda{task}-v3"
-    with torch_panda.make(env_id, num_envs=EPISODES, seed=1) as env:
-        td, actions = env.reset(), []
+def count_differences(env_id, episodes):
+    """How many episodes other ones change, after one other episode or after three."""
+    with torch_panda.make(env_id, num_envs=episodes, seed=1) as env:
+        td, actions, first = env.reset(), [], []
         state = env.get_state()
-        rngs = [np.random.default_rng(k) for k in range(EPISODES)]
+        rngs = [np.random.default_rng(k) for k in range(episodes)]
         for _ in range(STEPS):
             observation = td["observation"].numpy()
             size = env.action_spec.shape[-1]
@@ -40,10 +40,24 @@ def test_hard_contacts_after_another_history(task):
             ]
             actions.append(torch.from_numpy(np.stack(rows)))
             td = env.step(td.set("action", actions[-1]))["next"]
-        first = play(env, env.reset(state.clone(), set_state=True), actions)
-        for steps in (41, 50, 57):
-            play(env, env.reset(), [a.roll(7, 0) for a in actions[:steps]])
+            first.append(td["observation"])
         again = play(env, env.reset(state.clone(), set_state=True), actions)
-    differ = int((first != again).flatten(1).any(dim=1).sum())
-    print(f"{task}: {differ} of {EPISODES} episodes differ")
-    assert differ == 0
+        for steps in HISTORY:
+            play(env, env.reset(), [a.roll(7, 0) for a in actions[:steps]])
+        later = play(env, env.reset(state.clone(), set_state=True), actions)
+    first = torch.stack(first, dim=1)
+    differ = (first != again) | (first != later)
+    return int(differ.flatten(1).any(dim=1).sum())
+
+
+def test_hard_contacts_after_another_history():
+    assert count_differences("PandaStack-v3", 16) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "episodes"),
+    [("Push", 30), ("Slide", 30), ("PickAndPlace", 100), ("Stack", 100), ("Flip", 100)],
+)
+def test_many_hard_contacts_after_another_history(task, episodes):
+    assert count_differences(f"Panda{task}-v3", episodes) == 0

@@ -29,12 +29,17 @@ CMD_DESIRED_STATE_RECEIVED_COMPLETED = 25
 CMD_STEP_FORWARD_SIMULATION_COMPLETED = 26
 CMD_CONTACT_POINT_INFORMATION_COMPLETED = 39
 CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43
+CMD_GET_DYNAMICS_INFO_COMPLETED = 77
 CMD_CREATE_COLLISION_SHAPE_COMPLETED = 80
 CMD_CREATE_MULTI_BODY_COMPLETED = 84
 CMD_PERFORM_COLLISION_DETECTION_COMPLETED = 112
 
 # enum eURDF_Flags
 URDF_IGNORE_VISUAL_SHAPES = 1 << 20
+
+# Collision group and mask that Bullet gives to links that move, and to fixed bases.
+FILTER_DYNAMIC = (1, -1)
+FILTER_STATIC = (2, -1 ^ 2)
 
 # enum for b3JointControlCommandInit2
 CONTROL_MODE_POSITION_VELOCITY_PD = 2
@@ -66,6 +71,31 @@ class JointInfo(ctypes.Structure):
         ("parent_index", c_int),
         ("q_size", c_int),
         ("u_size", c_int),
+    )
+
+
+class DynamicsInfo(ctypes.Structure):
+    """``struct b3DynamicsInfo``."""
+
+    _fields_ = (
+        ("mass", c_double),
+        ("local_inertia_diagonal", c_double * 3),
+        ("local_inertial_frame", c_double * 7),
+        ("lateral_friction", c_double),
+        ("rolling_friction", c_double),
+        ("spinning_friction", c_double),
+        ("restitution", c_double),
+        ("contact_stiffness", c_double),
+        ("contact_damping", c_double),
+        ("activation_state", c_int),
+        ("body_type", c_int),
+        ("angular_damping", c_double),
+        ("linear_damping", c_double),
+        ("ccd_swept_sphere_radius", c_double),
+        ("contact_processing_threshold", c_double),
+        ("friction_anchor", c_int),
+        ("collision_margin", c_double),
+        ("dynamic_type", c_int),
     )
 
 
@@ -241,9 +271,26 @@ dynamics_set_spinning_friction = bind(
     c_int,
     c_double,
 )
+dynamics_info_init = bind(
+    _cheap, "b3GetDynamicsInfoCommandInit", _command, _client, c_int, c_int
+)
+dynamics_info = bind(_cheap, "b3GetDynamicsInfo", c_int, _status, POINTER(DynamicsInfo))
 joint_count = bind(_cheap, "b3GetNumJoints", c_int, _client, c_int)
 joint_info = bind(
     _cheap, "b3GetJointInfo", c_int, _client, c_int, c_int, POINTER(JointInfo)
+)
+
+# Collision filter
+filter_init = bind(_cheap, "b3CollisionFilterCommandInit", _command, _client)
+filter_set_group_mask = bind(
+    _cheap,
+    "b3SetCollisionFilterGroupMask",
+    None,
+    _command,
+    c_int,  # body
+    c_int,  # link
+    c_int,  # group
+    c_int,  # mask
 )
 
 # Poses

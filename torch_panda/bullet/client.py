@@ -1,6 +1,7 @@
 """One DIRECT physics client of Bullet."""
 
 import importlib.util
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from ctypes import Array, byref, c_double, c_int, c_size_t, c_void_p
 from dataclasses import dataclass
@@ -94,6 +95,11 @@ def doubles(values: Sequence[float]) -> Array[c_double]:
     return (c_double * len(values))(*values)
 
 
+def read_doubles(address: int, count: int) -> tuple[float, ...]:
+    """The doubles at an address."""
+    return tuple((c_double * count).from_address(address))
+
+
 def find_urdf(path: str | Path) -> str:
     """A URDF file by its path, or by its place among those pybullet ships.
 
@@ -107,6 +113,21 @@ def find_urdf(path: str | Path) -> str:
         if candidate.is_file():
             return str(candidate)
     raise FileNotFoundError(f"no URDF file at {path}, nor at {shipped / path}")
+
+
+def _check_collision_filters(file: str) -> None:
+    """Raise ValueError if a URDF chooses its own collision groups or masks."""
+    try:
+        tree = ElementTree.parse(file)
+    except ElementTree.ParseError:
+        return  # Bullet says what is wrong
+    for shape in tree.iter("collision"):
+        chosen = {"group", "mask"} & set(shape.attrib)
+        if chosen:
+            raise ValueError(
+                f"the collision shapes of a URDF must not have a group or a mask, "
+                f"got {sorted(chosen)} in {file}"
+            )
 
 
 class PhysicsClient:
@@ -127,6 +148,8 @@ class PhysicsClient:
     """
 
     def __init__(self, *, timestep: float = 1 / 500, gravity: float = -9.81) -> None:
+        self._bodies: list[int] = []
+        self._num_detections = 0
         self._handle: int | None = _capi.connect_direct()
         if not self._handle:
             raise BulletError("Bullet could not create a DIRECT client")
@@ -145,6 +168,16 @@ class PhysicsClient:
     def is_closed(self) -> bool:
         """Whether the world is gone."""
         return self._handle is None
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Ids of the bodies, in the order in which they were built."""
+        return tuple(self._bodies)
+
+    @property
+    def num_detections(self) -> int:
+        """How often collisions have been detected; every time step does."""
+        return self._num_detections
 
     def close(self) -> None:
         """Free the world. Closing again does nothing."""
@@ -186,15 +219,19 @@ class PhysicsClient:
 
         Raises:
             FileNotFoundError: there is no such file.
+            ValueError: it chooses its own collision groups or masks, which Bullet does
+                not report and `set_collision_filter` could therefore not restore.
             BulletError: Bullet cannot read it.
         """
-        command = _capi.urdf_init(self._open(), find_urdf(path).encode())
+        file = find_urdf(path)
+        _check_collision_filters(file)
+        command = _capi.urdf_init(self._open(), file.encode())
         _capi.urdf_set_position(command, *position)
         _capi.urdf_set_orientation(command, *orientation)
         _capi.urdf_set_fixed_base(command, int(fixed_base))
         _capi.urdf_set_flags(command, _capi.URDF_IGNORE_VISUAL_SHAPES)
         status = self._submit(command, _capi.CMD_URDF_LOADING_COMPLETED, f"load {path}")
-        return _capi.status_body(status)
+        return self._add_body(status)
 
     def create_box(
         self, half_extents: Sequence[float], *, mass: float, position: Sequence[float]
@@ -246,6 +283,29 @@ class PhysicsClient:
             _capi.dynamics_set_spinning_friction(command, body, link, spinning)
         self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set friction")
 
+    def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
+        """Choose what a link (-1 is the base) touches, and forget what it touched.
+
+        Two links touch if the group of either has a bit of the other's mask. The link
+        enters Bullet's broad phase anew: without its overlaps and contacts so far, and
+        as the last of all links.
+        """
+        command = _capi.filter_init(self._open())
+        _capi.filter_set_group_mask(command, body, link, group, mask)
+        self._submit(
+            command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set a collision filter"
+        )
+
+    def mass(self, body: int, link: int = -1) -> float:
+        """Mass of a link (-1 is the base) [kg]; 0 for a base that cannot move."""
+        command = _capi.dynamics_info_init(self._open(), body, link)
+        status = self._submit(
+            command, _capi.CMD_GET_DYNAMICS_INFO_COMPLETED, "report a mass"
+        )
+        info = _capi.DynamicsInfo()
+        _capi.dynamics_info(status, byref(info))
+        return float(info.mass)
+
     def joints(self, body: int) -> list[Joint]:
         """The joints of a body, in the order of its URDF."""
         handle = self._open()
@@ -263,10 +323,23 @@ class PhysicsClient:
         self, body: int, joint: int, position: float, velocity: float
     ) -> None:
         """Put a joint at a position [rad] or [m], with a velocity [rad/s] or [m/s]."""
+        self.set_joints(body, (joint,), (position,), (velocity,))
+
+    def set_joints(
+        self,
+        body: int,
+        joints: Sequence[int],
+        positions: Sequence[float],
+        velocities: Sequence[float],
+    ) -> None:
+        """Put several joints somewhere at once; see `set_joint`."""
         command = _capi.pose_init(self._open(), body)
-        _capi.pose_set_joint_position(self._handle, command, joint, position)
-        _capi.pose_set_joint_velocity(self._handle, command, joint, velocity)
-        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set a joint")
+        for joint, position, velocity in zip(
+            joints, positions, velocities, strict=True
+        ):
+            _capi.pose_set_joint_position(self._handle, command, joint, position)
+            _capi.pose_set_joint_velocity(self._handle, command, joint, velocity)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set joints")
 
     def set_base(
         self,
@@ -323,14 +396,22 @@ class PhysicsClient:
         command = _capi.step_init(handle)
         # A client has one command buffer, and stepping leaves it as it was: submitting
         # it again steps again.
+        self._num_detections += count
         failed = _capi.repeat(handle, command, byref(c_size_t(count)), 0, _capi.submit)
         if failed:
             raise BulletError("Bullet could not step: it gave no answer")
 
-    def detect_collisions(self) -> None:
-        """Run collision detection without advancing time."""
+    def detect_collisions(self, count: int = 1) -> None:
+        """Run collision detection ``count`` times without advancing time."""
+        if count < 1:
+            return
+        handle = self._open()
+        command = _capi.detect_init(handle)
+        self._num_detections += count
+        # As in `step`; the last one's answer is checked.
+        _capi.repeat(handle, command, byref(c_size_t(count - 1)), 0, _capi.submit)
         self._submit(
-            _capi.detect_init(self._open()),
+            command,
             _capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED,
             "detect collisions",
         )
@@ -454,4 +535,9 @@ class PhysicsClient:
         status = self._submit(
             command, _capi.CMD_CREATE_MULTI_BODY_COMPLETED, "create a body"
         )
-        return _capi.status_body(status)
+        return self._add_body(status)
+
+    def _add_body(self, status: int) -> int:
+        body: int = _capi.status_body(status)
+        self._bodies.append(body)
+        return body

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torch_panda.bullet.built_world import BuiltWorld
 from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
 from torch_panda.bullet.pool import WorkerPool
 
@@ -19,8 +20,6 @@ N_SUBSTEPS = 20  # so 25 Hz, as the paper
 GRAVITY = -9.81  # [m/s^2]
 
 _DOUBLE = 8  # bytes
-# Where objects wait while contacts are forgotten: apart from all, and from each other.
-_FAR_AWAY = 1000.0  # [m]
 
 
 @dataclass(frozen=True)
@@ -91,12 +90,14 @@ class VectorSimulation:
         self.n_substeps = n_substeps
         self.dt = timestep * n_substeps
         self._clients: list[PhysicsClient] = []
+        self._built_worlds: list[BuiltWorld] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
         try:
             for _ in range(num_envs):
                 client = PhysicsClient(timestep=timestep, gravity=gravity)
                 self._clients.append(client)
                 scene = build(client)
+                self._built_worlds.append(BuiltWorld(client))
                 if client is self._clients[0]:
                     self.scene = scene
                 elif scene != self.scene:
@@ -138,9 +139,8 @@ class VectorSimulation:
     def reset(self, envs: Sequence[int]) -> None:
         """Start an episode from what the state tensors hold for these clients.
 
-        Bullet remembers the contacts of the last episode. They are forgotten when all
-        objects are out of reach for one collision detection, so that what follows
-        depends on the start state and the actions alone.
+        Bullet remembers more than the state. `BuiltWorld` makes it forget, so that what
+        follows depends on the start state and the actions alone.
 
         Raises:
             WorkerError: Bullet failed in one client; it names the client.
@@ -196,9 +196,7 @@ class VectorSimulation:
 
     def _reset_one(self, env: int) -> None:
         client, scene = self._clients[env], self.scene
-        for k, body in enumerate(scene.objects + scene.targets):
-            client.set_base(body, (0.0, _FAR_AWAY * k, _FAR_AWAY))
-        client.detect_collisions()
+        self._built_worlds[env].restore()
         positions = self.joint_position[env].tolist()
         velocities = self.joint_velocity[env].tolist()
         # One by one and in panda-gym's order: Bullet's broad phase remembers the way.

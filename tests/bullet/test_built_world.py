@@ -1,0 +1,93 @@
+"""Restoring a world: bodies are back, and Bullet has forgotten the rest."""
+
+from ctypes import c_double
+
+import pytest
+
+from torch_panda.bullet import PhysicsClient
+from torch_panda.bullet.built_world import BuiltWorld
+
+CUBE = (0.02, 0.02, 0.02)
+
+
+def read(address, count):
+    return list((c_double * count).from_address(address))
+
+
+def poses(client):
+    """Base, joints and links of all bodies."""
+    found = []
+    for body in client.bodies:
+        state, num_joints = client.state(body), len(client.joints(body))
+        found.append(read(state.q, 7))
+        if num_joints:
+            found.append(read(state.joint_positions, 9))
+            found.append(read(state.link_poses, 7 * num_joints))
+    return found
+
+
+@pytest.fixture
+def client():
+    with PhysicsClient() as client:
+        arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        client.set_joint(arm, 3, -1.5, 0.0)
+        client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
+        for height in (0.02, 0.06, 0.1):
+            client.create_box(CUBE, mass=1.0, position=(0.5, 0.0, height))
+        client.create_marker((0.5, 0.0, 0.1))
+        yield client
+
+
+def disturb(client, num_steps):
+    arm, _, *cubes, marker = client.bodies
+    client.set_joint(arm, 1, 1.2, 0.5)
+    client.set_base(marker, (0.3, 0.1, 0.2))
+    for k, cube in enumerate(cubes):
+        client.set_base(cube, (0.4, 0.01 * k, 0.1 + 0.05 * k), (0.0, 0.6, 0.0, 0.8))
+    client.step(num_steps)
+
+
+def test_bodies_are_where_they_were_built(client):
+    built = poses(client)
+    world = BuiltWorld(client)
+    disturb(client, 30)
+    assert poses(client) != built
+    world.restore()
+    assert poses(client) == built
+
+
+def test_contacts_are_forgotten(client):
+    world = BuiltWorld(client)
+    client.step()
+    assert client.contact_points()
+    world.restore()
+    assert not client.contact_points()
+
+
+def test_links_touch_what_they_touched(client):
+    world = BuiltWorld(client)
+    client.step()
+
+    def touching():
+        return {
+            (c.body_a, c.body_b, c.link_a, c.link_b) for c in client.contact_points()
+        }
+
+    built = touching()
+    world.restore()
+    client.step()
+    assert touching() == built != set()
+
+
+def test_what_follows_does_not_depend_on_what_was(client):
+    world = BuiltWorld(client)
+    ends = []
+    for num_steps in (0, 7, 40, 300):
+        disturb(client, num_steps)
+        world.restore()
+        contacts = []
+        for _ in range(60):
+            client.step()
+            contacts.append(client.contact_points())
+        ends.append((poses(client), contacts))
+    assert all(end == ends[0] for end in ends)
