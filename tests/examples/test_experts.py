@@ -1,0 +1,129 @@
+"""The scripted experts: they solve their tasks, from observations alone."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+import torch_panda
+from torch_panda.transforms import HindsightRelabel
+
+FILE = Path(__file__).parents[2] / "examples" / "experts.py"
+spec = importlib.util.spec_from_file_location("experts_example", FILE)
+experts = importlib.util.module_from_spec(spec)
+# Dataclasses look their module up.
+sys.modules[spec.name] = experts
+spec.loader.exec_module(experts)
+
+EPISODES = 16
+
+
+def successes(env_id, seed):
+    """Success at the end of 16 episodes and the rollouts."""
+    with torch_panda.make(env_id, num_envs=EPISODES, seed=seed) as env:
+        episodes = experts.play(env, experts.make_expert(env_id))
+    return [bool(episode["next", "success"][-1]) for episode in episodes], episodes
+
+
+# At least this many of 16: an expert with the measured rate misses it once in 10,000
+# draws. Random actions succeed, at an episode's end, in at most 1 of 10 episodes.
+@pytest.mark.parametrize(
+    ("env_id", "least"),
+    [
+        ("PandaReach-v1", 16),
+        ("PandaPush-v1", 13),
+        ("PandaSlide-v1", 3),
+        ("PandaPickAndPlace-v1", 13),
+        ("PandaStack-v1", 12),
+        ("PandaFlip-v1", 3),
+        ("PandaPush-v3", 13),
+    ],
+)
+def test_solves_its_task(env_id, least):
+    done, _ = successes(env_id, seed=11)
+    assert sum(done) >= least
+
+
+def test_v3_episodes_end_at_success():
+    done, episodes = successes("PandaReach-v3", seed=3)
+    assert all(done)
+    for episode in episodes:
+        assert episode["next", "done"].sum() == 1
+        assert not episode["next", "success"][:-1].any()
+
+
+@pytest.mark.parametrize("task", ["Reach", "Push", "Slide", "PickAndPlace", "Stack"])
+def test_the_actions_of_an_environment_depend_on_its_observation_only(task):
+    torch.manual_seed(0)
+    env_id = f"Panda{task}-v1"
+    expert = experts.make_expert(env_id)
+    with torch_panda.make(env_id, num_envs=4, seed=0) as env:
+        rollout = env.rollout(20, expert, break_when_any_done=False)
+    keys = ["observation", "achieved_goal", "desired_goal"]
+    order = torch.randperm(rollout.numel())
+    shuffled = rollout.reshape(-1)[order]
+    again = expert(shuffled.select(*keys))["action"]
+    assert torch.allclose(again, shuffled["action"], atol=1e-5)
+
+
+def test_a_single_environment_has_no_batch_dimension():
+    with torch_panda.make("PandaFlip-v1", seed=0) as env:
+        rollout = env.rollout(3, experts.make_expert("PandaFlip-v1"))
+    assert rollout["action"].shape == (3, 4)
+
+
+def test_collectors_take_an_expert():
+    env = torch_panda.make("PandaReach-v1", num_envs=4, seed=0)
+    expert = experts.make_expert("PandaReach-v1")
+    collector = Collector(env, expert, frames_per_batch=400, total_frames=400)
+    (data,) = list(collector)
+    collector.shutdown()
+    # The episodes' last steps: 100 steps are two episodes of each environment.
+    assert data["next", "success"][:, [49, 99]].all()
+
+
+def test_demonstrations_extend_a_replay_buffer(tmp_path):
+    out = tmp_path / "demos.pt"
+    arguments = ["--env-id", "PandaPush-v3", "--episodes", "6", "--num-envs", "4"]
+    result = subprocess.run(
+        [sys.executable, FILE, *arguments, "--out", out],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert "success at the end" in result.stdout
+    demonstrations = torch.load(out, weights_only=False)
+    assert isinstance(demonstrations, TensorDict)
+    ids = demonstrations["collector", "traj_ids"]
+    assert ids.unique().tolist() == list(range(6))
+    last = demonstrations["next", "done"].squeeze(-1)
+    assert ids[last].tolist() == list(range(6))
+
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1000),
+        transform=HindsightRelabel(torch_panda.Push().compute_reward, seed=0),
+        batch_size=64,
+    )
+    buffer.extend(demonstrations)
+    batch = buffer.sample()
+    assert batch["desired_goal"].shape == (64, 3)
+    assert (batch["next", "reward"] == 0).any()
+
+
+@pytest.mark.parametrize("env_id", ["PandaPushJoints-v1", "PandaFly-v1", "Push"])
+def test_ids_without_an_expert(env_id):
+    with pytest.raises(ValueError, match="no expert for"):
+        experts.make_expert(env_id)
+
+
+def test_wilson_interval():
+    # The textbook value for 8 of 10.
+    low, high = experts.wilson_interval(8, 10)
+    assert low == pytest.approx(0.490, abs=1e-3)
+    assert high == pytest.approx(0.943, abs=1e-3)
