@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
@@ -79,7 +80,7 @@ class HindsightAugment(BufferTransform):
         )
         if k < 1:
             raise ValueError(f"k must be at least 1, got {k}.")
-        if self._strategy is None:
+        if strategy == RANDOM:
             raise ValueError(
                 "HindsightAugment sees one episode at a time and cannot draw "
                 f"{RANDOM!r} goals; HindsightRelabel can."
@@ -97,8 +98,9 @@ class HindsightAugment(BufferTransform):
         if len(shape) > 1:  # time first, as the streams are
             tensordict = tensordict.permute(len(shape) - 1, *range(len(shape) - 1))
         flat = tensordict.reshape(-1)
-        runs = split_runs(stream, flat.get(("next", "done")).reshape(-1))
-        rows = runs.order.split(runs.length.tolist())
+        done = flat.get(("next", "done")).reshape(-1)
+        runs = split_runs(stream.cpu().numpy(), done.cpu().numpy())
+        rows = torch.from_numpy(runs.order).split(runs.length.tolist())
         episodes = []
         for name, ended, part in zip(runs.stream, runs.ended, rows, strict=True):
             self._held.setdefault(name, []).append(flat[part])
@@ -111,19 +113,24 @@ class HindsightAugment(BufferTransform):
     def _augment(self, episodes: list[TensorDictBase]) -> TensorDictBase:
         """Returns the episodes' transitions, then their k relabelled copies."""
         original = TensorDict.cat(episodes)
-        device = original.get(self._rewriter.next_achieved_key).device
-        length = torch.tensor([len(e) for e in episodes], dtype=torch.int32)
-        start = (length.cumsum(0, dtype=torch.int32) - length).repeat_interleave(length)
-        end = length.repeat_interleave(length)
-        step = torch.arange(len(original), dtype=torch.int32) - start
-        step, start, end = (x.repeat(self.k).to(device) for x in (step, start, end))
-        assert self._strategy is not None  # the constructor refuses "random"
+        achieved = original.get(self._rewriter.next_achieved_key)
+        length = np.array([len(e) for e in episodes])
+        start = (length.cumsum() - length).repeat(length)
+        end = length.repeat(length)
+        step = np.arange(len(original)) - start
+        step, start, end = (np.tile(x, self.k) for x in (step, start, end))
+        share = torch.rand(len(step), generator=self._generator, dtype=torch.float64)
         goal_step = choose_steps(
-            self._strategy, step, torch.zeros_like(step), end, self._generator
+            self.strategy,
+            step,
+            np.zeros_like(step),
+            end,
+            share.numpy(),
+            self._generator,
         )
-        goals = original.get(self._rewriter.next_achieved_key)[start + goal_step]
+        goals = achieved[torch.from_numpy(start + goal_step).to(achieved.device)]
         copies = TensorDict.cat([original] * self.k)
-        rows = torch.arange(len(copies), device=device)
+        rows = torch.arange(len(copies), device=achieved.device)
         self._rewriter.rewrite(copies, rows, goals)
         return TensorDict.cat([original, copies])
 

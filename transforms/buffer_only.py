@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import Compose, EnvBase, MultiStepTransform, Transform
 
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
-from torch_panda.transforms.strategies import Strategy, make_strategy
+from torch_panda.transforms.strategies import Strategy, check_strategy
 
 
 class BufferTransform(Transform):
@@ -27,10 +27,10 @@ class BufferTransform(Transform):
         seed: int | None,
     ) -> None:
         super().__init__()
+        check_strategy(strategy)
         self.strategy = strategy
         self.trajectory_key = trajectory_key
         self.single_env = single_env
-        self._strategy = make_strategy(strategy)
         self._rewriter = Rewriter(
             reward_fn, terminated_fn, goal_key, achieved_goal_key, reward_key
         )

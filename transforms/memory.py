@@ -5,15 +5,22 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from torch_panda.transforms.blocks import GoalBlocks
-from torch_panda.transforms.strategies import Strategy, choose_steps, final, future
-from torch_panda.transforms.trajectories import Runs, split_runs
+from torch_panda.transforms.strategies import (
+    LOOKING_AHEAD,
+    RANDOM,
+    Shares,
+    Strategy,
+    choose_steps,
+    uniform,
+)
+from torch_panda.transforms.trajectories import Integers, Runs, split_runs
 
-# Strategies that look ahead only: what follows a stored transition is stored too.
-LOOKING_AHEAD = (future, final)
 # Transitions that may wait to be sorted into trajectories.
 MAX_WAITING = 4096
 
@@ -26,9 +33,11 @@ class GoalMemory:
     `head`. A ring gives the trajectory and the step of each; the goals are in blocks by
     trajectory and step.
 
-    Sorting a batch into trajectories takes the same few dozen tensor operations whether
+    Sorting a batch into trajectories takes the same few dozen array operations whether
     it is small or large. So what is written waits until a draw concerns it, that is
-    one of the waiting transitions or a trajectory that is still open.
+    one of the waiting transitions or a trajectory that is still open. These are in
+    numpy, whose operations on small arrays take a third of the time of torch's. The
+    goals stay on the device of the first data.
 
     Nothing tells a transform how much its buffer holds: until `observe` has found it
     out from what is sampled, the ring grows with the data.
@@ -50,18 +59,13 @@ class GoalMemory:
         self._forgotten = 0  # floor that trajectories are cut at; lags behind
         self._unit = 1  # transitions written at one index of the storage
         self._origin = 0  # serial, in units, that index 0 is counted from
-        self._waiting: list[tuple[Tensor, Tensor, Tensor]] = []  # stream, done, goals
-        self._ring = torch.zeros(0, 2, dtype=torch.int32)  # (rows, [trajectory, step])
+        self._waiting: list[tuple[NDArray[Any], NDArray[Any], Tensor]] = []
+        self._ring = np.zeros((0, 2), dtype=np.int32)  # (rows, [trajectory, step])
         self._blocks = GoalBlocks()
         self._open: dict[int, int] = {}  # stream -> trajectory that may go on
 
-    @property
-    def device(self) -> torch.device:
-        """Where the memory is: the device of the first data written."""
-        return self._ring.device
-
     def nbytes(self) -> int:
-        """Returns the bytes of all the tensors held."""
+        """Returns the bytes of all that is held."""
         blocks = self._blocks
         return self._ring.nbytes + blocks.goals.nbytes + blocks.table.nbytes
 
@@ -71,52 +75,52 @@ class GoalMemory:
         """Takes the goals that transitions achieved and returns their serials, (n,).
 
         Args:
-            stream: trajectory or environment of every transition, (n,), int64.
+            stream: trajectory or environment of every transition, (n,).
             done: whether the transition ends its trajectory, (n,), bool.
             goals: what it achieved, (n, *goal).
             unit: transitions that the buffer writes at one index.
         """
-        serial = torch.arange(self.head, self.head + len(goals), device=goals.device)
+        serial = np.arange(self.head, self.head + len(goals))
         self._unit = unit
         # Copies, as collectors reuse their tensors.
-        self._waiting.append((stream.long().clone(), done.clone(), goals.clone()))
+        flags = (stream.cpu().numpy().copy(), done.cpu().numpy().copy())
+        self._waiting.append((*flags, goals.clone()))
         self.head += len(goals)
         if self.capacity is not None:
             self.floor = max(self.floor, self.head - self.capacity)
         if self.head - self._sorted >= MAX_WAITING:
             self._sort()
-        return serial
+        return torch.from_numpy(serial).to(goals.device)
 
     def _sort(self) -> None:
         """Sorts what waits into trajectories."""
         if not self._waiting:
             return
-        waiting = zip(*self._waiting, strict=True)
-        stream, done, goals = (torch.cat(part) for part in waiting)
+        streams, dones, parts = zip(*self._waiting, strict=True)
         self._waiting.clear()
+        goals = torch.cat(parts)
         self._make_room(goals)
-        runs = split_runs(stream, done)
-        # One entry a run, (m,).
+        runs = split_runs(np.concatenate(streams), np.concatenate(dones))
         trajectory = self._trajectories_of(runs)
         base, begin = self._blocks.append(trajectory, runs.length)
-        over = [i for i, ended in enumerate(runs.ended) if ended]
+        over = [t for t, end in zip(trajectory, runs.ended, strict=True) if end]
         if over:
-            self._blocks.close(trajectory[over].tolist())
+            self._blocks.close(over)
 
-        # One entry a transition, sorted by run, (n,).
-        per_run = torch.stack([trajectory, begin - runs.begin, base], 1)
-        trajectory, step, base = per_run.index_select(0, runs.run).unbind(1)
-        step = step + torch.arange(len(step), dtype=torch.int32, device=self.device)
-        entry = (base + step).long()
-        self._blocks.goals.index_copy_(0, entry, goals.index_select(0, runs.order))
+        # From one entry a run, (m,), to one a transition sorted by run, (n,).
+        run_start = runs.length.cumsum() - runs.length
+        step = (begin - run_start).repeat(runs.length) + np.arange(len(goals))
+        entry = np.empty_like(step)
+        entry[runs.order] = base.repeat(runs.length) + step
+        self._blocks.write(entry, goals)
         row = (self._sorted + runs.order) % len(self._ring)
-        self._ring.index_copy_(0, row, torch.stack([trajectory, step], 1))
+        self._ring[row, 0] = np.repeat(trajectory, runs.length)
+        self._ring[row, 1] = step
         self._sorted = self.head
 
     def _make_room(self, goals: Tensor) -> None:
         """Makes the ring hold what waits; the first goals tell type and device."""
         if not len(self._ring):
-            self._ring = self._ring.to(goals.device)
             self._blocks.start(goals)
             self._resize(self._ring_length())
         if self.head - self._forgotten > len(self._ring):
@@ -131,15 +135,15 @@ class GoalMemory:
 
     def _resize(self, rows: int) -> None:
         """Gives the ring another length."""
-        serial = torch.arange(self._forgotten, self._sorted, device=self.device)
-        ring = self._ring.new_zeros(rows, 2)
+        serial = np.arange(self._forgotten, self._sorted)
+        ring = np.zeros((rows, 2), dtype=np.int32)
         if len(serial):
             ring[serial % rows] = self._ring[serial % len(self._ring)]
         self._ring = ring
         self._blocks.rows = rows
 
-    def _trajectories_of(self, runs: Runs) -> Tensor:
-        """Returns the trajectory of every run, a known one or a new, (m,), int32.
+    def _trajectories_of(self, runs: Runs) -> list[int]:
+        """Returns the trajectory of every run, a known one or a new, m numbers.
 
         Runs of one stream follow each other: only the first of them may continue a
         trajectory, and only the last may be continued.
@@ -161,7 +165,7 @@ class GoalMemory:
         for name, number, end in zip(stream, trajectory, ended, strict=True):
             if end and self._open[name] == number:
                 del self._open[name]
-        return torch.tensor(trajectory, dtype=torch.int32, device=self.device)
+        return trajectory
 
     def _forget(self) -> None:
         """Cuts the trajectories at the floor: what is below has been overwritten."""
@@ -173,15 +177,13 @@ class GoalMemory:
         if gone:
             self._open = {s: t for s, t in self._open.items() if t not in gone}
 
-    def _written(self, start: int, stop: int) -> tuple[Tensor, Tensor]:
+    def _written(self, start: int, stop: int) -> tuple[Integers, Integers]:
         """Returns trajectory and step of the serials from start up to stop."""
-        serial = torch.arange(start, stop, device=self.device)
-        trajectory, step = self._ring[serial % len(self._ring)].unbind(1)
-        return trajectory, step
+        return self.find(np.arange(start, stop))
 
     # -- reading ----------------------------------------------------------------------
 
-    def observe(self, serial: Tensor, index: Tensor) -> int:
+    def observe(self, serial: Integers, index: Integers) -> int:
         """Learns from sampled rows which transitions the buffer still holds.
 
         Index 0 is written once a lap of the storage, so `serial // unit - index` is
@@ -197,8 +199,8 @@ class GoalMemory:
         Raises:
             RuntimeError: the rows were not written round-robin along that dimension.
         """
-        lap = torch.div(serial, self._unit, rounding_mode="floor") - index
-        low, high = (int(x) for x in torch.aminmax(lap))
+        lap = serial // self._unit - index
+        low, high = int(lap.min()), int(lap.max())
         if high > low and (high - low) * self._unit != self.capacity:
             laps = ((lap == low) | (lap == high)).all()
             if low < 0 or not laps or int(index.max()) >= high - low:
@@ -223,38 +225,36 @@ class GoalMemory:
             self.floor = max(self.floor, low * self._unit)
         return self.floor
 
-    def find(self, serial: Tensor) -> tuple[Tensor, Tensor]:
+    def find(self, serial: Integers) -> tuple[Integers, Integers]:
         """Returns trajectory and step of transitions not below the floor, (n,) each."""
-        if self._waiting and int(serial.max()) >= self._sorted:
+        if self._waiting and serial.max() >= self._sorted:
             self._sort()
-        trajectory, step = self._ring.index_select(0, serial % len(self._ring)).unbind(
-            1
-        )
+        trajectory, step = self._ring.take(serial % len(self._ring), 0).T
         return trajectory, step
 
     def draw(
         self,
-        serial: Tensor,
-        strategy: Strategy | None,
-        generator: Generator | None,
+        serial: Integers,
+        strategy: str | Strategy,
+        share: Shares,
         floor: int,
+        generator: Generator | None,
     ) -> Tensor:
         """Draws a goal for each of some stored transitions, (n, *goal).
 
         Args:
             serial: serials of the transitions, (n,).
-            strategy: chooses the step; None draws from all stored transitions.
-            generator: source of randomness, None for torch's own.
+            strategy: chooses the step; "random" draws from all stored transitions.
+            share: random numbers from 0 to 1, (n,).
             floor: serial of the oldest transition that goals may come from; strategies
                 that look ahead need none.
+            generator: source of randomness for a user's own strategy.
         """
         blocks = self._blocks
-        if strategy is None:
-            share = torch.rand(len(serial), generator=generator, dtype=torch.float64)
-            serial = floor + (share.to(self.device) * (self.head - floor)).long()
-            trajectory, goal_step = self.find(serial)
+        if strategy == RANDOM:
+            trajectory, goal_step = self.find(uniform(floor, self.head, share))
             base, *_ = blocks.find(trajectory)
-            return blocks.goals.index_select(0, base + goal_step)
+            return blocks.read(base + goal_step)
         trajectory, step = self.find(serial)
         base, first, end, _, is_open = blocks.find(trajectory)
         if self._waiting and is_open.any():
@@ -262,9 +262,9 @@ class GoalMemory:
             base, first, end, *_ = blocks.find(trajectory)
         if strategy not in LOOKING_AHEAD:
             first = blocks.first_steps(*self._written(self._forgotten, floor))
-            first = first.index_select(0, trajectory)
-        goal_step = choose_steps(strategy, step, first, end, generator)
-        return blocks.goals.index_select(0, base + goal_step)
+            first = first[trajectory]
+        goal_step = choose_steps(strategy, step, first, end, share, generator)
+        return blocks.read(base + goal_step)
 
     # -- saving -----------------------------------------------------------------------
 
@@ -272,10 +272,14 @@ class GoalMemory:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
         self._sort()
         own = {k: v for k, v in vars(self).items() if k != "_blocks"}
-        return copy.deepcopy({"memory": own, "blocks": vars(self._blocks)})
+        own["_ring"] = torch.from_numpy(self._ring)
+        blocks = {**vars(self._blocks), "table": torch.from_numpy(self._blocks.table)}
+        return copy.deepcopy({"memory": own, "blocks": blocks})
 
     def load(self, state: dict[str, Any]) -> None:
         """Takes the state that another memory returned."""
         state = copy.deepcopy(state)
         vars(self).update(state["memory"])
         vars(self._blocks).update(state["blocks"])
+        self._ring = state["memory"]["_ring"].numpy()
+        self._blocks.table = state["blocks"]["table"].numpy()

@@ -5,16 +5,18 @@ from __future__ import annotations
 import threading
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
 
 from torch_panda.transforms.buffer_only import BufferTransform
-from torch_panda.transforms.memory import LOOKING_AHEAD, GoalMemory
+from torch_panda.transforms.memory import GoalMemory
 from torch_panda.transforms.rewrite import GoalFunction
-from torch_panda.transforms.strategies import Strategy
+from torch_panda.transforms.strategies import LOOKING_AHEAD, Shares, Strategy
 from torch_panda.transforms.trajectories import (
     TRAJECTORY_KEY,
+    Integers,
     streams_of,
     time_first,
     time_last,
@@ -140,31 +142,34 @@ class HindsightRelabel(BufferTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled."""
-        serial = tensordict.get(SERIAL_KEY).reshape(-1)
-        device = serial.device
+        tag = tensordict.get(SERIAL_KEY).reshape(-1)
         tensordict = tensordict.exclude(SERIAL_KEY)
+        serial = tag.cpu().numpy()
         with self._lock:
-            memory = self._memory
-            serial = serial.to(memory.device)
             floor = self._floor(serial, tensordict)
             choose = self._choose_rows if self.unit == "row" else self._choose_slices
-            rows, last, place = choose(serial)
+            rows, last, share, place = choose(serial)
             if not len(rows):
                 return tensordict
-            goals = memory.draw(last, self._strategy, self._generator, floor)
+            goals = self._memory.draw(
+                last, self.strategy, share, floor, self._generator
+            )
         if place is not None:
-            goals = goals.index_select(0, place)
-        self._rewriter.rewrite(tensordict, rows.to(device), goals.to(device))
+            goals = goals[place]
+        device = tag.device
+        self._rewriter.rewrite(
+            tensordict, torch.from_numpy(rows).to(device), goals.to(device)
+        )
         return tensordict
 
-    def _floor(self, serial: Tensor, tensordict: TensorDictBase) -> int:
+    def _floor(self, serial: Integers, tensordict: TensorDictBase) -> int:
         """Returns the serial from which on goals may be drawn."""
         memory = self._memory
-        if memory.capacity is not None and self._strategy in LOOKING_AHEAD:
+        if memory.capacity is not None and self.strategy in LOOKING_AHEAD:
             return memory.floor  # these strategies need no other
         index = tensordict.get("index", None)
         if index is not None:
-            return memory.observe(serial, index.reshape(-1).to(serial.device))
+            return memory.observe(serial, index.reshape(-1).cpu().numpy())
         if memory.capacity is None:
             raise RuntimeError(
                 'the sampled rows have no "index": use a TensorDictReplayBuffer, or '
@@ -172,37 +177,43 @@ class HindsightRelabel(BufferTransform):
             )
         return memory.floor
 
-    def _choose_rows(self, serial: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Chooses rows (n,) of a batch and returns them with their serials (n,)."""
-        chosen = torch.rand(len(serial), generator=self._generator) < self.her_ratio
-        rows = chosen.nonzero().squeeze(1).to(serial.device)
-        serial = serial.index_select(0, rows)
-        stored = serial >= self._memory.floor
-        if not stored.all():  # overwritten after it was prefetched: left as it is
-            rows, serial = rows[stored], serial[stored]
-        return rows, serial, None
+    def _choose(self, number: int) -> tuple[NDArray[np.bool_], Shares]:
+        """Chooses a random `her_ratio` of so many, and numbers to draw goals with."""
+        # The generator is the CPU's, so that a seed means the same on every device.
+        drawn = torch.rand(number, generator=self._generator, dtype=torch.float64)
+        share = drawn.numpy()
+        # Those below the ratio are uniform up to it: no second draw is needed.
+        return share < self.her_ratio, share / (self.her_ratio or 1)
 
-    def _choose_slices(self, serial: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _choose_rows(self, serial: Integers) -> tuple[Integers, Integers, Shares, None]:
+        """Chooses rows (n,) of a batch; returns also serials and shares, (n,) each."""
+        chosen, share = self._choose(len(serial))
+        chosen &= serial >= self._memory.floor  # the others were overwritten since
+        rows = chosen.nonzero()[0]
+        return rows, serial[rows], share[rows], None
+
+    def _choose_slices(
+        self, serial: Integers
+    ) -> tuple[Integers, Integers, Shares, Integers]:
         """Chooses slices of a batch.
 
         Returns:
-            Their rows, (n,), the serials of their last rows, (slices,), and which of
-            these slices every row is in, (n,).
+            Their rows, (n,), serials of their last rows and shares, (slices,) each, and
+            which of these slices every row is in, (n,).
         """
-        stored = serial >= self._memory.floor
-        trajectory, step = self._memory.find(serial.clamp(min=self._memory.floor))
-        ahead = step.diff()
+        floor = self._memory.floor
+        trajectory, step = self._memory.find(serial.clip(floor))
+        ahead = np.diff(step)
         # A padded slice repeats its last row: still the same slice.
-        goes_on = (trajectory.diff() == 0) & ((ahead == 0) | (ahead == 1))
-        last = torch.cat([~goes_on, goes_on.new_ones(1)])
-        ends = last.nonzero().squeeze(1)
-        slices = last.cumsum(0) - last.long()
-        chosen = torch.rand(len(ends), generator=self._generator) < self.her_ratio
-        chosen = chosen.to(serial.device)
-        chosen[slices[~stored]] = False
-        rows = chosen[slices].nonzero().squeeze(1)
-        place = (chosen.cumsum(0) - 1)[slices[rows]]
-        return rows, serial[ends[chosen]], place
+        goes_on = (np.diff(trajectory) == 0) & ((ahead == 0) | (ahead == 1))
+        last = np.append(~goes_on, True)
+        ends = last.nonzero()[0]
+        slices = last.cumsum() - last
+        chosen, share = self._choose(len(ends))
+        chosen[slices[serial < floor]] = False
+        rows = chosen[slices].nonzero()[0]
+        place = (chosen.cumsum() - 1)[slices[rows]]
+        return rows, serial[ends[chosen]], share[chosen], place
 
     def empty(self) -> None:
         """Forgets all transitions, as after the buffer's own `empty`.

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+
+Integers = NDArray[np.integer[Any]]
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
 
@@ -16,44 +20,34 @@ class Runs(NamedTuple):
 
     Attributes:
         order: the batch's rows sorted by stream, time order kept, shape (n,), int64.
-        run: the run of every sorted row, shape (n,), int64.
-        begin: the first sorted row of every run, shape (m,), int32.
-        length: number of rows of every run, shape (m,), int32.
+        length: number of sorted rows of every run, shape (m,), int64.
         stream: the stream of every run, m numbers.
         ended: whether the run's last row ends its trajectory, m flags.
     """
 
-    order: Tensor
-    run: Tensor
-    begin: Tensor
-    length: Tensor
+    order: Integers
+    length: Integers
     stream: list[int]
     ended: list[bool]
 
 
-def split_runs(stream: Tensor, done: Tensor) -> Runs:
+def split_runs(stream: Integers, done: NDArray[np.bool_]) -> Runs:
     """Cuts a batch into runs: where the stream changes, and after every done.
 
     Args:
         stream: what the transition comes from (a trajectory's or an environment's
-            number), shape (n,), int64. Rows of one stream are in time order.
-        done: whether the transition ends its trajectory, shape (n,), bool.
+            number), shape (n,). Rows of one stream are in time order.
+        done: whether the transition ends its trajectory, shape (n,).
     """
-    stream, order = torch.sort(stream, stable=True)
-    done = done.index_select(0, order)
-    # Where a run begins, with one more entry for the end of the last one.
-    first = torch.ones(len(order) + 1, dtype=torch.bool, device=order.device)
-    torch.logical_or(stream[1:] != stream[:-1], done[:-1], out=first[1:-1])
-    bounds = first.nonzero().squeeze(1)
-    begin, end = bounds[:-1], bounds[1:]
-    return Runs(
-        order,
-        first[:-1].cumsum(0).sub_(1),
-        begin.int(),
-        (end - begin).int(),
-        stream.index_select(0, begin).tolist(),
-        done.index_select(0, end - 1).tolist(),
-    )
+    order = stream.argsort(kind="stable")
+    stream, done = stream[order], done[order]
+    last = done.copy()
+    last[-1] = True
+    last[:-1] |= stream[1:] != stream[:-1]
+    ends = last.nonzero()[0]
+    length = ends + 1
+    length[1:] -= length[:-1]  # numpy takes care of the overlap
+    return Runs(order, length, stream[ends].tolist(), done[ends].tolist())
 
 
 def time_first(value: Tensor, batch_dims: int) -> Tensor:

@@ -4,7 +4,7 @@ import pytest
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from tests.transforms import toy
+from tests.transforms import panda, toy
 from tests.transforms.identifiable import check_batch, relabelled, reward_fn
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
@@ -49,16 +49,62 @@ def test_single_process(flat, reset_at_each_iter, steps):
     check(SINGLE, 3 * steps, 3 * steps * 40, **options)
 
 
+@pytest.mark.slow
 def test_parallel_env():
     check(PARALLEL, 6 * 4, 6 * 4 * 20)
 
 
+@pytest.mark.slow
 def test_multi_process_synchronous():
     check(SYNC, 6 * 4, 6 * 4 * 20)
 
 
+@pytest.mark.slow
 def test_multi_process_asynchronous():
     check(ASYNC, 3 * 4, 3 * 4 * 40)
+
+
+PANDAS = {
+    "batched": functools.partial(Collector, panda.make_env),
+    "ParallelEnv": functools.partial(Collector, panda.make_parallel),
+    "synchronous": functools.partial(
+        MultiSyncCollector, [panda.make_env, panda.make_longer]
+    ),
+    "asynchronous": functools.partial(
+        MultiAsyncCollector, [panda.make_env, panda.make_longer]
+    ),
+}
+PANDAS_NESTED = {
+    "synchronous": functools.partial(MultiSyncCollector, [panda.make_parallel] * 2),
+    "asynchronous": functools.partial(MultiAsyncCollector, [panda.make_parallel] * 2),
+}
+
+
+@pytest.mark.parametrize("collector", PANDAS)
+def test_panda_environments(collector):
+    check_panda(PANDAS[collector])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", PANDAS_NESTED)
+def test_panda_parallel_env_in_workers(collector):
+    check_panda(PANDAS_NESTED[collector])
+
+
+def check_panda(make_collector):
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(200),
+        transform=HindsightRelabel(panda.reward_fn),
+        batch_size=128,
+    )
+    share, written = [], 0
+    for data in collect(make_collector, 8 * 3, 8 * 3 * 25):
+        rb.extend(data.reshape(-1))
+        written += data.numel()
+        mask = panda.check_batch(rb.sample(), rb.storage[:])
+        share.append(mask.float().mean())
+    assert written > 2 * len(rb) == 400  # it was full, and written over
+    assert abs(sum(share) / len(share) - 0.8) < 0.1
 
 
 def test_augment_of_a_collectors_data():

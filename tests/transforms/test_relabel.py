@@ -1,5 +1,6 @@
 import threading
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -8,6 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
+    PrioritizedSampler,
     ReplayBuffer,
     SamplerWithoutReplacement,
     SliceSampler,
@@ -441,22 +443,69 @@ def test_padded_slices():
         assert (pieces == pieces[:, :1]).all()
 
 
-def test_prioritized_sampler():
-    from torchrl.data import PrioritizedSampler
+class SumTree:
+    """What torchrl's compiled trees do, slowly."""
 
-    try:
-        sampler = PrioritizedSampler(100, alpha=0.7, beta=0.5)
-    except (ImportError, RuntimeError) as error:
-        pytest.skip(f"torchrl's compiled extension is missing: {error}")
-    rb = make_buffer(100, sampler=sampler)
+    def __init__(self, size):
+        self.values = torch.zeros(size)
+
+    def __getitem__(self, index):
+        return self.values[index]
+
+    def __setitem__(self, index, value):
+        self.values[index] = torch.as_tensor(value, dtype=torch.float32)
+
+    def query(self, left, right):
+        return self.values[left:right].sum().item()
+
+    def scan_lower_bound(self, mass):
+        index = torch.searchsorted(self.values.cumsum(0), torch.as_tensor(mass))
+        return index.clamp(max=len(self.values) - 1)
+
+
+class MinTree(SumTree):
+    def query(self, left, right):
+        return self.values[left:right].min().item()
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_prioritized_sampler(compiled, monkeypatch):
+    from torchrl.data.replay_buffers.samplers import prioritized
+
+    if not compiled:
+        for trees, tree in ("SumSegmentTree", SumTree), ("MinSegmentTree", MinTree):
+            for dtype in ("Fp32", "Fp64"):
+                monkeypatch.setattr(prioritized, trees + dtype, tree)
+    elif prioritized.SumSegmentTreeFp32 is None:
+        pytest.skip("torchrl's compiled extension does not load with this torch")
+
+    def make(transform):
+        return TensorDictReplayBuffer(
+            storage=LazyTensorStorage(100),
+            sampler=PrioritizedSampler(100, alpha=0.7, beta=0.5),
+            transform=transform,
+            batch_size=64,
+        )
+
+    rb, plain = make(HindsightRelabel(reward_fn, seed=0)), make(None)
     envs = Envs(3, [5, 9])
-    for _ in range(30):
-        rb.extend(envs.chunk(4).reshape(-1))
-        batch = rb.sample()
+    for i in range(30):
+        data = envs.chunk(4).reshape(-1)
+        batches = []
+        for buffer in (rb, plain):
+            buffer.extend(data)
+            torch.manual_seed(i)
+            np.random.seed(i)
+            batches.append(buffer.sample())
+        batch, expected = batches
         check_batch(batch, rb.storage[:], "future")
         check_untouched(batch, rb.storage[:])
-        batch["td_error"] = torch.rand(len(batch))
-        rb.update_tensordict_priority(batch)
+        for key in ("index", "priority_weight"):
+            assert (batch[key] == expected[key]).all(), key
+        for buffer, sampled in zip((rb, plain), batches, strict=True):
+            sampled["td_error"] = (sampled["index"] % 7 + 1).float()
+            buffer.update_tensordict_priority(sampled)
+    assert batch["priority_weight"].unique().numel() > 1
 
 
 def test_prefetch_beside_writing():
