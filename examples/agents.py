@@ -53,6 +53,9 @@ class Hyperparameters:
     """DDPG, TD3: weight of the mean squared action in the actor's loss"""
     random_eps: float = 0.3
     """DDPG, TD3: probability of a random action"""
+    max_random_eps: float | None = None
+    """DDPG, TD3: that probability in the last environment, the others being evenly
+    spaced, so that some always explore; None means random_eps in all"""
     noise_eps: float = 0.2
     """DDPG, TD3: standard deviation of the Gaussian noise on actions"""
     policy_noise: float = 0.2
@@ -178,11 +181,17 @@ class Agent(nn.Module):
         else:
             sigma = {"sigma_init": hp.noise_eps, "sigma_end": hp.noise_eps}
             eps = {"eps_init": hp.random_eps, "eps_end": hp.random_eps}
+            random_action = EGreedyModule(env.action_spec, **eps)
+            if hp.max_random_eps is not None:
+                # (num_envs,): compared with one random number per environment.
+                random_action.eps = torch.linspace(
+                    hp.random_eps, hp.max_random_eps, env.batch_size[0]
+                )
             self.explore = Seq(
                 normalize,
                 actor,
                 AdditiveGaussianModule(env.action_spec, **sigma),
-                EGreedyModule(env.action_spec, **eps),
+                random_action,
             )
             if hp.algo == "ddpg":
                 self.loss = DDPGLoss(

@@ -1,6 +1,6 @@
 """Draw the picture of all tasks, at the end of an expert's episode.
 
-    python examples/gallery.py --out gallery.png
+python examples/gallery.py --out gallery.png
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ import tyro
 from PIL import Image, ImageDraw
 
 import torch_panda
-
 from experts import make_expert
 from watch import tile
 
@@ -40,7 +39,10 @@ def main(args: Args) -> None:
     cells = []
     for task in TASKS:
         env_id = f"Panda{task}-v1"
-        with torch_panda.make(env_id, num_envs=1, seed=args.seed) as env, torch.no_grad():
+        with (
+            torch_panda.make(env_id, num_envs=1, seed=args.seed) as env,
+            torch.no_grad(),
+        ):
             env.rollout(args.step, make_expert(env_id))
             pixels = env.render(camera=camera, size=args.size)[0].numpy()
         cell = Image.fromarray(pixels)

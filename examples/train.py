@@ -61,6 +61,8 @@ class Args(Hyperparameters):
     """gradient steps per environment step"""
     batch_size: int = 256
     """transitions per gradient step"""
+    demos: Path | None = None
+    """transitions to start the buffer with, as examples/experts.py writes them"""
     keep_unmoved: float = 1.0
     """share of the episodes in which nothing moved that are stored (filtered HER, see
     arXiv 2012.08850): every goal that they could be given is reached without acting"""
@@ -126,7 +128,11 @@ class Run:
             max_episode_steps=self.env.max_episode_steps,
             sparse="Dense" not in args.env_id,
         ).to(args.device)
-        self.buffer = make_buffer(args, self.env)
+        demos = None if args.demos is None else read_demos(args.demos, self.env)
+        self.buffer = make_buffer(args, self.env, 0 if demos is None else len(demos))
+        if demos is not None:
+            self.buffer.extend(demos)
+            self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
         self.curve: list[dict[str, float]] = []
         self.steps = 0
         self.seconds = 0.0
@@ -298,10 +304,29 @@ class StopSignal:
         return self.received
 
 
-def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBuffer:
+def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
+    """Transitions (n,) of whole episodes.
+
+    Raises:
+        ValueError: they are not of such an environment.
+    """
+    demos = torch.load(path, weights_only=False).select(*STORED_KEYS)
+    for key in ("observation", "action", "desired_goal"):
+        expected = env.full_observation_spec.get(key, None)
+        size = (env.action_spec if expected is None else expected).shape[-1]
+        if demos[key].shape[-1] != size:
+            raise ValueError(
+                f"{path}: {key} has size {demos[key].shape[-1]}, the task's has {size}"
+            )
+    return demos.to(env.device)
+
+
+def make_buffer(
+    args: Args, env: torch_panda.RobotTaskEnv, num_demos: int
+) -> TensorDictReplayBuffer:
     """The replay buffer with the chosen kind of hindsight."""
     iteration = args.num_envs * env.max_episode_steps
-    capacity = min(args.buffer_size, args.total_steps + iteration)
+    capacity = min(args.buffer_size, args.total_steps + iteration + num_demos)
     transform: HindsightRelabel | HindsightAugment | None = None
     if args.her == "relabel":
         transform = HindsightRelabel(
@@ -334,9 +359,8 @@ def crossed(interval: int, before: int, after: int) -> bool:
 
 def fixed(args: Args) -> dict[str, Any]:
     """The arguments that a continuation must share."""
-    return {
-        key: value for key, value in asdict(args).items() if key not in FREE_ARGUMENTS
-    }
+    every = json.loads(json.dumps(asdict(args), default=str))
+    return {key: value for key, value in every.items() if key not in FREE_ARGUMENTS}
 
 
 def main(args: Args) -> None:

@@ -23,7 +23,6 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_ty
 from tqdm import tqdm
 
 import torch_panda
-
 from agents import load_policy
 from experts import make_expert
 
@@ -48,9 +47,13 @@ def record(
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"a video's name must end in .mp4 or .gif, got {path.name!r}")
-    frames = list(tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame"))
+    frames = list(
+        tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame")
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
-    options = {"loop": 0, "duration": 1000 / FPS} if path.suffix == ".gif" else {"fps": FPS}
+    options = (
+        {"loop": 0, "duration": 1000 / FPS} if path.suffix == ".gif" else {"fps": FPS}
+    )
     iio.imwrite(path, np.stack(frames), **options)
 
 
@@ -116,7 +119,9 @@ def main(args: Args) -> None:
         path = Path(args.policy)
         path = path / "checkpoint.pt" if path.is_dir() else path
         if not path.exists():
-            raise SystemExit(f"a policy is random, expert or a run, got {args.policy!r}")
+            raise SystemExit(
+                f"a policy is random, expert or a run, got {args.policy!r}"
+            )
         checkpoint = torch.load(path)
     env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
     try:
