@@ -84,7 +84,7 @@ class Args(Hyperparameters):
 
 PRESETS = {
     "paper": Args(),
-    "tuned": Args(preset="tuned"),
+    "tuned": Args(preset="tuned", gamma=0.95, keep_unmoved=0.1, max_random_eps=1.0),
 }
 # What may differ between a run and its continuation.
 FREE_ARGUMENTS = {"resume", "out", "num_threads", "tensorboard", "save_interval"}
