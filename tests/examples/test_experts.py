@@ -56,7 +56,7 @@ def test_v3_episodes_end_at_success():
         assert not episode["next", "success"][:-1].any()
 
 
-@pytest.mark.parametrize("task", ["Reach", "Push", "Slide", "PickAndPlace", "Stack"])
+@pytest.mark.parametrize("task", list(experts.EXPERTS))
 def test_the_actions_of_an_environment_depend_on_its_observation_only(task):
     torch.manual_seed(0)
     env_id = f"Panda{task}-v1"
