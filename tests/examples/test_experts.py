@@ -21,44 +21,42 @@ experts = importlib.util.module_from_spec(spec)
 sys.modules[spec.name] = experts
 spec.loader.exec_module(experts)
 
-EPISODES = 16
 
-
-def successes(env_id, seed):
-    """Success at the end of 16 episodes and the rollouts."""
-    with torch_panda.make(env_id, num_envs=EPISODES, seed=seed) as env:
+def successes(env_id, episodes, seed):
+    """Success at the end of each episode, and the episodes."""
+    with torch_panda.make(env_id, num_envs=episodes, seed=seed) as env:
         episodes = experts.play(env, experts.make_expert(env_id))
     return [bool(episode["next", "success"][-1]) for episode in episodes], episodes
 
 
-# At least this many of 16: an expert with the measured rate misses it once in 10,000
-# draws. Random actions succeed, at an episode's end, in at most 1 of 10 episodes.
+# Bounds that the measured rates miss less than once in 1,000 draws of so many episodes.
+# Random actions succeed at the end of one Push episode in nine, and more rarely else.
 @pytest.mark.parametrize(
-    ("env_id", "least"),
+    ("env_id", "episodes", "least"),
     [
-        ("PandaReach-v1", 16),
-        ("PandaPush-v1", 13),
-        ("PandaSlide-v1", 3),
-        ("PandaPickAndPlace-v1", 13),
-        ("PandaStack-v1", 12),
-        ("PandaFlip-v1", 3),
-        ("PandaPush-v3", 13),
+        ("PandaReach-v1", 16, 16),
+        ("PandaPush-v1", 16, 13),
+        ("PandaSlide-v1", 32, 9),
+        ("PandaPickAndPlace-v1", 16, 13),
+        ("PandaStack-v1", 16, 12),
+        ("PandaFlip-v1", 32, 8),
+        ("PandaPush-v3", 16, 13),
     ],
 )
-def test_solves_its_task(env_id, least):
-    done, _ = successes(env_id, seed=11)
+def test_solves_its_task(env_id, episodes, least):
+    done, _ = successes(env_id, episodes, seed=11)
     assert sum(done) >= least
 
 
 def test_v3_episodes_end_at_success():
-    done, episodes = successes("PandaReach-v3", seed=3)
+    done, episodes = successes("PandaReach-v3", 16, seed=3)
     assert all(done)
     for episode in episodes:
         assert episode["next", "done"].sum() == 1
         assert not episode["next", "success"][:-1].any()
 
 
-@pytest.mark.parametrize("task", ["Reach", "Push", "Slide", "PickAndPlace", "Stack"])
+@pytest.mark.parametrize("task", list(experts.EXPERTS))
 def test_the_actions_of_an_environment_depend_on_its_observation_only(task):
     torch.manual_seed(0)
     env_id = f"Panda{task}-v1"
