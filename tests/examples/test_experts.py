@@ -1,9 +1,7 @@
 """The scripted experts: they solve their tasks, from observations alone."""
 
-import importlib.util
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,15 +9,11 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+import experts
 import torch_panda
 from torch_panda.transforms import HindsightRelabel
 
-FILE = Path(__file__).parents[2] / "examples" / "experts.py"
-spec = importlib.util.spec_from_file_location("experts_example", FILE)
-experts = importlib.util.module_from_spec(spec)
-# Dataclasses look their module up.
-sys.modules[spec.name] = experts
-spec.loader.exec_module(experts)
+FILE = experts.__file__
 
 
 def successes(env_id, episodes, seed):
