@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from torch_panda.bullet import ControlType
+from torch_panda.bullet.shapes import BLUE
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.robots import Panda
 from torch_panda.tasks import (
@@ -40,7 +41,7 @@ _V3_ARGUMENTS: dict[str, dict[str, Any]] = {
         "table_length": 1.4,
         "table_x_offset": -0.1,
     },
-    "Stack": {"distance_threshold": 0.1, "per_object": False},
+    "Stack": {"distance_threshold": 0.1, "per_object": False, "lower_color": BLUE},
 }
 _VERSIONS = ("v1", "v3")
 

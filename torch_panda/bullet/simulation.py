@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
-from torch_panda.bullet.pool import WorkerPool
+from torch_panda.bullet.pool import Work, WorkerPool
 
 ControlType = Literal["ee", "joints"]
 
@@ -134,6 +134,14 @@ class VectorSimulation:
         """
         work = self._step_ee if control_type == "ee" else self._step_joints
         self._pool.run(work, range(self.num_envs) if envs is None else envs)
+
+    def run(self, work: Work, envs: Sequence[int]) -> None:
+        """Call ``work(env)`` for these environments, in the threads that step them.
+
+        Raises:
+            WorkerError: it raised; all others are done nevertheless.
+        """
+        self._pool.run(work, envs)
 
     def reset(self, envs: Sequence[int]) -> None:
         """Start an episode from what the state tensors hold for these clients.

@@ -3,6 +3,7 @@
 import functools
 import operator
 import secrets
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -13,8 +14,17 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_panda.bullet import BulletError, PhysicsClient, Scene, VectorSimulation
+from torch_panda.bullet import (
+    BulletError,
+    Camera,
+    PhysicsClient,
+    Scene,
+    VectorSimulation,
+)
+from torch_panda.bullet.visual import resized
+from torch_panda.envs.renderer import Renderer
 from torch_panda.envs.state import read_state
+from torch_panda.envs.twin import Frames, VisualTwin
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
@@ -83,6 +93,7 @@ class RobotTaskEnv(EnvBase):
         self._simulation = VectorSimulation(
             self._build_scene, count, num_threads=num_threads
         )
+        self._renderer = Renderer(self._simulation, self._make_twin)
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
 
@@ -117,10 +128,49 @@ class RobotTaskEnv(EnvBase):
         values = {key: self._emit(value.clone()) for key, value in state.items()}
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
 
+    def render(
+        self,
+        envs: int | Sequence[int] | None = None,
+        *,
+        camera: Camera | None = None,
+        size: int | tuple[int, int] | None = None,
+    ) -> Tensor:
+        """Draw the environments as they are now.
+
+        Args:
+            envs: which, by index; None means all.
+            camera: where from; None means `Camera`'s defaults, which are panda-gym's.
+            size: height and width of the picture [pixels], or both in one number;
+                None means the camera's.
+
+        Returns:
+            uint8, (num_envs, height, width, 3) or as many as were asked for;
+            (height, width, 3) for one index or an environment of batch size [].
+
+        Raises:
+            BulletError: the environment is closed.
+            ValueError: an index is out of range, or its environment was never reset.
+        """
+        self._check_open()
+        camera = resized(camera or Camera(), size)
+        single = isinstance(envs, int) or (envs is None and self.num_envs is None)
+        if envs is None:
+            envs = range(len(self._goal))
+        elif isinstance(envs, int):
+            envs = [envs]
+        for env in envs:
+            if env not in range(len(self._goal)) or not self._episodes[env]:
+                raise ValueError(f"there is no environment {env} that was reset")
+        frames = Frames.allocate(len(envs), camera)
+        self._renderer.draw(envs, camera, frames, range(len(envs)))
+        pixels = frames.pixels.to(self.device)
+        return pixels[0] if single else pixels
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all clients and threads. Closing again does nothing."""
         if not self.is_closed:
             super().close(raise_if_closed=raise_if_closed)
+            self._renderer.close()
             self._simulation.close()
 
     def __enter__(self) -> "RobotTaskEnv":
@@ -216,6 +266,11 @@ class RobotTaskEnv(EnvBase):
             joint_forces=self.robot.joint_forces,
             objects=bodies.objects,
             targets=bodies.targets,
+        )
+
+    def _make_twin(self) -> VisualTwin:
+        return VisualTwin(
+            self._build_scene, lambda client: self.task.build(client).targets
         )
 
     def _start_episode(self, env: int) -> None:

@@ -1,0 +1,317 @@
+"""A client that holds what bodies look like, and draws it."""
+
+import dataclasses
+import functools
+import subprocess
+import sys
+from collections.abc import Sequence
+from ctypes import byref, c_float, c_int
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from torch_panda.bullet import _capi
+from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
+from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Look, Shape, Sphere
+
+Layer = Literal["solids", "markers"]
+RendererName = Literal["tiny", "egl"]
+
+_Z_AXIS = 2
+_NOT_SHINY = doubles((0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; the defaults are panda-gym's.
+
+    Attributes:
+        target: the point it looks at, world frame [m].
+        distance: from there [m].
+        yaw: its direction, about the world's z axis [degrees].
+        pitch: above the horizon, so a negative one looks down [degrees].
+        roll: about the line of sight [degrees].
+        fov: vertical angle of view [degrees].
+        width: of the image [pixels].
+        height: of the image [pixels].
+        near: nothing closer along the line of sight is seen [m].
+        far: nor anything farther [m].
+
+    Raises:
+        ValueError: a size, a distance or an angle is out of range.
+    """
+
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distance: float = 1.4
+    yaw: float = 45.0
+    pitch: float = -30.0
+    roll: float = 0.0
+    fov: float = 60.0
+    width: int = 720
+    height: int = 480
+    near: float = 0.1
+    far: float = 100.0
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1:
+            raise ValueError(
+                f"a camera's width and height must be at least 1 pixel, got "
+                f"{self.width} x {self.height}"
+            )
+        if not 0 < self.fov < 180:
+            raise ValueError(f"fov must be between 0 and 180 degrees, got {self.fov}")
+        if not (0 < self.near < self.far and self.distance > 0):
+            raise ValueError(
+                f"distance must be above 0, and near between 0 and far, got distance "
+                f"{self.distance}, near {self.near}, far {self.far}"
+            )
+
+
+def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
+    """The same view in another size: (height, width), or both in one; None: as is."""
+    if size is None:
+        return camera
+    height, width = (size, size) if isinstance(size, int) else size
+    return dataclasses.replace(camera, height=height, width=width)
+
+
+class Image(NamedTuple):
+    """What a camera sees, valid until the client's next command.
+
+    Attributes:
+        rgb: (height, width, 3) uint8.
+        depth: (height, width) float32, from 0 at ``near`` to 1 at ``far``, not linear;
+            see `to_metres`.
+        segmentation: (height, width) int32, the body id of what is seen, -1 where
+            nothing is; None if it was not asked for.
+    """
+
+    rgb: npt.NDArray[np.uint8]
+    depth: npt.NDArray[np.float32]
+    segmentation: npt.NDArray[np.int32] | None
+
+
+class VisualClient(PhysicsClient):
+    """A client that draws; it is built as a `PhysicsClient` and not stepped.
+
+    Bullet's software renderer knows no translucency. So what is opaque and what is
+    translucent are two layers, in a client each, for the caller to blend.
+
+    Args:
+        layer: what is seen: "solids", or the "markers" only.
+        renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, whose
+            client must be made, used and closed by one thread.
+
+    Attributes:
+        looks: how bodies look, by body id.
+    """
+
+    def __init__(
+        self, layer: Layer = "solids", *, renderer: RendererName = "tiny"
+    ) -> None:
+        super().__init__()
+        if renderer == "egl":
+            self._load_egl()
+        self._layer = layer
+        if layer == "solids":
+            self._urdf_flags = 0
+        self.looks: dict[int, Look] = {}
+
+    def set_joints(
+        self, body: int, joints: Sequence[int], positions: Sequence[float]
+    ) -> None:
+        """Put joints at positions [rad] or [m]."""
+        command = _capi.pose_init(self._open(), body)
+        for joint, position in zip(joints, positions, strict=True):
+            _capi.pose_set_joint_position(self._handle, command, joint, position)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set joints")
+
+    def draw(
+        self, camera: Camera, *, segmentation: bool = False, shadow: bool = True
+    ) -> Image:
+        """Draw what a camera sees.
+
+        Args:
+            camera: the camera.
+            segmentation: whether to tell the bodies apart.
+            shadow: whether bodies cast shadows.
+        """
+        view, projection = (c_float * 16)(), (c_float * 16)()
+        x, y, z = camera.target
+        _capi.view_matrix(
+            (c_float * 3)(x, y, z),
+            camera.distance,
+            camera.yaw,
+            camera.pitch,
+            camera.roll,
+            _Z_AXIS,
+            view,
+        )
+        aspect = camera.width / camera.height
+        _capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
+        command = _capi.camera_init(self._open())
+        _capi.camera_set_matrices(command, view, projection)
+        _capi.camera_set_size(command, camera.width, camera.height)
+        _capi.camera_set_shadow(command, int(shadow))
+        flags = 0 if segmentation else _capi.ER_NO_SEGMENTATION_MASK
+        _capi.camera_set_flags(command, flags)
+        self._submit(command, _capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
+        data = _capi.CameraImage()
+        _capi.camera_result(self._handle, byref(data))
+        size = (camera.height, camera.width)
+        return Image(
+            np.ctypeslib.as_array(data.rgba, shape=(*size, 4))[..., :3],
+            np.ctypeslib.as_array(data.depth, shape=size),
+            np.ctypeslib.as_array(data.segmentation, shape=size)
+            if segmentation
+            else None,
+        )
+
+    def _load_egl(self) -> None:
+        command = _capi.plugin_init(self._open())
+        _capi.plugin_set_path(command, _capi.library_path("eglRenderer").encode())
+        _capi.plugin_set_suffix(command, b"_eglRendererPlugin")
+        status = self._submit(
+            command, _capi.CMD_CUSTOM_COMMAND_COMPLETED, "load its EGL renderer"
+        )
+        if _capi.status_plugin(status) < 0:
+            raise BulletError("Bullet could not load its EGL renderer")
+
+    # ---- looks -------------------------------------------------------------------
+
+    def _create_body(
+        self,
+        shape: Shape | None,
+        mass: float,
+        position: Sequence[float],
+        look: Look,
+        *,
+        is_marker: bool = False,
+    ) -> int:
+        body = super()._create_body(shape, mass, position, look, is_marker=is_marker)
+        self.looks[body] = look
+        if look.texture is not None and self._draws(is_marker):
+            path = str(look.texture).encode()
+            command = _capi.texture_init(self._open(), path)
+            status = self._submit(
+                command, _capi.CMD_LOAD_TEXTURE_COMPLETED, f"load {look.texture}"
+            )
+            texture = _capi.status_texture(status)
+            command = _capi.look_init(self._open(), body, -1, -1)
+            _capi.look_set_texture(command, texture)
+            self._submit(
+                command, _capi.CMD_VISUAL_SHAPE_UPDATE_COMPLETED, "set a texture"
+            )
+        return body
+
+    def _create_collision_shape(self, shape: Shape) -> int:
+        # Bullet draws the collision shape of a body that has no visual shape.
+        return -1
+
+    def _create_visual_shape(self, shape: Shape, look: Look, *, is_marker: bool) -> int:
+        if not self._draws(is_marker):
+            return -1
+        handle = self._open()
+        command = _capi.visual_init(handle)
+        match shape:
+            case Box(half_extents) if look.texture is not None:
+                add_textured_box(handle, command, half_extents)
+            case Box(half_extents):
+                _capi.visual_add_box(command, doubles(half_extents))
+            case Cylinder(radius, height):
+                _capi.visual_add_cylinder(command, radius, height)
+            case Sphere(radius):
+                _capi.visual_add_sphere(command, radius)
+        color = look.color if look.texture is None else WHITE
+        _capi.visual_set_color(command, 0, doubles((*color, 1.0)))
+        _capi.visual_set_specular(command, 0, _NOT_SHINY)
+        status = self._submit(
+            command, _capi.CMD_CREATE_VISUAL_SHAPE_COMPLETED, "create a visual shape"
+        )
+        return _capi.status_visual(status)
+
+    def _draws(self, is_marker: bool) -> bool:
+        return is_marker == (self._layer == "markers")
+
+
+# Draws a box from above, and tells whether it and what surrounds it are seen.
+_EGL_PROBE = """
+from torch_panda.bullet import Camera
+from torch_panda.bullet.visual import VisualClient
+with VisualClient(renderer="egl") as client:
+    client.create_box((0.5, 0.5, 0.5), mass=0, position=(0, 0, 0))
+    image = client.draw(Camera(pitch=-90, distance=3, width=64, height=48))
+    assert image.rgb.std() > 1 and image.depth.std() > 0, "the image is blank"
+"""
+
+
+@functools.cache
+def check_egl() -> None:
+    """Make sure that EGL works here, in a process of its own: Bullet may end it.
+
+    Raises:
+        RuntimeError: it does not work.
+    """
+    probe = subprocess.run(
+        [sys.executable, "-c", _EGL_PROBE], capture_output=True, text=True
+    )
+    if probe.returncode != 0:
+        output = (probe.stdout + probe.stderr).strip().splitlines() or ["no output"]
+        raise RuntimeError(
+            f"renderer='egl' does not work on this machine, use 'tiny' "
+            f"(EGL said: {output[-1]})"
+        )
+
+
+def to_metres(
+    depth: npt.NDArray[np.float32], camera: Camera
+) -> npt.NDArray[np.float32]:
+    """Distance along the line of sight [m] of an `Image`'s depth.
+
+    The inverse of OpenGL's perspective projection.
+    """
+    near, far = np.float32(camera.near), np.float32(camera.far)
+    return near * far / (far - (far - near) * depth)
+
+
+def add_textured_box(
+    handle: int, command: int, half_extents: tuple[float, float, float]
+) -> None:
+    """Add a box whose faces show the six squares of a texture; see `Look`.
+
+    Bullet's own boxes show the whole texture on each face.
+    """
+    vertices: list[float] = []
+    normals: list[float] = []
+    coordinates: list[float] = []
+    indices: list[int] = []
+    for row, sign in enumerate((1.0, -1.0)):
+        for axis in range(3):
+            # Right and up on the face, so that right x up points outwards.
+            right, up = (axis + 1) % 3, (axis + 2) % 3
+            first = len(vertices) // 3
+            for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)):
+                vertex, normal = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+                vertex[axis] = sign * half_extents[axis]
+                vertex[right] = sign * (2 * u - 1) * half_extents[right]
+                vertex[up] = (2 * v - 1) * half_extents[up]
+                normal[axis] = sign
+                vertices += vertex
+                normals += normal
+                coordinates += [(axis + u) / 3, 1 - (row + 1 - v) / 2]
+            indices += [first + k for k in (0, 1, 2, 0, 2, 3)]
+    _capi.visual_add_mesh(
+        handle,
+        command,
+        doubles((1.0, 1.0, 1.0)),
+        doubles(vertices),
+        len(vertices) // 3,
+        (c_int * len(indices))(*indices),
+        len(indices),
+        doubles(normals),
+        len(normals) // 3,
+        doubles(coordinates),
+        len(coordinates) // 2,
+    )
