@@ -61,8 +61,9 @@ def make(
     num_threads: int | None = None,
     seed: int | None = None,
     device: torch.device | str | int | None = None,
+    **options: Any,  # noqa: ANN401 (those of RobotTaskEnv)
 ) -> RobotTaskEnv:
-    """Make the environments of an id; see `RobotTaskEnv` for the arguments.
+    """Make the environments of an id; see `RobotTaskEnv` for arguments and options.
 
     ``-v1`` follows the paper (arXiv 2106.13687), ``-v3`` equals panda-gym 3.0.7.
 
@@ -87,5 +88,5 @@ def make(
         num_threads=num_threads,
         seed=seed,
         device=device,
-        terminate_on_success=version == "v3",
+        **({"terminate_on_success": version == "v3"} | options),
     )

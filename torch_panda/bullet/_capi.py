@@ -54,6 +54,9 @@ URDF_IGNORE_VISUAL_SHAPES = 1 << 20
 # enum for b3JointControlCommandInit2
 CONTROL_MODE_POSITION_VELOCITY_PD = 2
 
+# enum JointFeedbackMode
+JOINT_FEEDBACK_IN_JOINT_FRAME = 2
+
 # enum EnumRendererAuxFlags
 ER_NO_SEGMENTATION_MASK = 4
 
@@ -405,14 +408,26 @@ state_result = bind(
     _address,  # link velocities (6 per link), world frame
 )
 contact_init = bind(_cheap, "b3InitRequestContactPointInformation", _command, _client)
-contact_set_body_a = bind(_cheap, "b3SetContactFilterBodyA", None, _command, c_int)
-contact_set_body_b = bind(_cheap, "b3SetContactFilterBodyB", None, _command, c_int)
 contact_result = bind(
     _cheap,
     "b3GetContactPointInformation",
     None,
     _client,
     POINTER(ContactInformation),
+)
+
+# Sensors
+sensor_init = bind(_cheap, "b3CreateSensorCommandInit", _command, _client, c_int)
+sensor_enable_wrench = bind(
+    _cheap,
+    "b3CreateSensorEnable6DofJointForceTorqueSensor",
+    c_int,
+    _command,
+    c_int,
+    c_int,
+)
+physics_set_joint_feedback = bind(
+    _cheap, "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
 )
 
 # Looks: shapes that are seen, and cameras that see them

@@ -26,6 +26,9 @@ _ORIGIN = (0.0, 0.0, 0.0)
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
+Vector = tuple[float, float, float]
+
+
 class BulletError(RuntimeError):
     """Bullet refused a command, or a simulation was used after ``close``."""
 
@@ -47,10 +50,56 @@ class ContactPoint(NamedTuple):
     body_b: int
     link_a: int
     link_b: int
-    position_on_b: tuple[float, float, float]  # [m]
-    normal_on_b: tuple[float, float, float]  # from b towards a
+    position_on_a: Vector  # [m]
+    position_on_b: Vector  # [m]
+    normal_on_b: Vector  # from b towards a
     distance: float  # [m], negative where the bodies penetrate
-    normal_force: float  # [N]
+    normal_force: float  # [N], along the normal on a, against it on b
+    friction_force: Vector  # [N], on a; the reverse acts on b
+
+    @property
+    def force_on_a(self) -> Vector:
+        """All that b exerts on a here [N]."""
+        x, y, z = (
+            self.normal_force * n + f
+            for n, f in zip(self.normal_on_b, self.friction_force, strict=True)
+        )
+        return x, y, z
+
+    def swapped(self) -> "ContactPoint":
+        """The same contact with a and b exchanged."""
+        return ContactPoint(
+            self.body_b,
+            self.body_a,
+            self.link_b,
+            self.link_a,
+            self.position_on_b,
+            self.position_on_a,
+            _negative(self.normal_on_b),
+            self.distance,
+            self.normal_force,
+            _negative(self.friction_force),
+        )
+
+
+class JointForces(NamedTuple):
+    """Addresses of the forces at a body's joints in the last step.
+
+    They are valid until the client's next command, and arrays of doubles for m joints,
+    fixed ones included:
+
+    Attributes:
+        wrenches: (m, 6), what each link's parent exerts on it, force [N] and torque
+            [N m], at the joint and in the link's frame; zero without a sensor.
+        motor_forces: (m,), what each motor exerts [N m] or [N].
+    """
+
+    wrenches: int
+    motor_forces: int
+
+    def wrench(self, joint: int) -> int:
+        """Address of the wrench (6) at a joint."""
+        return self.wrenches + _DOUBLE * 6 * joint
 
 
 class BodyState(NamedTuple):
@@ -93,6 +142,32 @@ class BodyState(NamedTuple):
 def doubles(values: Sequence[float]) -> Array[c_double]:
     """A C array of doubles."""
     return (c_double * len(values))(*values)
+
+
+def _read_contact(point: _capi.ContactPoint) -> ContactPoint:
+    friction = (
+        point.friction_force_1 * d1 + point.friction_force_2 * d2
+        for d1, d2 in zip(
+            point.friction_direction_1, point.friction_direction_2, strict=True
+        )
+    )
+    return ContactPoint(
+        point.body_a,
+        point.body_b,
+        point.link_a,
+        point.link_b,
+        tuple(point.position_on_a),
+        tuple(point.position_on_b),
+        tuple(point.normal_on_b),
+        point.distance,
+        point.normal_force,
+        tuple(friction),
+    )
+
+
+def _negative(vector: Vector) -> Vector:
+    x, y, z = vector
+    return -x, -y, -z
 
 
 def find_urdf(path: str | Path) -> str:
@@ -416,33 +491,58 @@ class PhysicsClient:
         )
         return BodyState(q.value, u.value, poses.value, velocities.value)  # type: ignore[arg-type]
 
+    def enable_wrench_sensor(self, body: int, joint: int) -> None:
+        """Have the forces through a joint computed in every step."""
+        command = _capi.physics_init(self._open())
+        _capi.physics_set_joint_feedback(command, _capi.JOINT_FEEDBACK_IN_JOINT_FRAME)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+        command = _capi.sensor_init(self._open(), body)
+        _capi.sensor_enable_wrench(command, joint, 1)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "add a sensor")
+
+    def joint_forces(self, body: int) -> JointForces:
+        """The forces at a body's joints in the last step."""
+        command = _capi.state_init(self._open(), body)
+        status = self._submit(
+            command, _capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED, "report a state"
+        )
+        wrenches, motors = c_void_p(), c_void_p()
+        _capi.state_result(
+            status,
+            None,
+            None,
+            None,
+            None,
+            None,
+            None,
+            None,
+            byref(wrenches),
+            None,
+            byref(motors),
+            None,
+            None,
+        )
+        return JointForces(wrenches.value, motors.value)  # type: ignore[arg-type]
+
     def contact_points(
         self, body_a: int | None = None, body_b: int | None = None
     ) -> list[ContactPoint]:
         """Contacts of the last step, of all bodies or of those given."""
+        # Not filtered by Bullet, which would swap a and b but not the friction.
         command = _capi.contact_init(self._open())
-        if body_a is not None:
-            _capi.contact_set_body_a(command, body_a)
-        if body_b is not None:
-            _capi.contact_set_body_b(command, body_b)
         self._submit(
             command, _capi.CMD_CONTACT_POINT_INFORMATION_COMPLETED, "report contacts"
         )
         found = _capi.ContactInformation()
         _capi.contact_result(self._handle, byref(found))
-        return [
-            ContactPoint(
-                point.body_a,
-                point.body_b,
-                point.link_a,
-                point.link_b,
-                tuple(point.position_on_b),
-                tuple(point.normal_on_b),
-                point.distance,
-                point.normal_force,
-            )
-            for point in found.points[: found.count]
-        ]
+        points = []
+        for point in found.points[: found.count]:
+            contact = _read_contact(point)
+            if body_a not in (None, contact.body_a):
+                contact = contact.swapped()
+            if body_a in (None, contact.body_a) and body_b in (None, contact.body_b):
+                points.append(contact)
+        return points
 
     # ---- commands ----------------------------------------------------------------
 

@@ -135,6 +135,11 @@ class VectorSimulation:
         work = self._step_ee if control_type == "ee" else self._step_joints
         self._pool.run(work, range(self.num_envs) if envs is None else envs)
 
+    @property
+    def clients(self) -> Sequence[PhysicsClient]:
+        """The clients, by environment."""
+        return self._clients
+
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for these environments, in the threads that step them.
 

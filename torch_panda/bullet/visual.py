@@ -7,19 +7,29 @@ import sys
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from torch_panda.bullet import _capi
-from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
+from torch_panda.bullet.client import (
+    BulletError,
+    PhysicsClient,
+    doubles,
+    find_urdf,
+)
+from torch_panda.bullet.coarse import coarse_urdf
 from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Look, Shape, Sphere
 
 Layer = Literal["solids", "markers"]
 RendererName = Literal["tiny", "egl"]
+RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
 
 _Z_AXIS = 2
+# Of a pixel in which nothing is seen, up to rounding.
+_BACKGROUND_DEPTH = np.float32(1 - 1e-6)
 _NOT_SHINY = doubles((0.0, 0.0, 0.0))
 
 
@@ -103,21 +113,43 @@ class VisualClient(PhysicsClient):
         layer: what is seen: "solids", or the "markers" only.
         renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, whose
             client must be made, used and closed by one thread.
+        mesh_cell: merge the vertices of robots' meshes in cubes of this edge length
+            [m]; see `coarse_urdf`. 0 leaves them as they are.
 
     Attributes:
         looks: how bodies look, by body id.
     """
 
     def __init__(
-        self, layer: Layer = "solids", *, renderer: RendererName = "tiny"
+        self,
+        layer: Layer = "solids",
+        *,
+        renderer: RendererName = "tiny",
+        mesh_cell: float = 0.0,
     ) -> None:
         super().__init__()
         if renderer == "egl":
             self._load_egl()
         self._layer = layer
+        self._mesh_cell = mesh_cell
         if layer == "solids":
             self._urdf_flags = 0
         self.looks: dict[int, Look] = {}
+
+    def load_urdf(
+        self,
+        path: str | Path,
+        *,
+        position: Sequence[float] = (0.0, 0.0, 0.0),
+        orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        fixed_base: bool = False,
+    ) -> int:
+        """Load a URDF to be seen; see `PhysicsClient.load_urdf`."""
+        if self._mesh_cell > 0 and self._layer == "solids":
+            path = coarse_urdf(find_urdf(path), self._mesh_cell)
+        return super().load_urdf(
+            path, position=position, orientation=orientation, fixed_base=fixed_base
+        )
 
     def set_joints(
         self, body: int, joints: Sequence[int], positions: Sequence[float]
@@ -247,13 +279,22 @@ with VisualClient(renderer="egl") as client:
 """
 
 
-@functools.cache
-def check_egl() -> None:
-    """Make sure that EGL works here, in a process of its own: Bullet may end it.
+def check_renderer(renderer: str) -> None:
+    """Make sure that a renderer works here.
 
     Raises:
-        RuntimeError: it does not work.
+        ValueError: there is none of that name.
+        RuntimeError: EGL does not work on this machine.
     """
+    if renderer not in RENDERERS:
+        raise ValueError(f"renderer must be one of {RENDERERS}, got {renderer!r}")
+    if renderer == "egl":
+        _check_egl()
+
+
+@functools.cache
+def _check_egl() -> None:
+    """In a process of its own: where EGL fails, Bullet ends the process."""
     probe = subprocess.run(
         [sys.executable, "-c", _EGL_PROBE], capture_output=True, text=True
     )
@@ -273,7 +314,8 @@ def to_metres(
     The inverse of OpenGL's perspective projection.
     """
     near, far = np.float32(camera.near), np.float32(camera.far)
-    return near * far / (far - (far - near) * depth)
+    metres = near * far / (far - (far - near) * depth)
+    return np.where(depth < _BACKGROUND_DEPTH, metres, far)
 
 
 def add_textured_box(

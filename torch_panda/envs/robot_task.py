@@ -21,10 +21,13 @@ from torch_panda.bullet import (
     Scene,
     VectorSimulation,
 )
-from torch_panda.bullet.visual import resized
+from torch_panda.bullet.visual import RendererName, check_renderer, resized
 from torch_panda.envs.renderer import Renderer
+from torch_panda.envs.senses import Sense
 from torch_panda.envs.state import read_state
-from torch_panda.envs.twin import Frames, VisualTwin
+from torch_panda.envs.touch import Touch, check_sensors
+from torch_panda.envs.twin import Frames, VisualTwin, segmentation_ids
+from torch_panda.envs.vision import PIXELS_CAMERA, Vision
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
@@ -54,9 +57,21 @@ class RobotTaskEnv(EnvBase):
         max_episode_steps: steps until ``truncated``; None means the task's number.
         terminate_on_success: whether success ends an episode, as in panda-gym 3; the
             paper's episodes go on.
+        from_pixels: observe ``pixels``, uint8 (*batch, height, width, 3).
+        pixels_only: leave ``observation`` out; the goals stay.
+        camera: of what is observed; None means panda-gym's view in 64 x 64 pixels.
+        render_size: height and width of what is observed [pixels], or both in one
+            number; None means the camera's.
+        depth: observe ``depth``, float32 (*batch, height, width, 1) [m]; see `Vision`.
+        segmentation: observe ``segmentation``, int32 (*batch, height, width, 1), the
+            body ids of ``segmentation_ids``.
+        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
+        sensors: which of "wrist_force_torque", "finger_contact" and "joint_torque" to
+            observe, each under its own key, float32; see `Touch`.
 
     Raises:
         ValueError: an argument is out of range.
+        RuntimeError: EGL is asked for and does not work here.
     """
 
     _supports_set_state = True
@@ -72,7 +87,29 @@ class RobotTaskEnv(EnvBase):
         device: torch.device | str | int | None = None,
         max_episode_steps: int | None = None,
         terminate_on_success: bool = False,
+        from_pixels: bool = False,
+        pixels_only: bool = False,
+        camera: Camera | None = None,
+        render_size: int | tuple[int, int] | None = None,
+        depth: bool = False,
+        segmentation: bool = False,
+        renderer: RendererName = "tiny",
+        sensors: Sequence[str] = (),
     ) -> None:
+        if pixels_only and not from_pixels:
+            raise ValueError("pixels_only=True needs from_pixels=True")
+        check_renderer(renderer)
+        check_sensors(robot, sensors)
+        self._sensing: dict[str, Any] = {
+            "from_pixels": from_pixels,
+            "pixels_only": pixels_only,
+            "camera": camera,
+            "render_size": render_size,
+            "depth": depth,
+            "segmentation": segmentation,
+            "renderer": renderer,
+            "sensors": sensors,
+        }
         _check_positive(num_envs=num_envs, num_threads=num_threads)
         _check_positive(max_episode_steps=max_episode_steps)
         batch_size = () if num_envs is None else (num_envs,)
@@ -84,7 +121,6 @@ class RobotTaskEnv(EnvBase):
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
-        self._make_specs()
         self._constructor_seed = seed
         self._set_seed(seed)
         count = num_envs or 1
@@ -93,7 +129,16 @@ class RobotTaskEnv(EnvBase):
         self._simulation = VectorSimulation(
             self._build_scene, count, num_threads=num_threads
         )
-        self._renderer = Renderer(self._simulation, self._make_twin)
+        self._renderer = Renderer(self._simulation, self._make_twin, renderer=renderer)
+        self._senses: list[Sense] = []
+        if from_pixels or depth or segmentation:
+            view = resized(camera or PIXELS_CAMERA, render_size)
+            images = {"pixels": from_pixels, "depth": depth}
+            images["segmentation"] = segmentation
+            self._senses.append(Vision(self._renderer, count, view, **images))
+        if sensors:
+            self._senses.append(Touch(self._simulation, robot, sensors))
+        self._make_specs()
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
 
@@ -111,6 +156,15 @@ class RobotTaskEnv(EnvBase):
     def is_success(self) -> RewardFunction:
         """The task's pure success function; see `Task.is_success`."""
         return self.task.is_success
+
+    @functools.cached_property
+    def segmentation_ids(self) -> dict[str, int]:
+        """What the numbers in segmentations stand for, by name.
+
+        ``nothing`` (-1), ``robot``, ``ground``, ``table``, and ``object``, or
+        ``object1`` and ``object2``, unless the task's looks name bodies otherwise.
+        """
+        return segmentation_ids(self._build_scene)
 
     def get_state(self) -> TensorDict:
         """The physical state, from which ``reset(state, set_state=True)`` starts.
@@ -196,6 +250,7 @@ class RobotTaskEnv(EnvBase):
             device=self.device,
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
+            **self._sensing,
         )
         return build, ()
 
@@ -209,6 +264,8 @@ class RobotTaskEnv(EnvBase):
         self._step_count += 1 if stepped is None else stepped
         envs = None if stepped is None else _indices(stepped)
         self._simulation.step(self.robot.control_type, envs)
+        for sense in self._senses:
+            sense.after_step(range(len(self._goal)) if envs is None else envs)
 
         observation = self._observe()
         reward = self.compute_reward(
@@ -241,6 +298,8 @@ class RobotTaskEnv(EnvBase):
             target_pose = self.task.target_pose(self._goal[envs])
             self._simulation.target_pose[envs] = target_pose
         self._simulation.reset(envs)
+        for sense in self._senses:
+            sense.after_reset(envs)
         return self._make_tensordict(self._observe())
 
     def _set_seed(self, seed: int | None) -> None:
@@ -268,9 +327,12 @@ class RobotTaskEnv(EnvBase):
             targets=bodies.targets,
         )
 
-    def _make_twin(self) -> VisualTwin:
+    def _make_twin(self, mesh_cell: float) -> VisualTwin:
         return VisualTwin(
-            self._build_scene, lambda client: self.task.build(client).targets
+            self._build_scene,
+            lambda client: self.task.build(client).targets,
+            renderer=self._sensing["renderer"],
+            mesh_cell=mesh_cell,
         )
 
     def _start_episode(self, env: int) -> None:
@@ -303,8 +365,13 @@ class RobotTaskEnv(EnvBase):
         started = self._step_count > 0
         truncated = self._step_count >= self.max_episode_steps
         terminated = success & started & self.terminate_on_success
+        sensed: dict[str, Tensor] = {}
+        for sense in self._senses:
+            sensed |= sense.observe()
+        if not self._sensing["pixels_only"]:
+            sensed["observation"] = observation.float()
         return {
-            "observation": observation.float(),
+            **sensed,
             "achieved_goal": achieved_goal,
             "desired_goal": desired_goal,
             "success": success,
@@ -346,6 +413,10 @@ class RobotTaskEnv(EnvBase):
             shape=batch,
             device=device,
         )
+        if self._sensing["pixels_only"]:
+            del self.observation_spec["observation"]
+        for sense in self._senses:
+            self.observation_spec.update(sense.spec(batch, device))
         self.action_spec = Bounded(
             low=-1.0,
             high=1.0,

@@ -50,6 +50,7 @@ class VisualTwin:
         build_scene: builds robot and task in a client.
         build_markers: builds the task alone, and returns the body ids of its markers.
         renderer: "tiny" or "egl", what draws the scene.
+        mesh_cell: how coarse the robot's meshes are [m]; see `VisualClient`.
     """
 
     def __init__(
@@ -58,8 +59,9 @@ class VisualTwin:
         build_markers: Callable[[PhysicsClient], tuple[int, ...]],
         *,
         renderer: RendererName = "tiny",
+        mesh_cell: float = 0.0,
     ) -> None:
-        self._solids = VisualClient("solids", renderer=renderer)
+        self._solids = VisualClient("solids", renderer=renderer, mesh_cell=mesh_cell)
         self._markers: VisualClient | None = None
         try:
             self._scene = build_scene(self._solids)
@@ -73,20 +75,6 @@ class VisualTwin:
         except BaseException:
             self.close()
             raise
-
-    @property
-    def segmentation_ids(self) -> dict[str, int]:
-        """What the numbers in segmentations stand for."""
-        scene = self._scene
-        if len(scene.objects) == 1:
-            names = {scene.objects[0]: "object"}
-        else:
-            names = {body: f"object{k + 1}" for k, body in enumerate(scene.objects)}
-        for body, look in self._solids.looks.items():
-            if look.name is not None:
-                names[body] = look.name
-        names = {scene.robot: "robot", **names}
-        return {"nothing": NOTHING} | {names[body]: body for body in sorted(names)}
 
     def close(self) -> None:
         """Free the clients. Closing again does nothing."""
@@ -155,3 +143,17 @@ def blend(
     opacity = opacity[:, None]
     mixed = (1 - opacity) * pixels[where] + opacity * marks[where]
     pixels[where] = mixed.round().astype(np.uint8)
+
+
+def segmentation_ids(build_scene: Callable[[PhysicsClient], Scene]) -> dict[str, int]:
+    """What the numbers in segmentations stand for."""
+    client = VisualClient("markers")
+    with client:
+        scene = build_scene(client)
+    names = {scene.robot: "robot"}
+    for k, body in enumerate(scene.objects):
+        names[body] = "object" if len(scene.objects) == 1 else f"object{k + 1}"
+    for body, look in client.looks.items():
+        if look.name is not None:
+            names[body] = look.name
+    return {"nothing": NOTHING} | {names[body]: body for body in sorted(names)}
