@@ -128,6 +128,8 @@ class VisualClient(PhysicsClient):
         mesh_cell: float = 0.0,
     ) -> None:
         super().__init__()
+        # The first picture of Bullet's OpenGL renderer lacks the shadows.
+        self._lacks_shadows = renderer == "egl"
         if renderer == "egl":
             self._load_egl()
         self._layer = layer
@@ -183,6 +185,9 @@ class VisualClient(PhysicsClient):
         )
         aspect = camera.width / camera.height
         _capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
+        if self._lacks_shadows:
+            self._lacks_shadows = False
+            self.draw(camera, shadow=shadow)
         command = _capi.camera_init(self._open())
         _capi.camera_set_matrices(command, view, projection)
         _capi.camera_set_size(command, camera.width, camera.height)

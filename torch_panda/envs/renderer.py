@@ -1,6 +1,7 @@
 """Drawing many environments in parallel."""
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 
 from torch_panda.bullet import Camera, VectorSimulation, WorkerPool
@@ -68,7 +69,7 @@ class Renderer:
         if self._gl_thread is None:
             for twin in twins:
                 twin.close()
-        else:
+        elif not sys.is_finalizing():  # when Python ends, its threads already have
             self._gl_thread.run(lambda k: twins[k].close(), range(len(twins)))
             self._gl_thread.close()
 
