@@ -171,7 +171,7 @@ def test_egl_where_it_works_and_a_clear_error_elsewhere():
             table = images["depth"][images["segmentation"] == ids["table"]]
             assert table.median() == pytest.approx(1.2, abs=1e-4)
         assert ours["pixels"].float().std() > 20
-        # A picture does not depend on what was drawn before, or on whether anything was.
+        # A picture does not depend on what was drawn before, if anything was.
         again = env.reset(env.get_state(), set_state=True)
         assert (again["pixels"] == ours["pixels"]).all()
 

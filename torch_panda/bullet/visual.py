@@ -128,8 +128,8 @@ class VisualClient(PhysicsClient):
         mesh_cell: float = 0.0,
     ) -> None:
         super().__init__()
-        # The first picture of Bullet's OpenGL renderer lacks the shadows.
-        self._lacks_shadows = renderer == "egl"
+        # The shadows of the first two pictures of Bullet's OpenGL renderer are wrong.
+        self._warm_up = 2 if renderer == "egl" else 0
         if renderer == "egl":
             self._load_egl()
         self._layer = layer
@@ -185,8 +185,8 @@ class VisualClient(PhysicsClient):
         )
         aspect = camera.width / camera.height
         _capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
-        if self._lacks_shadows:
-            self._lacks_shadows = False
+        while self._warm_up:
+            self._warm_up -= 1
             self.draw(camera, shadow=shadow)
         command = _capi.camera_init(self._open())
         _capi.camera_set_matrices(command, view, projection)
