@@ -5,8 +5,9 @@ import pybullet
 import pytest
 
 from torch_panda.bullet import BulletError, Camera, Look, PhysicsClient, VisualClient
+from torch_panda.bullet.camera import resized, to_metres
+from torch_panda.bullet.renderers import check_renderer
 from torch_panda.bullet.shapes import Box, Cylinder, Sphere
-from torch_panda.bullet.visual import check_renderer, resized, to_metres
 from torch_panda.tasks.flip import LOOK
 
 BLUE, RED = (0.1, 0.2, 0.9), (0.8, 0.1, 0.1)

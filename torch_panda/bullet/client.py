@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 from torch_panda.bullet import _capi
+from torch_panda.bullet.contacts import ContactPoint, read_contact
 from torch_panda.bullet.shapes import Box, Cylinder, Look, Shape, Sphere
 
 _MAX_DOF = _capi.MAX_MULTI_DOF
@@ -26,9 +27,6 @@ _ORIGIN = (0.0, 0.0, 0.0)
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
-Vector = tuple[float, float, float]
-
-
 class BulletError(RuntimeError):
     """Bullet refused a command, or a simulation was used after ``close``."""
 
@@ -41,45 +39,6 @@ class Joint:
     name: str
     link_name: str
     is_movable: bool
-
-
-class ContactPoint(NamedTuple):
-    """A contact of two bodies; vectors are in the world frame."""
-
-    body_a: int
-    body_b: int
-    link_a: int
-    link_b: int
-    position_on_a: Vector  # [m]
-    position_on_b: Vector  # [m]
-    normal_on_b: Vector  # from b towards a
-    distance: float  # [m], negative where the bodies penetrate
-    normal_force: float  # [N], along the normal on a, against it on b
-    friction_force: Vector  # [N], on a; the reverse acts on b
-
-    @property
-    def force_on_a(self) -> Vector:
-        """All that b exerts on a here [N]."""
-        x, y, z = (
-            self.normal_force * n + f
-            for n, f in zip(self.normal_on_b, self.friction_force, strict=True)
-        )
-        return x, y, z
-
-    def swapped(self) -> "ContactPoint":
-        """The same contact with a and b exchanged."""
-        return ContactPoint(
-            self.body_b,
-            self.body_a,
-            self.link_b,
-            self.link_a,
-            self.position_on_b,
-            self.position_on_a,
-            _negative(self.normal_on_b),
-            self.distance,
-            self.normal_force,
-            _negative(self.friction_force),
-        )
 
 
 class JointForces(NamedTuple):
@@ -142,32 +101,6 @@ class BodyState(NamedTuple):
 def doubles(values: Sequence[float]) -> Array[c_double]:
     """A C array of doubles."""
     return (c_double * len(values))(*values)
-
-
-def _read_contact(point: _capi.ContactPoint) -> ContactPoint:
-    friction = (
-        point.friction_force_1 * d1 + point.friction_force_2 * d2
-        for d1, d2 in zip(
-            point.friction_direction_1, point.friction_direction_2, strict=True
-        )
-    )
-    return ContactPoint(
-        point.body_a,
-        point.body_b,
-        point.link_a,
-        point.link_b,
-        tuple(point.position_on_a),
-        tuple(point.position_on_b),
-        tuple(point.normal_on_b),
-        point.distance,
-        point.normal_force,
-        tuple(friction),
-    )
-
-
-def _negative(vector: Vector) -> Vector:
-    x, y, z = vector
-    return -x, -y, -z
 
 
 def find_urdf(path: str | Path) -> str:
@@ -537,7 +470,7 @@ class PhysicsClient:
         _capi.contact_result(self._handle, byref(found))
         points = []
         for point in found.points[: found.count]:
-            contact = _read_contact(point)
+            contact = read_contact(point)
             if body_a not in (None, contact.body_a):
                 contact = contact.swapped()
             if body_a in (None, contact.body_a) and body_b in (None, contact.body_b):

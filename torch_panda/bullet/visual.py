@@ -1,19 +1,15 @@
 """A client that holds what bodies look like, and draws it."""
 
-import dataclasses
-import functools
-import subprocess
-import sys
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from torch_panda.bullet import _capi
+from torch_panda.bullet.camera import Camera
 from torch_panda.bullet.client import (
     BulletError,
     PhysicsClient,
@@ -21,70 +17,13 @@ from torch_panda.bullet.client import (
     find_urdf,
 )
 from torch_panda.bullet.coarse import coarse_urdf
+from torch_panda.bullet.renderers import RendererName
 from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Look, Shape, Sphere
 
 Layer = Literal["solids", "markers"]
-RendererName = Literal["tiny", "egl"]
-RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
 
 _Z_AXIS = 2
-# Of a pixel in which nothing is seen, up to rounding.
-_BACKGROUND_DEPTH = np.float32(1 - 1e-6)
 _NOT_SHINY = doubles((0.0, 0.0, 0.0))
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera; the defaults are panda-gym's.
-
-    Attributes:
-        target: the point it looks at, world frame [m].
-        distance: from there [m].
-        yaw: its direction, about the world's z axis [degrees].
-        pitch: above the horizon, so a negative one looks down [degrees].
-        roll: about the line of sight [degrees].
-        fov: vertical angle of view [degrees].
-        width: of the image [pixels].
-        height: of the image [pixels].
-        near: nothing closer along the line of sight is seen [m].
-        far: nor anything farther [m].
-
-    Raises:
-        ValueError: a size, a distance or an angle is out of range.
-    """
-
-    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    distance: float = 1.4
-    yaw: float = 45.0
-    pitch: float = -30.0
-    roll: float = 0.0
-    fov: float = 60.0
-    width: int = 720
-    height: int = 480
-    near: float = 0.1
-    far: float = 100.0
-
-    def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1:
-            raise ValueError(
-                f"a camera's width and height must be at least 1 pixel, got "
-                f"{self.width} x {self.height}"
-            )
-        if not 0 < self.fov < 180:
-            raise ValueError(f"fov must be between 0 and 180 degrees, got {self.fov}")
-        if not (0 < self.near < self.far and self.distance > 0):
-            raise ValueError(
-                f"distance must be above 0, and near between 0 and far, got distance "
-                f"{self.distance}, near {self.near}, far {self.far}"
-            )
-
-
-def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """The same view in another size: (height, width), or both in one; None: as is."""
-    if size is None:
-        return camera
-    height, width = (size, size) if isinstance(size, int) else size
-    return dataclasses.replace(camera, height=height, width=width)
 
 
 class Image(NamedTuple):
@@ -93,7 +32,7 @@ class Image(NamedTuple):
     Attributes:
         rgb: (height, width, 3) uint8.
         depth: (height, width) float32, from 0 at ``near`` to 1 at ``far``, not linear;
-            see `to_metres`.
+            see `camera.to_metres`.
         segmentation: (height, width) int32, the body id of what is seen, -1 where
             nothing is; None if it was not asked for.
     """
@@ -271,56 +210,6 @@ class VisualClient(PhysicsClient):
 
     def _draws(self, is_marker: bool) -> bool:
         return is_marker == (self._layer == "markers")
-
-
-# Draws a box from above, and tells whether it and what surrounds it are seen.
-_EGL_PROBE = """
-from torch_panda.bullet import Camera
-from torch_panda.bullet.visual import VisualClient
-with VisualClient(renderer="egl") as client:
-    client.create_box((0.5, 0.5, 0.5), mass=0, position=(0, 0, 0))
-    image = client.draw(Camera(pitch=-90, distance=3, width=64, height=48))
-    assert image.rgb.std() > 1 and image.depth.std() > 0, "the image is blank"
-"""
-
-
-def check_renderer(renderer: str) -> None:
-    """Make sure that a renderer works here.
-
-    Raises:
-        ValueError: there is none of that name.
-        RuntimeError: EGL does not work on this machine.
-    """
-    if renderer not in RENDERERS:
-        raise ValueError(f"renderer must be one of {RENDERERS}, got {renderer!r}")
-    if renderer == "egl":
-        _check_egl()
-
-
-@functools.cache
-def _check_egl() -> None:
-    """In a process of its own: where EGL fails, Bullet ends the process."""
-    probe = subprocess.run(
-        [sys.executable, "-c", _EGL_PROBE], capture_output=True, text=True
-    )
-    if probe.returncode != 0:
-        output = (probe.stdout + probe.stderr).strip().splitlines() or ["no output"]
-        raise RuntimeError(
-            f"renderer='egl' does not work on this machine, use 'tiny' "
-            f"(EGL said: {output[-1]})"
-        )
-
-
-def to_metres(
-    depth: npt.NDArray[np.float32], camera: Camera
-) -> npt.NDArray[np.float32]:
-    """Distance along the line of sight [m] of an `Image`'s depth.
-
-    The inverse of OpenGL's perspective projection.
-    """
-    near, far = np.float32(camera.near), np.float32(camera.far)
-    metres = near * far / (far - (far - near) * depth)
-    return np.where(depth < _BACKGROUND_DEPTH, metres, far)
 
 
 def add_textured_box(

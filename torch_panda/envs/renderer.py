@@ -4,8 +4,10 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
+from torch import Tensor
+
 from torch_panda.bullet import Camera, VectorSimulation, WorkerPool
-from torch_panda.bullet.visual import RendererName
+from torch_panda.bullet.renderers import RendererName
 from torch_panda.envs.twin import Frames, VisualTwin
 
 # Meshes finer than this are drawn as they are [m].
@@ -61,6 +63,12 @@ class Renderer:
                 twins.append(twin)
 
         run(work, range(len(jobs)))
+
+    def picture(self, envs: Sequence[int], camera: Camera) -> Tensor:
+        """Draw environments: (len(envs), height, width, 3) uint8; see `draw`."""
+        frames = Frames.allocate(len(envs), camera)
+        self.draw(envs, camera, frames, range(len(envs)))
+        return frames.pixels
 
     def close(self) -> None:
         """Free all twins. Closing again does nothing."""

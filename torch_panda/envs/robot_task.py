@@ -21,13 +21,12 @@ from torch_panda.bullet import (
     Scene,
     VectorSimulation,
 )
-from torch_panda.bullet.visual import RendererName, check_renderer, resized
+from torch_panda.bullet.camera import resized
+from torch_panda.bullet.renderers import RendererName
 from torch_panda.envs.renderer import Renderer
-from torch_panda.envs.senses import Sense
+from torch_panda.envs.senses import SenseOptions
 from torch_panda.envs.state import read_state
-from torch_panda.envs.touch import Touch, check_sensors
-from torch_panda.envs.twin import Frames, VisualTwin, segmentation_ids
-from torch_panda.envs.vision import PIXELS_CAMERA, Vision
+from torch_panda.envs.twin import VisualTwin, segmentation_ids
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
@@ -96,20 +95,17 @@ class RobotTaskEnv(EnvBase):
         renderer: RendererName = "tiny",
         sensors: Sequence[str] = (),
     ) -> None:
-        if pixels_only and not from_pixels:
-            raise ValueError("pixels_only=True needs from_pixels=True")
-        check_renderer(renderer)
-        check_sensors(robot, sensors)
-        self._sensing: dict[str, Any] = {
-            "from_pixels": from_pixels,
-            "pixels_only": pixels_only,
-            "camera": camera,
-            "render_size": render_size,
-            "depth": depth,
-            "segmentation": segmentation,
-            "renderer": renderer,
-            "sensors": sensors,
-        }
+        self._options = SenseOptions(
+            from_pixels=from_pixels,
+            pixels_only=pixels_only,
+            camera=camera,
+            render_size=render_size,
+            depth=depth,
+            segmentation=segmentation,
+            renderer=renderer,
+            sensors=sensors,
+        )
+        self._options.check(robot)
         _check_positive(num_envs=num_envs, num_threads=num_threads)
         _check_positive(max_episode_steps=max_episode_steps)
         batch_size = () if num_envs is None else (num_envs,)
@@ -130,14 +126,7 @@ class RobotTaskEnv(EnvBase):
             self._build_scene, count, num_threads=num_threads
         )
         self._renderer = Renderer(self._simulation, self._make_twin, renderer=renderer)
-        self._senses: list[Sense] = []
-        if from_pixels or depth or segmentation:
-            view = resized(camera or PIXELS_CAMERA, render_size)
-            images = {"pixels": from_pixels, "depth": depth}
-            images["segmentation"] = segmentation
-            self._senses.append(Vision(self._renderer, count, view, **images))
-        if sensors:
-            self._senses.append(Touch(self._simulation, robot, sensors))
+        self._senses = self._options.make(self._simulation, self._renderer, robot)
         self._make_specs()
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
@@ -215,9 +204,7 @@ class RobotTaskEnv(EnvBase):
         for env in envs:
             if env not in range(len(self._goal)) or not self._episodes[env]:
                 raise ValueError(f"there is no environment {env} that was reset")
-        frames = Frames.allocate(len(envs), camera)
-        self._renderer.draw(envs, camera, frames, range(len(envs)))
-        pixels = frames.pixels.to(self.device)
+        pixels = self._renderer.picture(envs, camera).to(self.device)
         return pixels[0] if single else pixels
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -250,7 +237,7 @@ class RobotTaskEnv(EnvBase):
             device=self.device,
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
-            **self._sensing,
+            **vars(self._options),
         )
         return build, ()
 
@@ -331,7 +318,7 @@ class RobotTaskEnv(EnvBase):
         return VisualTwin(
             self._build_scene,
             lambda client: self.task.build(client).targets,
-            renderer=self._sensing["renderer"],
+            renderer=self._options.renderer,
             mesh_cell=mesh_cell,
         )
 
@@ -368,7 +355,7 @@ class RobotTaskEnv(EnvBase):
         sensed: dict[str, Tensor] = {}
         for sense in self._senses:
             sensed |= sense.observe()
-        if not self._sensing["pixels_only"]:
+        if not self._options.pixels_only:
             sensed["observation"] = observation.float()
         return {
             **sensed,
@@ -413,7 +400,7 @@ class RobotTaskEnv(EnvBase):
             shape=batch,
             device=device,
         )
-        if self._sensing["pixels_only"]:
+        if self._options.pixels_only:
             del self.observation_spec["observation"]
         for sense in self._senses:
             self.observation_spec.update(sense.spec(batch, device))

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import Camera, PhysicsClient, Scene, VectorSimulation
-from torch_panda.bullet.visual import RendererName, VisualClient, to_metres
+from torch_panda.bullet.camera import to_metres
+from torch_panda.bullet.renderers import RendererName
+from torch_panda.bullet.visual import VisualClient
 
 NOTHING = -1  # in a segmentation
 
