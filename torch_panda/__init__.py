@@ -1,6 +1,6 @@
 """Goal-conditioned Franka Panda tasks as one vectorised TorchRL environment."""
 
-from torch_panda.bullet import BulletError
+from torch_panda.bullet import BulletError, Camera
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.registry import ENV_IDS, make
 from torch_panda.robots import Panda, Robot
@@ -17,6 +17,7 @@ from torch_panda.tasks import (
 __all__ = [
     "ENV_IDS",
     "BulletError",
+    "Camera",
     "Flip",
     "Panda",
     "PickAndPlace",

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from torch_panda.bullet import ControlType
+from torch_panda.bullet.shapes import BLUE
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.robots import Panda
 from torch_panda.tasks import (
@@ -40,7 +41,7 @@ _V3_ARGUMENTS: dict[str, dict[str, Any]] = {
         "table_length": 1.4,
         "table_x_offset": -0.1,
     },
-    "Stack": {"distance_threshold": 0.1, "per_object": False},
+    "Stack": {"distance_threshold": 0.1, "per_object": False, "lower_color": BLUE},
 }
 _VERSIONS = ("v1", "v3")
 
@@ -60,8 +61,9 @@ def make(
     num_threads: int | None = None,
     seed: int | None = None,
     device: torch.device | str | int | None = None,
+    **options: Any,  # noqa: ANN401 (those of RobotTaskEnv)
 ) -> RobotTaskEnv:
-    """Make the environments of an id; see `RobotTaskEnv` for the arguments.
+    """Make the environments of an id; see `RobotTaskEnv` for arguments and options.
 
     ``-v1`` follows the paper (arXiv 2106.13687), ``-v3`` equals panda-gym 3.0.7.
 
@@ -86,5 +88,5 @@ def make(
         num_threads=num_threads,
         seed=seed,
         device=device,
-        terminate_on_success=version == "v3",
+        **({"terminate_on_success": version == "v3"} | options),
     )

@@ -232,3 +232,56 @@ def test_bodies_and_detections_are_counted():
         client.detect_collisions(5)
         client.detect_collisions(0)
         assert client.num_detections == before + 9
+
+
+def test_contact_forces_carry_a_box():
+    with PhysicsClient() as client:
+        ground = client.create_box((1, 1, 0.1), mass=0.0, position=(0, 0, -0.1))
+        box = client.create_box((0.1, 0.1, 0.1), mass=2.0, position=(0, 0, 0.1))
+        slope = float(np.sin(0.05)), float(np.cos(0.05))
+        client.set_base(ground, (0, 0, -0.1), (slope[0], 0, 0, slope[1]))
+        client.set_friction(box, lateral=1.0)
+        client.set_friction(ground, lateral=1.0)
+        client.step(1500)
+        on_box = np.sum([c.force_on_a for c in client.contact_points(box)], axis=0)
+        on_ground = np.sum(
+            [c.force_on_a for c in client.contact_points(ground)], axis=0
+        )
+        friction = [np.linalg.norm(c.friction_force) for c in client.contact_points()]
+    # On the slope the weight is carried by normal and friction forces together.
+    assert sum(friction) > 0.5 * 2.0 * 9.81 * np.sin(0.1)
+    # Bullet's report of forces on a slope closes to 0.3 % of the weight.
+    np.testing.assert_allclose(on_box, (0, 0, 2.0 * 9.81), atol=0.1)
+    np.testing.assert_allclose(on_ground, -on_box)
+
+
+def test_joint_forces(reference):
+    urdf = "franka_panda/panda.urdf"
+    with PhysicsClient() as client:
+        arm = reference.loadURDF(urdf, useFixedBase=True)
+        assert client.load_urdf(urdf, fixed_base=True) == arm
+        reference.enableJointForceTorqueSensor(arm, 8)
+        reference.setPhysicsEngineParameter(
+            jointFeedbackMode=reference.JOINT_FEEDBACK_IN_JOINT_FRAME
+        )
+        client.enable_wrench_sensor(arm, 8)
+        targets = torch.tensor(NEUTRAL, dtype=torch.float64)
+        forces = (c_double * 9)(*FORCES)
+        reference.setJointMotorControlArray(
+            arm,
+            JOINTS,
+            pybullet.POSITION_CONTROL,
+            targetPositions=NEUTRAL,
+            forces=FORCES,
+        )
+        client.control_joints(arm, targets.data_ptr(), forces)
+        for _ in range(20):
+            reference.stepSimulation()
+        client.step(20)
+        ours = client.joint_forces(arm)
+        _, _, theirs, _ = reference.getJointState(arm, 8)
+        assert read(ours.wrench(8), 6) == list(theirs)
+        torques = [reference.getJointState(arm, joint)[3] for joint in JOINTS]
+        motors = read(ours.motor_forces, 12)
+        assert [motors[joint] for joint in JOINTS] == torques
+        assert max(map(abs, torques)) > 1

@@ -1,14 +1,24 @@
 """Bullet's C API: one client, and many of them stepped in parallel."""
 
+from torch_panda.bullet.camera import Camera
 from torch_panda.bullet.client import BulletError, PhysicsClient
-from torch_panda.bullet.pool import WorkerError
+from torch_panda.bullet.pool import WorkerError, WorkerPool
+from torch_panda.bullet.shapes import Box, Cylinder, Look, Sphere
 from torch_panda.bullet.simulation import ControlType, Scene, VectorSimulation
+from torch_panda.bullet.visual import VisualClient
 
 __all__ = [
+    "Box",
     "BulletError",
+    "Camera",
     "ControlType",
+    "Cylinder",
+    "Look",
     "PhysicsClient",
     "Scene",
+    "Sphere",
     "VectorSimulation",
+    "VisualClient",
     "WorkerError",
+    "WorkerPool",
 ]

@@ -16,7 +16,17 @@ The file is found, not imported: importing pybullet prints a line on stdout.
 import ctypes
 import importlib.metadata
 import importlib.util
-from ctypes import POINTER, c_char, c_char_p, c_double, c_int, c_size_t, c_void_p
+from ctypes import (
+    POINTER,
+    c_char,
+    c_char_p,
+    c_double,
+    c_float,
+    c_int,
+    c_size_t,
+    c_ubyte,
+    c_void_p,
+)
 from typing import Any
 
 SUPPORTED_VERSION = "3.2.7"
@@ -27,11 +37,16 @@ CMD_URDF_LOADING_COMPLETED = 6
 CMD_ACTUAL_STATE_UPDATE_COMPLETED = 21
 CMD_DESIRED_STATE_RECEIVED_COMPLETED = 25
 CMD_STEP_FORWARD_SIMULATION_COMPLETED = 26
+CMD_CAMERA_IMAGE_COMPLETED = 28
 CMD_CONTACT_POINT_INFORMATION_COMPLETED = 39
 CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43
+CMD_VISUAL_SHAPE_UPDATE_COMPLETED = 49
+CMD_LOAD_TEXTURE_COMPLETED = 51
 CMD_GET_DYNAMICS_INFO_COMPLETED = 77
 CMD_CREATE_COLLISION_SHAPE_COMPLETED = 80
+CMD_CREATE_VISUAL_SHAPE_COMPLETED = 82
 CMD_CREATE_MULTI_BODY_COMPLETED = 84
+CMD_CUSTOM_COMMAND_COMPLETED = 89
 CMD_PERFORM_COLLISION_DETECTION_COMPLETED = 112
 
 # enum eURDF_Flags
@@ -43,6 +58,12 @@ FILTER_STATIC = (2, -1 ^ 2)
 
 # enum for b3JointControlCommandInit2
 CONTROL_MODE_POSITION_VELOCITY_PD = 2
+
+# enum JointFeedbackMode
+JOINT_FEEDBACK_IN_JOINT_FRAME = 2
+
+# enum EnumRendererAuxFlags
+ER_NO_SEGMENTATION_MASK = 4
 
 # The ...MultiDof setters ignore a call for more degrees of freedom than this.
 MAX_MULTI_DOF = 4
@@ -126,6 +147,18 @@ class ContactInformation(ctypes.Structure):
     _fields_ = (("count", c_int), ("points", POINTER(ContactPoint)))
 
 
+class CameraImage(ctypes.Structure):
+    """``struct b3CameraImageData``."""
+
+    _fields_ = (
+        ("width", c_int),
+        ("height", c_int),
+        ("rgba", POINTER(c_ubyte)),
+        ("depth", POINTER(c_float)),
+        ("segmentation", POINTER(c_int)),
+    )
+
+
 def wrong_pybullet(reason: str) -> ImportError:
     """The one error for a pybullet whose C API is not the one declared here."""
     try:
@@ -168,7 +201,7 @@ _cheap = ctypes.PyDLL(_path)
 
 _client = _command = _status = c_void_p
 # Doubles are passed as a ctypes array or as an address, for instance of a tensor.
-_doubles = c_void_p
+_doubles = _floats = c_void_p
 _address = POINTER(c_void_p)
 
 # Connection, and the one call that makes Bullet work.
@@ -422,8 +455,6 @@ state_result = bind(
     _address,  # link velocities (6 per link), world frame
 )
 contact_init = bind(_cheap, "b3InitRequestContactPointInformation", _command, _client)
-contact_set_body_a = bind(_cheap, "b3SetContactFilterBodyA", None, _command, c_int)
-contact_set_body_b = bind(_cheap, "b3SetContactFilterBodyB", None, _command, c_int)
 contact_result = bind(
     _cheap,
     "b3GetContactPointInformation",
@@ -431,3 +462,96 @@ contact_result = bind(
     _client,
     POINTER(ContactInformation),
 )
+
+# Sensors
+sensor_init = bind(_cheap, "b3CreateSensorCommandInit", _command, _client, c_int)
+sensor_enable_wrench = bind(
+    _cheap,
+    "b3CreateSensorEnable6DofJointForceTorqueSensor",
+    c_int,
+    _command,
+    c_int,
+    c_int,
+)
+physics_set_joint_feedback = bind(
+    _cheap, "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
+)
+
+# Looks: shapes that are seen, and cameras that see them
+visual_init = bind(_cheap, "b3CreateVisualShapeCommandInit", _command, _client)
+visual_add_box = bind(_cheap, "b3CreateVisualShapeAddBox", c_int, _command, _doubles)
+visual_add_sphere = bind(
+    _cheap, "b3CreateVisualShapeAddSphere", c_int, _command, c_double
+)
+visual_add_cylinder = bind(
+    _cheap, "b3CreateVisualShapeAddCylinder", c_int, _command, c_double, c_double
+)
+visual_add_mesh = bind(
+    _cheap,
+    "b3CreateVisualShapeAddMesh2",
+    c_int,
+    _client,
+    _command,
+    _doubles,  # scale
+    _doubles,  # vertices
+    c_int,
+    POINTER(c_int),  # indices
+    c_int,
+    _doubles,  # normals
+    c_int,
+    _doubles,  # texture coordinates
+    c_int,
+)
+visual_set_color = bind(
+    _cheap, "b3CreateVisualShapeSetRGBAColor", None, _command, c_int, _doubles
+)
+visual_set_specular = bind(
+    _cheap, "b3CreateVisualShapeSetSpecularColor", None, _command, c_int, _doubles
+)
+status_visual = bind(_cheap, "b3GetStatusVisualShapeUniqueId", c_int, _status)
+texture_init = bind(_cheap, "b3InitLoadTexture", _command, _client, c_char_p)
+status_texture = bind(_cheap, "b3GetStatusTextureUniqueId", c_int, _status)
+look_init = bind(
+    _cheap, "b3InitUpdateVisualShape2", _command, _client, c_int, c_int, c_int
+)
+look_set_texture = bind(_cheap, "b3UpdateVisualShapeTexture", None, _command, c_int)
+view_matrix = bind(
+    _cheap,
+    "b3ComputeViewMatrixFromYawPitchRoll",
+    None,
+    _floats,  # target
+    c_float,  # distance
+    c_float,  # yaw
+    c_float,  # pitch
+    c_float,  # roll
+    c_int,  # up axis
+    _floats,
+)
+projection_matrix = bind(
+    _cheap,
+    "b3ComputeProjectionMatrixFOV",
+    None,
+    c_float,  # field of view
+    c_float,  # width / height
+    c_float,  # near
+    c_float,  # far
+    _floats,
+)
+camera_init = bind(_cheap, "b3InitRequestCameraImage", _command, _client)
+camera_set_matrices = bind(
+    _cheap, "b3RequestCameraImageSetCameraMatrices", None, _command, _floats, _floats
+)
+camera_set_size = bind(
+    _cheap, "b3RequestCameraImageSetPixelResolution", None, _command, c_int, c_int
+)
+camera_set_shadow = bind(_cheap, "b3RequestCameraImageSetShadow", None, _command, c_int)
+camera_set_flags = bind(_cheap, "b3RequestCameraImageSetFlags", None, _command, c_int)
+camera_result = bind(
+    _cheap, "b3GetCameraImageData", None, _client, POINTER(CameraImage)
+)
+plugin_init = bind(_cheap, "b3CreateCustomCommand", _command, _client)
+plugin_set_path = bind(_cheap, "b3CustomCommandLoadPlugin", None, _command, c_char_p)
+plugin_set_suffix = bind(
+    _cheap, "b3CustomCommandLoadPluginSetPostFix", None, _command, c_char_p
+)
+status_plugin = bind(_cheap, "b3GetStatusPluginUniqueId", c_int, _status)

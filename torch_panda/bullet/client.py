@@ -10,6 +10,8 @@ from types import TracebackType
 from typing import NamedTuple
 
 from torch_panda.bullet import _capi
+from torch_panda.bullet.contacts import ContactPoint, read_contact
+from torch_panda.bullet.shapes import Box, Cylinder, Look, Shape, Sphere
 
 _MAX_DOF = _capi.MAX_MULTI_DOF
 # pybullet's defaults for setJointMotorControlArray(POSITION_CONTROL).
@@ -40,17 +42,24 @@ class Joint:
     is_movable: bool
 
 
-class ContactPoint(NamedTuple):
-    """A contact of two bodies; vectors are in the world frame."""
+class JointForces(NamedTuple):
+    """Addresses of the forces at a body's joints in the last step.
 
-    body_a: int
-    body_b: int
-    link_a: int
-    link_b: int
-    position_on_b: tuple[float, float, float]  # [m]
-    normal_on_b: tuple[float, float, float]  # from b towards a
-    distance: float  # [m], negative where the bodies penetrate
-    normal_force: float  # [N]
+    They are valid until the client's next command, and arrays of doubles for m joints,
+    fixed ones included:
+
+    Attributes:
+        wrenches: (m, 6), what each link's parent exerts on it, force [N] and torque
+            [N m], at the joint and in the link's frame; zero without a sensor.
+        motor_forces: (m,), what each motor exerts [N m] or [N].
+    """
+
+    wrenches: int
+    motor_forces: int
+
+    def wrench(self, joint: int) -> int:
+        """Address of the wrench (6) at a joint."""
+        return self.wrenches + _DOUBLE * 6 * joint
 
 
 class BodyState(NamedTuple):
@@ -139,6 +148,9 @@ class PhysicsClient:
     Methods that run in every step take and give addresses of doubles, for instance
     of a row of a float64 tensor, so that no number passes through a Python object.
 
+    Nothing is drawn here: looks are for a `VisualClient`, in which the same calls build
+    the same bodies to be seen.
+
     Args:
         timestep: length of one step [s].
         gravity: acceleration along the world's z axis [m/s^2].
@@ -146,6 +158,8 @@ class PhysicsClient:
     Raises:
         ImportError: the installed pybullet has another C API.
     """
+
+    _urdf_flags = _capi.URDF_IGNORE_VISUAL_SHAPES
 
     def __init__(self, *, timestep: float = 1 / 500, gravity: float = -9.81) -> None:
         self._bodies: list[int] = []
@@ -209,7 +223,7 @@ class PhysicsClient:
         orientation: Sequence[float] = _NO_ROTATION,
         fixed_base: bool = False,
     ) -> int:
-        """Load a URDF without its visual shapes, and return its body id.
+        """Load a URDF, here without its visual shapes, and return its body id.
 
         Args:
             path: a file, or a name among those that pybullet ships.
@@ -229,12 +243,17 @@ class PhysicsClient:
         _capi.urdf_set_position(command, *position)
         _capi.urdf_set_orientation(command, *orientation)
         _capi.urdf_set_fixed_base(command, int(fixed_base))
-        _capi.urdf_set_flags(command, _capi.URDF_IGNORE_VISUAL_SHAPES)
+        _capi.urdf_set_flags(command, self._urdf_flags)
         status = self._submit(command, _capi.CMD_URDF_LOADING_COMPLETED, f"load {path}")
         return self._add_body(status)
 
     def create_box(
-        self, half_extents: Sequence[float], *, mass: float, position: Sequence[float]
+        self,
+        half_extents: Sequence[float],
+        *,
+        mass: float,
+        position: Sequence[float],
+        look: Look = Look(),  # noqa: B008 (frozen)
     ) -> int:
         """Create a box and return its body id.
 
@@ -242,30 +261,49 @@ class PhysicsClient:
             half_extents: along x, y and z [m].
             mass: [kg]; 0 makes a body that never moves.
             position: of its centre, world frame [m].
+            look: how a `VisualClient` draws it.
         """
-        command = _capi.shape_init(self._open())
-        _capi.shape_add_box(command, doubles(half_extents))
-        return self._create_body(command, mass, position)
+        x, y, z = half_extents
+        return self._create_body(Box((x, y, z)), mass, position, look)
 
     def create_cylinder(
-        self, radius: float, height: float, *, mass: float, position: Sequence[float]
+        self,
+        radius: float,
+        height: float,
+        *,
+        mass: float,
+        position: Sequence[float],
+        look: Look = Look(),  # noqa: B008 (frozen)
     ) -> int:
         """Create an upright cylinder and return its body id; see `create_box`."""
-        command = _capi.shape_init(self._open())
-        _capi.shape_add_cylinder(command, radius, height)
-        return self._create_body(command, mass, position)
+        return self._create_body(Cylinder(radius, height), mass, position, look)
 
     def create_sphere(
-        self, radius: float, *, mass: float, position: Sequence[float]
+        self,
+        radius: float,
+        *,
+        mass: float,
+        position: Sequence[float],
+        look: Look = Look(),  # noqa: B008 (frozen)
     ) -> int:
         """Create a sphere and return its body id; see `create_box`."""
-        command = _capi.shape_init(self._open())
-        _capi.shape_add_sphere(command, radius)
-        return self._create_body(command, mass, position)
+        return self._create_body(Sphere(radius), mass, position, look)
 
-    def create_marker(self, position: Sequence[float]) -> int:
-        """Create a body without a shape, which nothing touches; return its id."""
-        return self._create_body(None, 0.0, position)
+    def create_marker(
+        self,
+        position: Sequence[float],
+        shape: Shape | None = None,
+        *,
+        look: Look = Look(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a body that nothing touches, and return its id.
+
+        Args:
+            position: world frame [m].
+            shape: what a `VisualClient` draws, translucent; None: nothing.
+            look: how it draws it.
+        """
+        return self._create_body(shape, 0.0, position, look, is_marker=True)
 
     def set_friction(
         self,
@@ -467,33 +505,58 @@ class PhysicsClient:
         )
         return BodyState(q.value, u.value, poses.value, velocities.value)  # type: ignore[arg-type]
 
+    def enable_wrench_sensor(self, body: int, joint: int) -> None:
+        """Have the forces through a joint computed in every step."""
+        command = _capi.physics_init(self._open())
+        _capi.physics_set_joint_feedback(command, _capi.JOINT_FEEDBACK_IN_JOINT_FRAME)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+        command = _capi.sensor_init(self._open(), body)
+        _capi.sensor_enable_wrench(command, joint, 1)
+        self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "add a sensor")
+
+    def joint_forces(self, body: int) -> JointForces:
+        """The forces at a body's joints in the last step."""
+        command = _capi.state_init(self._open(), body)
+        status = self._submit(
+            command, _capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED, "report a state"
+        )
+        wrenches, motors = c_void_p(), c_void_p()
+        _capi.state_result(
+            status,
+            None,
+            None,
+            None,
+            None,
+            None,
+            None,
+            None,
+            byref(wrenches),
+            None,
+            byref(motors),
+            None,
+            None,
+        )
+        return JointForces(wrenches.value, motors.value)  # type: ignore[arg-type]
+
     def contact_points(
         self, body_a: int | None = None, body_b: int | None = None
     ) -> list[ContactPoint]:
         """Contacts of the last step, of all bodies or of those given."""
+        # Not filtered by Bullet, which would swap a and b but not the friction.
         command = _capi.contact_init(self._open())
-        if body_a is not None:
-            _capi.contact_set_body_a(command, body_a)
-        if body_b is not None:
-            _capi.contact_set_body_b(command, body_b)
         self._submit(
             command, _capi.CMD_CONTACT_POINT_INFORMATION_COMPLETED, "report contacts"
         )
         found = _capi.ContactInformation()
         _capi.contact_result(self._handle, byref(found))
-        return [
-            ContactPoint(
-                point.body_a,
-                point.body_b,
-                point.link_a,
-                point.link_b,
-                tuple(point.position_on_b),
-                tuple(point.normal_on_b),
-                point.distance,
-                point.normal_force,
-            )
-            for point in found.points[: found.count]
-        ]
+        points = []
+        for point in found.points[: found.count]:
+            contact = read_contact(point)
+            if body_a not in (None, contact.body_a):
+                contact = contact.swapped()
+            if body_a in (None, contact.body_a) and body_b in (None, contact.body_b):
+                points.append(contact)
+        return points
 
     # ---- commands ----------------------------------------------------------------
 
@@ -517,20 +580,30 @@ class PhysicsClient:
             )
 
     def _create_body(
-        self, shape_command: int | None, mass: float, position: Sequence[float]
+        self,
+        shape: Shape | None,
+        mass: float,
+        position: Sequence[float],
+        look: Look,
+        *,
+        is_marker: bool = False,
     ) -> int:
-        shape = -1
-        if shape_command is not None:
-            status = self._submit(
-                shape_command,
-                _capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED,
-                "create a shape",
-            )
-            shape = _capi.status_shape(status)
+        collision = visual = -1
+        if shape is not None:
+            visual = self._create_visual_shape(shape, look, is_marker=is_marker)
+            if not is_marker:
+                collision = self._create_collision_shape(shape)
         rotation, origin = doubles(_NO_ROTATION), doubles(_ORIGIN)
         command = _capi.body_init(self._open())
         _capi.body_set_base(
-            command, mass, shape, -1, doubles(position), rotation, origin, rotation
+            command,
+            mass,
+            collision,
+            visual,
+            doubles(position),
+            rotation,
+            origin,
+            rotation,
         )
         status = self._submit(
             command, _capi.CMD_CREATE_MULTI_BODY_COMPLETED, "create a body"
@@ -541,3 +614,21 @@ class PhysicsClient:
         body: int = _capi.status_body(status)
         self._bodies.append(body)
         return body
+
+    def _create_collision_shape(self, shape: Shape) -> int:
+        command = _capi.shape_init(self._open())
+        match shape:
+            case Box(half_extents):
+                _capi.shape_add_box(command, doubles(half_extents))
+            case Cylinder(radius, height):
+                _capi.shape_add_cylinder(command, radius, height)
+            case Sphere(radius):
+                _capi.shape_add_sphere(command, radius)
+        status = self._submit(
+            command, _capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
+        )
+        return _capi.status_shape(status)
+
+    def _create_visual_shape(self, shape: Shape, look: Look, *, is_marker: bool) -> int:
+        """A shape to be seen; -1, as here, is none."""
+        return -1

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_panda.bullet.built_world import BuiltWorld
 from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
-from torch_panda.bullet.pool import WorkerPool
+from torch_panda.bullet.pool import Work, WorkerPool
 
 ControlType = Literal["ee", "joints"]
 
@@ -135,6 +135,19 @@ class VectorSimulation:
         """
         work = self._step_ee if control_type == "ee" else self._step_joints
         self._pool.run(work, range(self.num_envs) if envs is None else envs)
+
+    @property
+    def clients(self) -> Sequence[PhysicsClient]:
+        """The clients, by environment."""
+        return self._clients
+
+    def run(self, work: Work, envs: Sequence[int]) -> None:
+        """Call ``work(env)`` for these environments, in the threads that step them.
+
+        Raises:
+            WorkerError: it raised; all others are done nevertheless.
+        """
+        self._pool.run(work, envs)
 
     def reset(self, envs: Sequence[int]) -> None:
         """Start an episode from what the state tensors hold for these clients.

@@ -3,6 +3,7 @@
 import functools
 import operator
 import secrets
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -13,8 +14,19 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_panda.bullet import BulletError, PhysicsClient, Scene, VectorSimulation
+from torch_panda.bullet import (
+    BulletError,
+    Camera,
+    PhysicsClient,
+    Scene,
+    VectorSimulation,
+)
+from torch_panda.bullet.camera import resized
+from torch_panda.bullet.renderers import RendererName
+from torch_panda.envs.renderer import Renderer
+from torch_panda.envs.senses import SenseOptions
 from torch_panda.envs.state import read_state
+from torch_panda.envs.twin import VisualTwin, segmentation_ids
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
@@ -44,9 +56,21 @@ class RobotTaskEnv(EnvBase):
         max_episode_steps: steps until ``truncated``; None means the task's number.
         terminate_on_success: whether success ends an episode, as in panda-gym 3; the
             paper's episodes go on.
+        from_pixels: observe ``pixels``, uint8 (*batch, height, width, 3).
+        pixels_only: leave ``observation`` out; the goals stay.
+        camera: of what is observed; None means panda-gym's view in 64 x 64 pixels.
+        render_size: height and width of what is observed [pixels], or both in one
+            number; None means the camera's.
+        depth: observe ``depth``, float32 (*batch, height, width, 1) [m]; see `Vision`.
+        segmentation: observe ``segmentation``, int32 (*batch, height, width, 1), the
+            body ids of ``segmentation_ids``.
+        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
+        sensors: which of "wrist_force_torque", "finger_contact" and "joint_torque" to
+            observe, each under its own key, float32; see `Touch`.
 
     Raises:
         ValueError: an argument is out of range.
+        RuntimeError: EGL is asked for and does not work here.
     """
 
     _supports_set_state = True
@@ -62,7 +86,26 @@ class RobotTaskEnv(EnvBase):
         device: torch.device | str | int | None = None,
         max_episode_steps: int | None = None,
         terminate_on_success: bool = False,
+        from_pixels: bool = False,
+        pixels_only: bool = False,
+        camera: Camera | None = None,
+        render_size: int | tuple[int, int] | None = None,
+        depth: bool = False,
+        segmentation: bool = False,
+        renderer: RendererName = "tiny",
+        sensors: Sequence[str] = (),
     ) -> None:
+        self._options = SenseOptions(
+            from_pixels=from_pixels,
+            pixels_only=pixels_only,
+            camera=camera,
+            render_size=render_size,
+            depth=depth,
+            segmentation=segmentation,
+            renderer=renderer,
+            sensors=sensors,
+        )
+        self._options.check(robot)
         _check_positive(num_envs=num_envs, num_threads=num_threads)
         _check_positive(max_episode_steps=max_episode_steps)
         batch_size = () if num_envs is None else (num_envs,)
@@ -74,7 +117,6 @@ class RobotTaskEnv(EnvBase):
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
-        self._make_specs()
         self._constructor_seed = seed
         self._set_seed(seed)
         count = num_envs or 1
@@ -83,6 +125,9 @@ class RobotTaskEnv(EnvBase):
         self._simulation = VectorSimulation(
             self._build_scene, count, num_threads=num_threads
         )
+        self._renderer = Renderer(self._simulation, self._make_twin, renderer=renderer)
+        self._senses = self._options.make(self._simulation, self._renderer, robot)
+        self._make_specs()
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
 
@@ -101,6 +146,15 @@ class RobotTaskEnv(EnvBase):
         """The task's pure success function; see `Task.is_success`."""
         return self.task.is_success
 
+    @functools.cached_property
+    def segmentation_ids(self) -> dict[str, int]:
+        """What the numbers in segmentations stand for, by name.
+
+        ``nothing`` (-1), ``robot``, ``ground``, ``table``, and ``object``, or
+        ``object1`` and ``object2``, unless the task's looks name bodies otherwise.
+        """
+        return segmentation_ids(self._build_scene)
+
     def get_state(self) -> TensorDict:
         """The physical state, from which ``reset(state, set_state=True)`` starts.
 
@@ -117,10 +171,47 @@ class RobotTaskEnv(EnvBase):
         values = {key: self._emit(value.clone()) for key, value in state.items()}
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
 
+    def render(
+        self,
+        envs: int | Sequence[int] | None = None,
+        *,
+        camera: Camera | None = None,
+        size: int | tuple[int, int] | None = None,
+    ) -> Tensor:
+        """Draw the environments as they are now.
+
+        Args:
+            envs: which, by index; None means all.
+            camera: where from; None means `Camera`'s defaults, which are panda-gym's.
+            size: height and width of the picture [pixels], or both in one number;
+                None means the camera's.
+
+        Returns:
+            uint8, (num_envs, height, width, 3) or as many as were asked for;
+            (height, width, 3) for one index or an environment of batch size [].
+
+        Raises:
+            BulletError: the environment is closed.
+            ValueError: an index is out of range, or its environment was never reset.
+        """
+        self._check_open()
+        camera = resized(camera or Camera(), size)
+        single = isinstance(envs, int) or (envs is None and self.num_envs is None)
+        if envs is None:
+            envs = range(len(self._goal))
+        elif isinstance(envs, int):
+            envs = [envs]
+        for env in envs:
+            if env not in range(len(self._goal)) or not self._episodes[env]:
+                raise ValueError(f"there is no environment {env} that was reset")
+        pixels = self._renderer.picture(envs, camera).to(self.device)
+        return pixels[0] if single else pixels
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all clients and threads. Closing again does nothing."""
         if not self.is_closed:
             super().close(raise_if_closed=raise_if_closed)
+            self._renderer.close()
             self._simulation.close()
 
     def __enter__(self) -> "RobotTaskEnv":
@@ -146,6 +237,7 @@ class RobotTaskEnv(EnvBase):
             device=self.device,
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
+            **vars(self._options),
         )
         return build, ()
 
@@ -159,6 +251,8 @@ class RobotTaskEnv(EnvBase):
         self._step_count += 1 if stepped is None else stepped
         envs = None if stepped is None else _indices(stepped)
         self._simulation.step(self.robot.control_type, envs)
+        for sense in self._senses:
+            sense.after_step(range(len(self._goal)) if envs is None else envs)
 
         observation = self._observe()
         reward = self.compute_reward(
@@ -191,6 +285,8 @@ class RobotTaskEnv(EnvBase):
             target_pose = self.task.target_pose(self._goal[envs])
             self._simulation.target_pose[envs] = target_pose
         self._simulation.reset(envs)
+        for sense in self._senses:
+            sense.after_reset(envs)
         return self._make_tensordict(self._observe())
 
     def _set_seed(self, seed: int | None) -> None:
@@ -216,6 +312,14 @@ class RobotTaskEnv(EnvBase):
             joint_forces=self.robot.joint_forces,
             objects=bodies.objects,
             targets=bodies.targets,
+        )
+
+    def _make_twin(self, mesh_cell: float) -> VisualTwin:
+        return VisualTwin(
+            self._build_scene,
+            lambda client: self.task.build(client).targets,
+            renderer=self._options.renderer,
+            mesh_cell=mesh_cell,
         )
 
     def _start_episode(self, env: int) -> None:
@@ -248,8 +352,13 @@ class RobotTaskEnv(EnvBase):
         started = self._step_count > 0
         truncated = self._step_count >= self.max_episode_steps
         terminated = success & started & self.terminate_on_success
+        sensed: dict[str, Tensor] = {}
+        for sense in self._senses:
+            sensed |= sense.observe()
+        if not self._options.pixels_only:
+            sensed["observation"] = observation.float()
         return {
-            "observation": observation.float(),
+            **sensed,
             "achieved_goal": achieved_goal,
             "desired_goal": desired_goal,
             "success": success,
@@ -291,6 +400,10 @@ class RobotTaskEnv(EnvBase):
             shape=batch,
             device=device,
         )
+        if self._options.pixels_only:
+            del self.observation_spec["observation"]
+        for sense in self._senses:
+            self.observation_spec.update(sense.spec(batch, device))
         self.action_spec = Bounded(
             low=-1.0,
             high=1.0,

@@ -30,6 +30,9 @@ class Robot:
         control_type: "ee": an action displaces the end-effector along x, y, z;
             "joints": it displaces the arm's joints.
         base_position: of the base, world frame [m].
+        wrist_joint: index of the joint on which the hand is mounted, for the sensor of
+            its force and torque; None means that there is none.
+        finger_links: indices of the fingers' links, for the sensor of their contacts.
     """
 
     def __init__(
@@ -43,6 +46,8 @@ class Robot:
         num_arm_joints: int | None = None,
         control_type: ControlType = "ee",
         base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+        wrist_joint: int | None = None,
+        finger_links: Sequence[int] = (),
     ) -> None:
         if control_type not in get_args(ControlType):
             raise ValueError(
@@ -63,6 +68,8 @@ class Robot:
         self.num_arm_joints = num_arm_joints or len(self.joint_forces)
         self.control_type: ControlType = control_type
         self.base_position = tuple(map(float, base_position))
+        self.wrist_joint = wrist_joint
+        self.finger_links = tuple(finger_links)
 
     @property
     def action_dim(self) -> int:

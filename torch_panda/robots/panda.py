@@ -12,6 +12,8 @@ from torch_panda.robots.base import Robot
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 JOINT_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 EE_LINK = 11
+# The hand's mount, where the real arm carries a force and torque sensor.
+WRIST_JOINT = 8
 FINGER_LINKS = (9, 10)
 FINGER_LATERAL_FRICTION = 1.0
 FINGER_SPINNING_FRICTION = 0.001
@@ -48,6 +50,8 @@ class Panda(Robot):
             num_arm_joints=7,
             control_type=control_type,
             base_position=base_position,
+            wrist_joint=WRIST_JOINT,
+            finger_links=FINGER_LINKS,
         )
         self.block_gripper = block_gripper
 

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
+from torch_panda.bullet.shapes import DARK_GREY, LIGHT_GREY
 
 RewardType = Literal["sparse", "dense"]
 # (achieved_goal, desired_goal), both (..., goal_dim), to (..., 1).
@@ -153,12 +154,16 @@ def create_table(
 ) -> None:
     """Create the ground, and a table centred at x = ``x_offset`` [m]."""
     client.create_box(
-        (3.0, 3.0, 0.01), mass=0.0, position=(0.0, 0.0, -TABLE_HEIGHT - 0.01)
+        (3.0, 3.0, 0.01),
+        mass=0.0,
+        position=(0.0, 0.0, -TABLE_HEIGHT - 0.01),
+        look=Look(DARK_GREY, name="ground"),
     )
     client.create_box(
         (length / 2, TABLE_WIDTH / 2, TABLE_HEIGHT / 2),
         mass=0.0,
         position=(x_offset, 0.0, -TABLE_HEIGHT / 2),
+        look=Look(LIGHT_GREY, name="table"),
     )
 
 

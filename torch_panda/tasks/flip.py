@@ -1,17 +1,20 @@
 """Flip: turn a cube to an orientation."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import NO_ROTATION, Bodies, RewardType, Task, create_table
-from torch_panda.tasks.push import CUBE_SIZE, create_cube, sample_on_table
+from torch_panda.tasks.push import CUBE, CUBE_SIZE, create_cube, sample_on_table
 
 # Where the target turns, out of the cube's way.
 TARGET_POSITION = (0.0, 0.0, 3 * CUBE_SIZE / 2)  # [m]
+# Six faces that differ in colour and, as those of a die, in their number of pips.
+LOOK = Look(texture=Path(__file__).with_name("flip_cube.png"), opacity=0.5)
 
 
 class Flip(Task):
@@ -43,8 +46,8 @@ class Flip(Task):
         """Build the table, the cube and the target."""
         create_table(client)
         return Bodies(
-            objects=(create_cube(client),),
-            targets=(client.create_marker(TARGET_POSITION),),
+            objects=(create_cube(client, look=LOOK),),
+            targets=(client.create_marker(TARGET_POSITION, CUBE, look=LOOK),),
         )
 
     def target_pose(self, goal: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import Box, Look, PhysicsClient, VectorSimulation
+from torch_panda.bullet.shapes import GREEN
 from torch_panda.tasks.base import (
     NO_ROTATION,
     Bodies,
@@ -17,6 +18,7 @@ from torch_panda.tasks.base import (
 
 CUBE_SIZE = 0.04  # [m]
 CUBE_MASS = 1.0  # [kg]
+CUBE = Box((CUBE_SIZE / 2,) * 3)
 
 
 class Push(Task):
@@ -51,7 +53,7 @@ class Push(Task):
         create_table(client)
         return Bodies(
             objects=(create_cube(client),),
-            targets=(client.create_marker((0.0, 0.0, self.marker_height)),),
+            targets=(client.create_marker((0.0, 0.0, self.marker_height), CUBE),),
         )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
@@ -73,11 +75,15 @@ class Push(Task):
 
 
 def create_cube(
-    client: PhysicsClient, *, mass: float = CUBE_MASS, x: float = 0.0
+    client: PhysicsClient,
+    *,
+    mass: float = CUBE_MASS,
+    x: float = 0.0,
+    look: Look = Look(GREEN),  # noqa: B008 (frozen)
 ) -> int:
     """Create a cube on the table and return its body id."""
-    half = CUBE_SIZE / 2
-    return client.create_box((half, half, half), mass=mass, position=(x, 0.0, half))
+    position = (x, 0.0, CUBE_SIZE / 2)
+    return client.create_box(CUBE.half_extents, mass=mass, position=position, look=look)
 
 
 def sample_on_table(

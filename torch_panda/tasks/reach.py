@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation
 from torch_panda.tasks.base import Bodies, RewardType, Task, create_table
+
+MARKER = Sphere(0.02)
 
 
 class Reach(Task):
@@ -34,7 +36,7 @@ class Reach(Task):
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table and the target."""
         create_table(client)
-        return Bodies(targets=(client.create_marker((0.0, 0.0, 0.0)),))
+        return Bodies(targets=(client.create_marker((0.0, 0.0, 0.0), MARKER),))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a point of the cube: (3,)."""

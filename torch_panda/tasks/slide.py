@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
     NO_ROTATION,
     Bodies,
@@ -71,7 +71,9 @@ class Slide(Task):
             position=(0.0, 0.0, PUCK_START_HEIGHT),
         )
         client.set_friction(puck, lateral=PUCK_LATERAL_FRICTION)
-        target = client.create_marker((0.0, 0.0, PUCK_START_HEIGHT))
+        target = client.create_marker(
+            (0.0, 0.0, PUCK_START_HEIGHT), Cylinder(PUCK_RADIUS, PUCK_HEIGHT)
+        )
         return Bodies(objects=(puck,), targets=(target,))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
+from torch_panda.bullet.shapes import GREEN, RED, Color
 from torch_panda.tasks.base import (
     NO_ROTATION,
     Bodies,
@@ -15,7 +16,7 @@ from torch_panda.tasks.base import (
     create_table,
     object_observation,
 )
-from torch_panda.tasks.push import CUBE_SIZE, create_cube, sample_on_table
+from torch_panda.tasks.push import CUBE, CUBE_SIZE, create_cube, sample_on_table
 
 LOWER_MASS = 2.0  # [kg]
 UPPER_MASS = 1.0  # [kg]
@@ -36,6 +37,8 @@ class Stack(Task):
             does; otherwise the norm of both, as panda-gym 3.
         goal_xy_range: edge length of the square of goals [m].
         obj_xy_range: edge length of the square of start positions [m].
+        lower_color: of the lower cube and its target.
+        upper_color: of the upper cube and its target.
     """
 
     goal_dim = 6
@@ -50,19 +53,26 @@ class Stack(Task):
         per_object: bool = True,
         goal_xy_range: float = 0.3,
         obj_xy_range: float = 0.3,
+        lower_color: Color = RED,
+        upper_color: Color = GREEN,
     ) -> None:
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.per_object = per_object
         self.goal_xy_range = goal_xy_range
         self.obj_xy_range = obj_xy_range
+        self.lower_look, self.upper_look = Look(lower_color), Look(upper_color)
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cubes, the lower one first, and their targets."""
         create_table(client)
-        lower = create_cube(client, mass=LOWER_MASS)
-        lower_target = client.create_marker((0.0, 0.0, 0.05))
-        upper = create_cube(client, mass=UPPER_MASS, x=0.5)
-        upper_target = client.create_marker((0.5, 0.0, 0.05))
+        lower = create_cube(client, mass=LOWER_MASS, look=self.lower_look)
+        lower_target = client.create_marker(
+            (0.0, 0.0, 0.05), CUBE, look=self.lower_look
+        )
+        upper = create_cube(client, mass=UPPER_MASS, x=0.5, look=self.upper_look)
+        upper_target = client.create_marker(
+            (0.5, 0.0, 0.05), CUBE, look=self.upper_look
+        )
         return Bodies(objects=(lower, upper), targets=(lower_target, upper_target))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:

@@ -1,0 +1,129 @@
+"""Drawing against the pybullet module itself: the same scene, equal pictures."""
+
+import numpy as np
+import pybullet
+import pytest
+
+from torch_panda.bullet import BulletError, Camera, Look, PhysicsClient, VisualClient
+from torch_panda.bullet.camera import resized, to_metres
+from torch_panda.bullet.renderers import check_renderer
+from torch_panda.bullet.shapes import Box, Cylinder, Sphere
+from torch_panda.tasks.flip import LOOK
+
+BLUE, RED = (0.1, 0.2, 0.9), (0.8, 0.1, 0.1)
+CAMERA = Camera(
+    target=(0.1, 0.0, 0.05),
+    distance=1.1,
+    yaw=30,
+    pitch=-40,
+    roll=5,
+    width=93,
+    height=61,
+)
+
+
+def build(client):
+    client.create_box((1, 1, 0.1), mass=0, position=(0, 0, -0.1), look=Look(BLUE))
+    client.create_cylinder(0.1, 0.3, mass=1, position=(0.2, 0, 0.15), look=Look(RED))
+    client.create_sphere(0.15, mass=1, position=(-0.1, 0.2, 0.15))
+    client.create_marker((0, -0.2, 0.2), Box((0.1, 0.1, 0.1)), look=Look(BLUE))
+
+
+def build_reference(p):
+    shapes = (
+        (p.GEOM_BOX, {"halfExtents": (1, 1, 0.1)}, BLUE, (0, 0, -0.1)),
+        (p.GEOM_CYLINDER, {"radius": 0.1, "length": 0.3}, RED, (0.2, 0, 0.15)),
+        (p.GEOM_SPHERE, {"radius": 0.15}, (0.1, 0.9, 0.1), (-0.1, 0.2, 0.15)),
+    )
+    for kind, size, color, position in shapes:
+        shape = p.createVisualShape(kind, rgbaColor=(*color, 1), **size)
+        p.createMultiBody(baseVisualShapeIndex=shape, basePosition=position)
+
+
+@pytest.mark.parametrize("shadow", [True, False])
+def test_as_pybullet_draws(shadow):
+    reference = pybullet.connect(pybullet.DIRECT)
+    build_reference(pybullet)
+    view = pybullet.computeViewMatrixFromYawPitchRoll(
+        (0.1, 0, 0.05), 1.1, 30, -40, 5, 2
+    )
+    projection = pybullet.computeProjectionMatrixFOV(60, 93 / 61, 0.1, 100)
+    _, _, rgba, depth, segmentation = pybullet.getCameraImage(
+        93, 61, view, projection, shadow=shadow
+    )
+    pybullet.disconnect(reference)
+    with VisualClient() as client:
+        build(client)
+        image = client.draw(CAMERA, segmentation=True, shadow=shadow)
+        assert image.rgb.shape == (61, 93, 3)
+        np.testing.assert_array_equal(image.rgb, np.reshape(rgba, (61, 93, 4))[..., :3])
+        np.testing.assert_array_equal(image.depth, np.reshape(depth, (61, 93)))
+        ids = np.reshape(segmentation, (61, 93))
+        np.testing.assert_array_equal(image.segmentation, ids)
+        assert set(np.unique(ids)) == {-1, 0, 1, 2}
+
+
+def test_layers_hold_the_same_bodies_and_draw_their_own():
+    with PhysicsClient() as physics, VisualClient("markers") as markers:
+        build(physics)
+        build(markers)
+        assert physics.state(3).q and markers.state(3).q
+        image = markers.draw(CAMERA, segmentation=True)
+        assert set(np.unique(image.segmentation)) == {-1, 3}
+
+
+def test_depth_in_metres():
+    camera = Camera(
+        target=(0, 0, 0), distance=2.0, yaw=0, pitch=-90, height=32, width=32
+    )
+    with VisualClient() as client:
+        client.create_box((0.3, 0.3, 0.25), mass=0, position=(0, 0, 0))
+        depth = to_metres(client.draw(camera).depth, camera)
+    assert depth[16, 16] == pytest.approx(1.75, abs=1e-4)
+    assert depth[0, 0] == camera.far
+
+
+def test_six_faces_differ():
+    views = [(90, 0), (180, 0), (0, -90), (-90, 0), (0, 0), (0, 90)]
+    with VisualClient() as client:
+        client.create_box((0.02,) * 3, mass=0, position=(0, 0, 0), look=LOOK)
+        colors = []
+        for yaw, pitch in views:
+            # So narrow a view that a face fills the picture.
+            camera = Camera(
+                distance=0.2, yaw=yaw, pitch=pitch, fov=11, width=48, height=48
+            )
+            square = client.draw(camera, shadow=False).rgb
+            # Shading changes brightness, so hues are compared.
+            color = square.reshape(-1, 3).mean(axis=0)
+            colors.append(color / np.linalg.norm(color))
+    for a in range(6):
+        for b in range(a):
+            assert np.linalg.norm(colors[a] - colors[b]) > 0.15, (a, b)
+
+
+def test_bad_cameras_are_named():
+    with pytest.raises(ValueError, match="at least 1 pixel, got 0 x 480"):
+        Camera(width=0)
+    with pytest.raises(ValueError, match="fov"):
+        Camera(fov=180)
+    with pytest.raises(ValueError, match="near"):
+        Camera(near=2.0, far=1.0)
+    assert resized(Camera(), (30, 40)) == Camera(height=30, width=40)
+    assert resized(Camera(), 50) == Camera(height=50, width=50)
+
+
+def test_missing_texture_is_named(tmp_path):
+    look = Look(texture=tmp_path / "none.png")
+    with VisualClient() as client, pytest.raises(BulletError, match=r"none\.png"):
+        client.create_box((1, 1, 1), mass=0, position=(0, 0, 0), look=look)
+
+
+def test_unknown_renderer_is_named():
+    with pytest.raises(ValueError, match=r"'tiny', 'egl'.*'opengl'"):
+        check_renderer("opengl")
+
+
+def test_shapes_are_plain_values():
+    assert Box((1, 2, 3)) == ((1, 2, 3),)
+    assert Cylinder(0.1, 0.2) != Sphere(0.1)

@@ -1,0 +1,195 @@
+"""Looking at environments: `RobotTaskEnv.render` and what torchrl makes of it."""
+
+import imageio.v3 as imageio
+import numpy as np
+import pybullet
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.record import PixelRenderTransform, VideoRecorder
+from torchrl.record.loggers import Logger
+
+import torch_panda
+from tests.panda_gym_reference import make_reference, start
+from torch_panda import BulletError, Camera
+from torch_panda.bullet import visual
+
+TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+CLOSE = Camera(target=(0.0, 0.0, 0.0), distance=0.5, width=60, height=40)
+
+
+def render_reference(reference):
+    """panda-gym's picture, and which of its pixels show a target."""
+    client = reference.sim.physics_client
+    view = client.computeViewMatrixFromYawPitchRoll((0, 0, 0), 1.4, 45, -30, 0, 2)
+    projection = client.computeProjectionMatrixFOV(60, 720 / 480, 0.1, 100)
+    ids = client.getCameraImage(
+        720, 480, view, projection, shadow=True, renderer=pybullet.ER_TINY_RENDERER
+    )[4]
+    bodies = reference.sim._bodies_idx
+    targets = [body for name, body in bodies.items() if name.startswith("target")]
+    return reference.render(), np.isin(np.reshape(ids, (480, 720)), targets)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_as_panda_gym_draws(task):
+    """Every pixel but those of targets, which panda-gym draws opaque here."""
+    reference = make_reference(f"Panda{task}-v3")
+    _, poses, goal = start(reference, seed=3)
+    theirs, is_target = render_reference(reference)
+    reference.close()
+    with torch_panda.make(f"Panda{task}-v3", seed=0) as env:
+        state = TensorDict({"desired_goal": torch.as_tensor(goal).double()})
+        if len(poses):
+            state["object_pose"] = torch.as_tensor(poses)
+        env.reset(state, set_state=True)
+        ours = env.render().numpy()
+    assert ours.shape == (480, 720, 3)
+    difference = np.abs(ours.astype(int) - theirs.astype(int))
+    differs = difference.max(axis=-1) > 0
+    if task == "Flip":  # its cube cannot be seen: panda-gym's wheel lacks the texture
+        assert 0 < differs[~is_target].sum() < 600
+    else:
+        assert not differs[~is_target].any()
+        assert is_target.sum() > 50
+        # Translucent: between what panda-gym draws and what lies behind.
+        assert differs[is_target].mean() > 0.9
+
+
+def test_targets_are_seen_through():
+    with torch_panda.make("PandaPush-v1", seed=0) as env:
+        env.reset()
+        camera = Camera(
+            target=tuple(env.get_state()["desired_goal"].tolist()),
+            distance=0.2,
+            pitch=-90,
+            width=20,
+            height=20,
+        )
+        seen = env.render(camera=camera)[10, 10].float()
+        state = env.get_state()
+        state["desired_goal"] = torch.tensor([0.0, 3.0, 0.02], dtype=torch.float64)
+        env.reset(state, set_state=True)
+        behind = env.render(camera=camera)[10, 10].float()
+    # 30 % green over the grey table.
+    assert behind[0] == behind[1] == behind[2]
+    assert seen[0] < behind[0] and seen[0] == seen[2] < seen[1]
+    assert seen[0] > 0.7 * behind[0]
+
+
+@pytest.mark.parametrize(("version", "lower"), [("v1", 0), ("v3", 2)])
+def test_colors_of_the_stack(version, lower):
+    with torch_panda.make(f"PandaStack-{version}", seed=0) as env:
+        env.reset()
+        for index, channel in ((0, lower), (1, 1)):
+            position = env.get_state()["object_pose"][index, :3].tolist()
+            camera = Camera(
+                target=tuple(position), distance=0.2, pitch=-89, width=9, height=9
+            )
+            color = env.render(camera=camera)[4, 4]
+            assert color.argmax() == channel
+            assert color[channel] > 4 * color[channel - 1]
+
+
+def test_chosen_environments():
+    with torch_panda.make("PandaPush-v1", num_envs=5, num_threads=2, seed=0) as env:
+        with pytest.raises(ValueError, match="environment 0 that was reset"):
+            env.render()
+        env.reset()
+        every = env.render(camera=CLOSE)
+        assert every.shape == (5, 40, 60, 3) and every.dtype == torch.uint8
+        assert len(every.flatten(1).unique(dim=0)) == 5
+        assert (env.render([3, 1], camera=CLOSE) == every[[3, 1]]).all()
+        assert (env.render(4, camera=CLOSE) == every[4]).all()
+        assert env.render(4, camera=CLOSE, size=(30, 50)).shape == (30, 50, 3)
+        for wrong in (5, -1, [0, 7]):
+            with pytest.raises(ValueError, match="no environment"):
+                env.render(wrong, camera=CLOSE)
+    with pytest.raises(BulletError, match="closed"):
+        env.render()
+
+
+def test_pictures_do_not_depend_on_threads():
+    pictures = []
+    for num_threads in (1, 3):
+        with torch_panda.make(
+            "PandaFlip-v1", num_envs=4, num_threads=num_threads, seed=0
+        ) as env:
+            torch.manual_seed(0)
+            env.rollout(3)
+            pictures.append(env.render(camera=CLOSE))
+    assert (pictures[0] == pictures[1]).all()
+
+
+def test_nothing_is_built_before_something_is_drawn(monkeypatch):
+    made = []
+    constructor = visual.VisualClient.__init__
+
+    def count(self, *args, **kwargs):
+        made.append(self)
+        constructor(self, *args, **kwargs)
+
+    monkeypatch.setattr(visual.VisualClient, "__init__", count)
+    with torch_panda.make("PandaPush-v1", num_envs=3, num_threads=2, seed=0) as env:
+        env.rollout(3)
+        assert not made
+        env.render(1, camera=CLOSE)
+        assert len(made) == 2  # what is solid, and what is translucent
+        env.render(camera=CLOSE)
+        env.render(camera=CLOSE, size=30)
+        assert len(made) == 8
+        env.render(camera=CLOSE)
+        assert len(made) == 8
+    assert all(client.is_closed for client in made)
+
+
+def test_looking_changes_nothing():
+    rollouts = []
+    for look in (False, True):
+        with torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as env:
+            torch.manual_seed(0)
+            callback = (lambda env, td: env.render(camera=CLOSE)) if look else None
+            rollouts.append(env.rollout(15, callback=callback))
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+class _VideoFile(Logger):
+    """Writes the videos of torchrl's recorder with ffmpeg."""
+
+    def __init__(self, folder):
+        super().__init__("videos", folder)
+        self.folder = folder
+
+    def log_video(self, name, video, step=None, **kwargs):
+        frames = video[0].permute(0, 2, 3, 1).numpy()
+        imageio.imwrite(self.folder / f"{name}.mp4", frames, fps=25)
+
+    def _create_experiment(self):
+        return None
+
+    def log_scalar(self, name, value, step=None, **kwargs): ...
+    def log_hparams(self, cfg): ...
+    def log_histogram(self, name, data, **kwargs): ...
+    def __repr__(self):
+        return "_VideoFile()"
+
+
+@pytest.mark.parametrize("num_envs", [None, 4])
+def test_torchrl_records_videos(tmp_path, num_envs):
+    env = torch_panda.make("PandaPush-v1", num_envs=num_envs, seed=0)
+    env = env.append_transform(PixelRenderTransform(camera=CLOSE, size=(64, 96)))
+    recorder = VideoRecorder(_VideoFile(tmp_path), tag="push", skip=1)
+    env = env.append_transform(recorder)
+    rollout = env.rollout(9)
+    batch = () if num_envs is None else (num_envs,)
+    assert rollout["next", "pixels"].shape == (*batch, 9, 64, 96, 3)
+    recorder.dump()
+    env.close()
+    frames = imageio.imread(tmp_path / "push.mp4")
+    grid = (64, 96) if num_envs is None else (128, 192)
+    assert frames.shape == (10, *grid, 3)  # the reset, and nine steps
+    # Lossy, but the same pictures.
+    last = rollout["next", "pixels"][..., -1, :, :, :]
+    last = last if num_envs is None else last[0]
+    seen = frames[-1][:64, :96].astype(int)
+    assert np.abs(seen - last.numpy().astype(int)).mean() < 6

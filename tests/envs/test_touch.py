@@ -1,0 +1,151 @@
+"""Forces against Newton: press the table, lift a cube."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import torch_panda
+from tests.test_custom import make_kuka
+from torch_panda import Reach, RobotTaskEnv
+
+SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
+G = 9.81  # [m/s^2]
+HAND_MASS = 0.81 + 2 * 0.1  # [kg], of hand and fingers in the URDF
+HAND = 8
+ARM = 7  # joints
+
+
+def hand_to_world(env):
+    """Rotation of the hand's frame, where the wrist's wrench is given: (3, 3)."""
+    from ctypes import c_double
+
+    simulation = env._simulation
+    state = simulation.clients[0].state(simulation.scene.robot)
+    *_, x, y, z, w = (c_double * 7).from_address(state.link_pose(HAND))
+    return torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def test_press_on_the_table():
+    with torch_panda.make("PandaPush-v1", seed=0, sensors=SENSORS) as env:
+        td = env.reset()
+        assert all((td[sensor] == 0).all() for sensor in SENSORS)
+        for _ in range(30):
+            td = env.step(td.set("action", torch.tensor([0.0, 0.0, -1.0])))["next"]
+        on_hand = hand_to_world(env) @ td["wrist_force_torque"][:3]
+        on_fingers = td["finger_contact"].sum(0)
+    # The table pushes up, both fingers alike, and the arm pushes the hand down.
+    assert (td["finger_contact"][:, 2] > 50).all()
+    assert on_hand[2] < -100
+    # Arm, table and gravity balance; the hand still creeps over the table, and its
+    # acceleration accounts for up to 1 % of the forces.
+    weight = torch.tensor([0.0, 0.0, -HAND_MASS * G])
+    residual = on_hand + on_fingers + weight
+    assert residual.norm() < 0.01 * on_fingers.norm()
+
+
+def test_lift_a_cube():
+    env = torch_panda.make(
+        "PandaPickAndPlace-v1", seed=0, sensors=SENSORS, max_episode_steps=200
+    )
+    td = env.reset()
+
+    def go(target, grip, steps):
+        nonlocal td
+        for _ in range(steps):
+            offset = target(td["observation"]) - td["observation"][:3]
+            action = torch.cat(((offset * 8).clamp(-1, 1), torch.tensor([grip])))
+            td = env.step(td.set("action", action))["next"]
+
+    go(lambda o: o[7:10] + torch.tensor([0.0, 0.0, 0.1]), 1.0, 12)
+    go(lambda o: o[7:10], 1.0, 30)
+    free = hand_to_world(env) @ td["wrist_force_torque"][:3]
+    go(lambda o: o[7:10], -1.0, 5)
+    top = td["observation"][:3] + torch.tensor([0.0, 0.0, 0.15])
+    go(lambda o: top, -1.0, 45)
+    loaded = hand_to_world(env) @ td["wrist_force_torque"][:3]
+    contact, torque = td["finger_contact"], td["joint_torque"]
+    assert td["observation"][9] > 0.15, "the cube must hang in the air"
+    env.close()
+    # The cube, 1 kg, pulls the fingers down with its weight, and nowhere else: at rest
+    # this holds to the cube's remaining acceleration, below 0.02 m/s^2.
+    weight = torch.tensor([0.0, 0.0, -1.0 * G])
+    torch.testing.assert_close(contact.sum(0), weight, atol=0.02, rtol=0)
+    # Each finger is pushed outwards as hard as its motor pushes inwards.
+    assert contact[0, 1] * contact[1, 1] < 0
+    torch.testing.assert_close(contact[:, 1].abs(), -torque[ARM:], rtol=0.01, atol=0)
+    # The wrist bears the hand, then hand and cube. The arm holds still to 0.1 m/s^2.
+    down = torch.tensor([0.0, 0.0, 1.0])
+    for measured, mass in ((free, HAND_MASS), (loaded, HAND_MASS + 1.0)):
+        torch.testing.assert_close(measured, mass * G * down, atol=0.1 * mass, rtol=0)
+
+
+def test_physics_is_the_same_with_sensors():
+    rollouts = []
+    for sensors in ((), SENSORS):
+        env = torch_panda.make(
+            "PandaPickAndPlace-v1", num_envs=3, seed=0, sensors=sensors
+        )
+        td = env.reset()
+        observations, touched = [], False
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(50):
+            # Towards the cube and about, so that fingers, cube and table touch.
+            noise = torch.rand(3, 4, generator=generator) * 2 - 1
+            pull = (td["achieved_goal"] - td["observation"][:, :3]) * 10
+            noise[:, :3] = noise[:, :3] * 0.5 + pull
+            td = env.step(td.set("action", noise))["next"]
+            observations.append(td["observation"])
+            touched = touched or (bool(sensors) and bool(td["finger_contact"].any()))
+        rollouts.append(torch.stack(observations))
+        assert touched == bool(sensors)
+        state = env.get_state()
+        rollouts.append(torch.cat([v.flatten() for v in state.values()]))
+        env.close()
+    assert (rollouts[0] == rollouts[2]).all()
+    assert (rollouts[1] == rollouts[3]).all()
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_specs(num_envs):
+    batch = () if num_envs is None else (num_envs,)
+    with torch_panda.make(
+        "PandaStack-v1", num_envs=num_envs, seed=0, sensors=SENSORS
+    ) as env:
+        check_env_specs(env)
+        td = env.rollout(3)["next"]
+        assert td["wrist_force_torque"].shape == (*batch, 3, 6)
+        assert td["finger_contact"].shape == (*batch, 3, 2, 3)
+        assert td["joint_torque"].shape == (*batch, 3, 9)
+        assert (td["joint_torque"][..., 1].abs() > 1).all()
+
+
+def test_partial_steps_and_resets():
+    with torch_panda.make("PandaPush-v1", num_envs=2, seed=0, sensors=SENSORS) as env:
+        td = env.rollout(3)[:, -1]["next"]
+        before = td["joint_torque"].clone()
+        mask = torch.tensor([[True], [False]])
+        td = env.reset(td.clone().set("_reset", mask))
+        assert (td["joint_torque"][0] == 0).all()
+        assert (td["joint_torque"][1] == before[1]).all()
+
+
+def test_only_what_was_asked_for():
+    with torch_panda.make("PandaPush-v1", sensors=("finger_contact",)) as env:
+        assert not {"joint_torque", "wrist_force_torque"} & set(env.reset().keys())
+
+
+def test_unknown_sensors_are_named():
+    with pytest.raises(ValueError, match=r"'finger_contact', 'joint_torque'.*smell"):
+        torch_panda.make("PandaPush-v1", sensors=("smell",))
+    with pytest.raises(ValueError, match=r"among \('joint_torque',\)"):
+        RobotTaskEnv(robot=make_kuka(), task=Reach(), sensors=("finger_contact",))
+    with RobotTaskEnv(
+        robot=make_kuka(), task=Reach(), seed=0, sensors=("joint_torque",)
+    ) as env:
+        assert env.rollout(2)["next", "joint_torque"].shape == (2, 7)

@@ -1,0 +1,189 @@
+"""Learning from pixels: cameras as observations."""
+
+import pickle
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import torch_panda
+from torch_panda import Camera
+from torch_panda.bullet import renderers
+
+SIZE = 48
+IMAGES = {"from_pixels": True, "depth": True, "segmentation": True, "render_size": SIZE}
+
+
+def make(env_id="PandaPush-v1", **arguments):
+    return torch_panda.make(env_id, **{"num_envs": 3, "seed": 0, **IMAGES, **arguments})
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_specs(num_envs):
+    with make("PandaStack-v1", num_envs=num_envs, sensors=("joint_torque",)) as env:
+        check_env_specs(env)
+        td = env.rollout(3)
+        batch = () if num_envs is None else (num_envs,)
+        for key, channels, dtype in (
+            ("pixels", 3, torch.uint8),
+            ("depth", 1, torch.float32),
+            ("segmentation", 1, torch.int32),
+        ):
+            for value in (td[key], td["next", key]):
+                assert value.shape == (*batch, 3, SIZE, SIZE, channels)
+                assert value.dtype == dtype
+        assert "observation" in td
+
+
+def test_what_is_not_asked_for_is_not_there():
+    with make(depth=False, segmentation=False, pixels_only=True) as env:
+        check_env_specs(env)
+        keys = set(env.reset().keys()) - {"done", "terminated", "truncated", "success"}
+        assert keys == {"pixels", "achieved_goal", "desired_goal"}
+    with make(from_pixels=False, segmentation=False) as env:
+        assert {"depth", "observation"} <= set(env.reset().keys())
+        assert "pixels" not in env.reset()
+    with pytest.raises(ValueError, match="pixels_only"):
+        make(from_pixels=False, pixels_only=True)
+
+
+def test_pixels_are_what_render_shows():
+    camera = Camera(distance=0.8, yaw=80)
+    with make(num_envs=4, num_threads=2, camera=camera) as env:
+        td = env.rollout(4)
+        assert (
+            env.render(camera=camera, size=SIZE) == td["next", "pixels"][:, -1]
+        ).all()
+        # Later steps do not write into earlier ones.
+        assert not (td["next", "pixels"][:, 0] == td["next", "pixels"][:, -1]).all()
+        assert (td["next", "pixels"][:, :-1] == td["pixels"][:, 1:]).all()
+
+
+def test_partial_resets_and_steps():
+    with make() as env:
+        td = env.reset()
+        before = {key: td[key].clone() for key in ("pixels", "depth", "segmentation")}
+        mask = torch.tensor([[False], [True], [False]])
+        td = env.reset(td.clone().set("_reset", mask))
+        for key, value in before.items():
+            assert (td[key][[0, 2]] == value[[0, 2]]).all(), key
+            assert not (td[key][1] == value[1]).all(), key
+        before = {key: td[key].clone() for key in before}
+        action = torch.ones(3, 3)
+        td = env.step(td.set("action", action).set("_step", mask.squeeze(-1)))["next"]
+        for key, value in before.items():
+            assert not (td[key][1] == value[1]).all(), key
+    with make() as env:
+        td = env.reset()
+        state = env.get_state()
+        env.rollout(5)
+        again = env.reset(state, set_state=True)
+        for key in before:
+            assert (again[key] == td[key]).all(), key
+
+
+def project(point, camera):
+    """Column, row and depth at which a camera sees a point, by its own geometry."""
+    yaw, pitch = torch.deg2rad(torch.tensor([camera.yaw, camera.pitch]).double())
+    forward = torch.stack(
+        (-yaw.sin() * pitch.cos(), yaw.cos() * pitch.cos(), pitch.sin())
+    )
+    right = torch.stack((yaw.cos(), yaw.sin(), torch.zeros_like(yaw)))
+    up = torch.linalg.cross(right, forward)
+    eye = torch.tensor(camera.target).double() - camera.distance * forward
+    depth = (point - eye) @ forward
+    focal = camera.height / 2 / torch.tan(torch.deg2rad(torch.tensor(camera.fov / 2)))
+    column = camera.width / 2 + focal * ((point - eye) @ right) / depth
+    row = camera.height / 2 - focal * ((point - eye) @ up) / depth
+    return int(column), int(row), float(depth)
+
+
+def test_objects_are_seen_where_they_are():
+    camera = Camera(distance=0.7, yaw=120, pitch=-50, width=360, height=280)
+    with make("PandaStack-v1", num_envs=2, camera=camera, render_size=None) as env:
+        td = env.reset()
+        ids = env.segmentation_ids
+        assert set(ids) == {"nothing", "robot", "ground", "table", "object1", "object2"}
+        assert set(td["segmentation"].unique().tolist()) <= set(ids.values())
+        found = 0
+        for env_index in range(2):
+            poses = env.get_state()["object_pose"][env_index]
+            for name, position in zip(
+                ("object1", "object2"), poses[:, :3], strict=True
+            ):
+                column, row, depth = project(position, camera)
+                if td["segmentation"][env_index, row, column, 0] == ids[name]:
+                    found += 1
+                    seen = td["depth"][env_index, row, column, 0]
+                    # A face is 2 to 3.5 cm before the centre; a pixel is 3 mm wide.
+                    assert 0.017 < depth - seen < 0.038
+        assert found >= 3  # the arm or a cube may hide one
+        assert (td["depth"] <= camera.far).all()
+        assert (td["depth"][td["segmentation"] == ids["nothing"]] == camera.far).all()
+
+
+def test_targets_are_in_the_pixels_only():
+    camera = Camera(distance=0.5, width=50, height=50)
+    with make(num_envs=None, camera=camera, render_size=None) as env:
+        td = env.reset()
+        state = env.get_state()
+        state["desired_goal"] = torch.tensor([-0.1, 0.1, 0.02]).double()
+        other = env.reset(state, set_state=True)
+        assert not (td["pixels"] == other["pixels"]).all()
+        assert (td["depth"] == other["depth"]).all()
+        assert (td["segmentation"] == other["segmentation"]).all()
+
+
+def test_same_episodes_as_without():
+    rollouts = []
+    for images in (IMAGES, {}):
+        env = torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0, **images)
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(12)["next", "observation"])
+        env.close()
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+def test_pickle_keeps_the_options():
+    with (
+        make(sensors=("joint_torque",)) as env,
+        pickle.loads(pickle.dumps(env)) as copy,
+    ):
+        assert copy.observation_spec == env.observation_spec
+        assert (copy.reset()["pixels"] == env.reset()["pixels"]).all()
+
+
+def test_egl_where_it_works_and_a_clear_error_elsewhere():
+    camera = Camera(distance=1.2, pitch=-90, width=48, height=48)
+    options = {"num_envs": 2, "camera": camera, "render_size": None}
+    try:
+        env = make(renderer="egl", **options)
+    except RuntimeError as error:
+        assert "does not work on this machine" in str(error)
+        return
+    with env, make(**options) as tiny:
+        ours, theirs = env.reset(), tiny.reset()
+        ids = env.segmentation_ids
+        # Other lights and edges, but the same things in the same places.
+        same = ours["segmentation"] == theirs["segmentation"]
+        assert same.float().mean() > 0.95
+        for images in (ours, theirs):
+            table = images["depth"][images["segmentation"] == ids["table"]]
+            assert table.median() == pytest.approx(1.2, abs=1e-4)
+        assert ours["pixels"].float().std() > 20
+        # A picture does not depend on what was drawn before, if anything was.
+        again = env.reset(env.get_state(), set_state=True)
+        assert (again["pixels"] == ours["pixels"]).all()
+
+
+def test_no_blank_frames_without_egl(monkeypatch):
+    renderers._check_egl.cache_clear()
+    monkeypatch.setattr(renderers, "_EGL_PROBE", "raise SystemExit('no EGL device')")
+    with pytest.raises(RuntimeError, match=r"use 'tiny'.*no EGL device"):
+        make(renderer="egl")
+    renderers._check_egl.cache_clear()
+
+
+def test_unknown_renderer():
+    with pytest.raises(ValueError, match=r"renderer must be one of.*'gl'"):
+        make(renderer="gl")

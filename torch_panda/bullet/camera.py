@@ -1,0 +1,76 @@
+"""A camera, and the distances that it sees."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+# The depth of a pixel in which nothing is seen, up to rounding.
+_BACKGROUND_DEPTH = np.float32(1 - 1e-6)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; the defaults are panda-gym's.
+
+    Attributes:
+        target: the point it looks at, world frame [m].
+        distance: from there [m].
+        yaw: its direction, about the world's z axis [degrees].
+        pitch: above the horizon, so a negative one looks down [degrees].
+        roll: about the line of sight [degrees].
+        fov: vertical angle of view [degrees].
+        width: of the image [pixels].
+        height: of the image [pixels].
+        near: nothing closer along the line of sight is seen [m].
+        far: nor anything farther [m].
+
+    Raises:
+        ValueError: a size, a distance or an angle is out of range.
+    """
+
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distance: float = 1.4
+    yaw: float = 45.0
+    pitch: float = -30.0
+    roll: float = 0.0
+    fov: float = 60.0
+    width: int = 720
+    height: int = 480
+    near: float = 0.1
+    far: float = 100.0
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1:
+            raise ValueError(
+                f"a camera's width and height must be at least 1 pixel, got "
+                f"{self.width} x {self.height}"
+            )
+        if not 0 < self.fov < 180:
+            raise ValueError(f"fov must be between 0 and 180 degrees, got {self.fov}")
+        if not (0 < self.near < self.far and self.distance > 0):
+            raise ValueError(
+                f"distance must be above 0, and near between 0 and far, got distance "
+                f"{self.distance}, near {self.near}, far {self.far}"
+            )
+
+
+def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
+    """The same view in another size: (height, width), or both in one; None: as is."""
+    if size is None:
+        return camera
+    height, width = (size, size) if isinstance(size, int) else size
+    return dataclasses.replace(camera, height=height, width=width)
+
+
+def to_metres(
+    depth: npt.NDArray[np.float32], camera: Camera
+) -> npt.NDArray[np.float32]:
+    """Distance along the line of sight [m] of an `Image`'s depth.
+
+    The inverse of OpenGL's perspective projection.
+    """
+    near, far = np.float32(camera.near), np.float32(camera.far)
+    metres = near * far / (far - (far - near) * depth)
+    return np.where(depth < _BACKGROUND_DEPTH, metres, far)

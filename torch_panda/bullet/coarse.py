@@ -1,0 +1,178 @@
+"""Coarser meshes for small pictures.
+
+The Panda's meshes have 100,000 triangles, and Bullet's software renderer spends 95 %
+of a picture of 64 x 64 pixels on triangles that are smaller than a pixel.
+"""
+
+import functools
+import shutil
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+# Texture coordinates that differ by less belong to one colour.
+_TEXTURE_CELL = 0.1
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+
+@functools.cache
+def _scratch() -> tempfile.TemporaryDirectory[str]:
+    """Where coarse files live until the process ends."""
+    return tempfile.TemporaryDirectory(prefix="torch_panda-")
+
+
+@functools.cache
+def coarse_urdf(urdf: str, cell: float) -> Path:
+    """A URDF that looks like another one from afar.
+
+    Its visual meshes in Wavefront's format (.obj) have one vertex in a cube of edge
+    length ``cell`` [m]. It has no collision shapes.
+
+    Args:
+        urdf: the original file.
+        cell: edge length of the cubes [m].
+    """
+    folder = Path(tempfile.mkdtemp(dir=_scratch().name))
+    source = Path(urdf).absolute()
+    tree = ElementTree.parse(source)
+    for link in tree.iter("link"):
+        for collision in link.findall("collision"):
+            link.remove(collision)
+        for mesh in link.iter("mesh"):
+            original = _find_mesh(mesh.get("filename", ""), source)
+            if original is not None and original.suffix == ".obj":
+                scale = np.array(mesh.get("scale", "1 1 1").split(), dtype=float)
+                original = _coarse_obj(original, folder, cell / scale)
+            if original is not None:
+                mesh.set("filename", str(original))
+    path = folder / source.name
+    tree.write(path)
+    return path
+
+
+def _find_mesh(name: str, urdf: Path) -> Path | None:
+    """A mesh of a URDF, looked for where Bullet does: in all folders above it."""
+    name = name.removeprefix("package://").removeprefix("file://")
+    candidates = [parent / name for parent in urdf.parents]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _coarse_obj(original: Path, folder: Path, cell: Floats) -> Path:
+    """Write the coarse version of an .obj file, and its texture, into a folder."""
+    vertices, coordinates, corners = _read_obj(original)
+    positions, texture, faces = merge_vertices(vertices, coordinates, corners, cell)
+    path = folder / f"{original.parent.name}_{original.name}"
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in positions]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in texture]
+    image = _texture_of(original)
+    if image is not None:
+        shutil.copy(image, folder)
+        material = path.with_suffix(".mtl")
+        material.write_text(f"newmtl coarse\nmap_Kd {image.name}\n")
+        lines = [f"mtllib {material.name}", *lines, "usemtl coarse"]
+    normals = _normals(positions, faces)
+    lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals]
+    lines += [
+        "f " + " ".join(f"{v + 1}/{v + 1}/{v + 1}" for v in face) for face in faces
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def merge_vertices(
+    vertices: Floats, coordinates: Floats, corners: Integers, cell: Floats
+) -> tuple[Floats, Floats, Integers]:
+    """Merge the vertices in each cube of a grid into their mean.
+
+    Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex
+    scenes", 1993. Vertices of different colours move to one point but stay apart.
+
+    Args:
+        vertices: (n, 3) [m].
+        coordinates: (m, 2), in the texture.
+        corners: (f, 3, 2), of the triangles: which vertex, which coordinate.
+        cell: (3,), edge lengths of the cubes [m].
+
+    Returns:
+        Positions (k, 3), texture coordinates (k, 2) and triangles (g, 3).
+    """
+    grid = np.floor(vertices / cell).astype(np.int64)
+    _, cube = np.unique(grid, axis=0, return_inverse=True)
+    sums = np.stack([np.bincount(cube, column) for column in vertices.T], axis=1)
+    means: Floats = sums / np.bincount(cube)[:, None]
+    color = np.floor(coordinates / _TEXTURE_CELL).astype(np.int64)
+    # A new vertex for each cube and colour; its texture coordinates are one corner's.
+    flat = corners.reshape(-1, 2)
+    keys = np.column_stack((cube[flat[:, 0]], color[flat[:, 1]]))
+    keys, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    # Triangles that shrank to a line or a point are gone, as are doubles.
+    in_cubes = keys[faces, 0]
+    has_area = (in_cubes != np.roll(in_cubes, 1, axis=1)).all(axis=1)
+    faces, in_cubes = faces[has_area], in_cubes[has_area]
+    lowest = in_cubes.argmin(axis=1)
+    turned = (lowest[:, None] + np.arange(3)) % 3
+    in_cubes = np.take_along_axis(in_cubes, turned, axis=1)
+    _, kept = np.unique(in_cubes, axis=0, return_index=True)
+    return means[keys[:, 0]], coordinates[flat[first, 1]], faces[np.sort(kept)]
+
+
+def _normals(positions: Floats, faces: Integers) -> Floats:
+    """Normals of vertices: the mean of their triangles', by area."""
+    a, b, c = positions[faces[:, 0]], positions[faces[:, 1]], positions[faces[:, 2]]
+    normals = np.zeros_like(positions)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], np.cross(b - a, c - a))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0, length, 1.0)
+
+
+def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
+    """Vertices (n, 3), texture coordinates (m, 2), corners (f, 3, 2) of an .obj file.
+
+    Corners without a texture coordinate refer to the first one, which is (0, 0).
+    """
+    vertices: list[list[float]] = []
+    coordinates = [[0.0, 0.0]]
+    corners: list[list[tuple[int, int]]] = []
+    for line in path.read_text().splitlines():
+        kind, _, rest = line.partition(" ")
+        if kind == "v":
+            vertices.append([float(x) for x in rest.split()[:3]])
+        elif kind == "vt":
+            coordinates.append([float(x) for x in rest.split()[:2]])
+        elif kind == "f":
+            polygon = []
+            for corner in rest.split():
+                vertex, coordinate = [*corner.split("/"), ""][:2]
+                # Numbers count from 1, or back from the last one so far.
+                v, t = int(vertex), int(coordinate or 0)
+                v = v - 1 if v > 0 else v + len(vertices)
+                polygon.append((v, t if t >= 0 else t + len(coordinates)))
+            for k in range(1, len(polygon) - 1):
+                corners.append([polygon[0], polygon[k], polygon[k + 1]])
+    return np.array(vertices), np.array(coordinates), np.array(corners)
+
+
+def _texture_of(path: Path) -> Path | None:
+    """The first texture of an .obj file's materials, the one that Bullet uses."""
+    for library in _values(path, "mtllib"):
+        materials = path.with_name(library)
+        if materials.is_file():
+            for image in _values(materials, "map_Kd"):
+                if materials.with_name(image).is_file():
+                    return materials.with_name(image)
+    return None
+
+
+def _values(path: Path, key: str) -> Iterator[str]:
+    with path.open() as lines:
+        for line in lines:
+            if line.startswith(key + " "):
+                yield line.split()[-1]

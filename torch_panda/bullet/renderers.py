@@ -1,0 +1,51 @@
+"""The renderers, and whether they work here."""
+
+import functools
+import subprocess
+import sys
+from typing import Literal, get_args
+
+# Bullet's software renderer, and its OpenGL renderer without a window.
+RendererName = Literal["tiny", "egl"]
+RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
+
+# Draws a box before nothing, and tells whether both are seen. With pybullet itself: it
+# is imported much faster than torch.
+_EGL_PROBE = """
+import importlib.util, numpy, pybullet as p
+p.connect(p.DIRECT)
+path = importlib.util.find_spec("eglRenderer").origin
+assert p.loadPlugin(path, "_eglRendererPlugin") >= 0, "the plugin does not load"
+p.createMultiBody(0, p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.5] * 3))
+view = p.computeViewMatrixFromYawPitchRoll([0] * 3, 3, 0, -30, 0, 2)
+projection = p.computeProjectionMatrixFOV(60, 1.5, 0.1, 100)
+_, _, rgba, depth, _ = p.getCameraImage(60, 40, view, projection)
+assert numpy.std(rgba) > 1 and numpy.std(depth) > 0, "the image is blank"
+"""
+
+
+def check_renderer(renderer: str) -> None:
+    """Make sure that a renderer works here.
+
+    Raises:
+        ValueError: there is none of that name.
+        RuntimeError: EGL does not work on this machine.
+    """
+    if renderer not in RENDERERS:
+        raise ValueError(f"renderer must be one of {RENDERERS}, got {renderer!r}")
+    if renderer == "egl":
+        _check_egl()
+
+
+@functools.cache
+def _check_egl() -> None:
+    """In a process of its own: where EGL fails, Bullet ends the process."""
+    probe = subprocess.run(
+        [sys.executable, "-c", _EGL_PROBE], capture_output=True, text=True
+    )
+    if probe.returncode != 0:
+        output = (probe.stdout + probe.stderr).strip().splitlines() or ["no output"]
+        raise RuntimeError(
+            f"renderer='egl' does not work on this machine, use 'tiny' "
+            f"(EGL said: {output[-1]})"
+        )
