@@ -60,6 +60,7 @@ def make(
     num_threads: int | None = None,
     seed: int | None = None,
     device: torch.device | str | int | None = None,
+    max_episode_steps: int | None = None,
 ) -> RobotTaskEnv:
     """Make the environments of an id; see `RobotTaskEnv` for the arguments.
 
@@ -68,14 +69,7 @@ def make(
     Raises:
         ValueError: the id is unknown, or an argument is out of range.
     """
-    if env_id not in _ENVS:
-        close = difflib.get_close_matches(str(env_id), ENV_IDS, n=3)
-        hint = f"did you mean {' or '.join(close)}? " if close else ""
-        raise ValueError(
-            f"unknown environment id {env_id!r}; {hint}accepted are "
-            f"Panda{{{','.join(_TASKS)}}}{{,Joints}}{{,Dense}}-v{{1,3}}"
-        )
-    task, control, reward, version = _ENVS[env_id]
+    task, control, reward, version = _parts(env_id)
     arguments = _V3_ARGUMENTS.get(task, {}) if version == "v3" else {}
     return RobotTaskEnv(
         robot=Panda(
@@ -86,5 +80,27 @@ def make(
         num_threads=num_threads,
         seed=seed,
         device=device,
+        max_episode_steps=max_episode_steps,
         terminate_on_success=version == "v3",
     )
+
+
+def max_episode_steps(env_id: str) -> int:
+    """The number of steps after which an id's episodes are truncated.
+
+    Raises:
+        ValueError: the id is unknown.
+    """
+    return _TASKS[_parts(env_id)[0]].max_episode_steps
+
+
+def _parts(env_id: str) -> tuple[str, str, str, str]:
+    """Task, control, reward and version of an id."""
+    if env_id not in _ENVS:
+        close = difflib.get_close_matches(str(env_id), ENV_IDS, n=3)
+        hint = f"did you mean {' or '.join(close)}? " if close else ""
+        raise ValueError(
+            f"unknown environment id {env_id!r}; {hint}accepted are "
+            f"Panda{{{','.join(_TASKS)}}}{{,Joints}}{{,Dense}}-v{{1,3}}"
+        )
+    return _ENVS[env_id]

@@ -101,6 +101,17 @@ class RobotTaskEnv(EnvBase):
         """The task's pure success function; see `Task.is_success`."""
         return self.task.is_success
 
+    def set_env_seed(self, env: int, seed: int) -> None:
+        """Let environment ``env`` draw what the first one draws under ``seed``.
+
+        For interfaces that seed environments one by one, such as Gymnasium's.
+
+        Raises:
+            ValueError: the seed is negative.
+        """
+        self._streams[env] = (_check_seed(seed), 0)
+        self._episodes[env] = 0
+
     def get_state(self) -> TensorDict:
         """The physical state, from which ``reset(state, set_state=True)`` starts.
 
@@ -197,10 +208,9 @@ class RobotTaskEnv(EnvBase):
         if seed is None:
             # Different in every process, also in those that unpickle this environment.
             seed = secrets.randbits(63)
-        elif operator.index(seed) < 0:
-            raise ValueError(f"seed must be a non-negative integer, got {seed}")
-        self._seed = operator.index(seed)
-        self._episodes = [0] * (self.num_envs or 1)
+        count = self.num_envs or 1
+        self._streams = [(_check_seed(seed), env) for env in range(count)]
+        self._episodes = [0] * count
 
     # ---- parts of a step -----------------------------------------------------------
 
@@ -221,7 +231,7 @@ class RobotTaskEnv(EnvBase):
     def _start_episode(self, env: int) -> None:
         """Put the start of an environment's next episode into the state tensors."""
         simulation = self._simulation
-        rng = np.random.default_rng((self._seed, env, self._episodes[env]))
+        rng = np.random.default_rng((*self._streams[env], self._episodes[env]))
         self._episodes[env] += 1
         self._step_count[env] = 0
         self._goal[env] = torch.as_tensor(self.task.sample_goal(rng))
@@ -353,6 +363,12 @@ class RobotTaskEnv(EnvBase):
 
 def _indices(mask: Tensor) -> list[int]:
     return mask.flatten().nonzero().flatten().tolist()
+
+
+def _check_seed(seed: int) -> int:
+    if operator.index(seed) < 0:
+        raise ValueError(f"seed must be a non-negative integer, got {seed}")
+    return operator.index(seed)
 
 
 def _check_positive(**arguments: int | None) -> None:
