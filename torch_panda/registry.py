@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from torch_panda.bullet import ControlType
-from torch_panda.envs import RobotTaskEnv
+from torch_panda.envs import OnDivergence, RobotTaskEnv
 from torch_panda.robots import Panda
 from torch_panda.tasks import (
     Flip,
@@ -61,6 +61,7 @@ def make(
     seed: int | None = None,
     device: torch.device | str | int | None = None,
     max_episode_steps: int | None = None,
+    on_divergence: OnDivergence = "raise",
 ) -> RobotTaskEnv:
     """Make the environments of an id; see `RobotTaskEnv` for the arguments.
 
@@ -82,6 +83,7 @@ def make(
         device=device,
         max_episode_steps=max_episode_steps,
         terminate_on_success=version == "v3",
+        on_divergence=on_divergence,
     )
 
 

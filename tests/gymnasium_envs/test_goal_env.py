@@ -1,4 +1,4 @@
-"""The single environment: Gymnasium's contract, and the torch environment's episodes."""
+"""One environment: Gymnasium's contract, and the torch environment's episodes."""
 
 import gymnasium
 import numpy as np
@@ -152,9 +152,11 @@ def test_own_task():
     assert [env.step(np.zeros(3))[3] for _ in range(4)] == [False] * 3 + [True]
     env.close()
     assert own.is_closed
-    with torch_panda.make("PandaReach-v1", num_envs=2) as batched:
-        with pytest.raises(ValueError, match=r"must be \[\], got \[2\]"):
-            GoalEnv(batched)
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=2) as batched,
+        pytest.raises(ValueError, match=r"must be \[\], got \[2\]"),
+    ):
+        GoalEnv(batched)
 
 
 def test_render(monkeypatch):

@@ -1,5 +1,7 @@
 """The vector environment gives what SyncVectorEnv gives."""
 
+import itertools
+
 import gymnasium
 import numpy as np
 import pytest
@@ -99,7 +101,7 @@ def test_outputs_are_not_overwritten():
     env = GoalVectorEnv("PandaReach-v1", num_envs=2)
     results = [env.reset(seed=0)[0], *(env.step(np.ones((2, 3)))[0] for _ in range(3))]
     env.close()
-    for first, second in zip(results, results[1:], strict=False):
+    for first, second in itertools.pairwise(results):
         assert not np.array_equal(first["observation"], second["observation"])
 
 
@@ -129,9 +131,11 @@ def test_bad_resets(arguments, error, message):
 def test_bad_arguments():
     with pytest.raises(ValueError, match="Sometimes"):
         GoalVectorEnv("PandaReach-v1", autoreset_mode="Sometimes")
-    with torch_panda.make("PandaReach-v1") as single:
-        with pytest.raises(ValueError, match=r"must be \[num_envs\], got \[\]"):
-            GoalVectorEnv(single)
+    with (
+        torch_panda.make("PandaReach-v1") as single,
+        pytest.raises(ValueError, match=r"must be \[num_envs\], got \[\]"),
+    ):
+        GoalVectorEnv(single)
 
 
 def test_render(monkeypatch):

@@ -7,6 +7,7 @@ from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from torch.nn.utils import parameters_to_vector
 
 import torch_panda
 from tests.gymnasium_envs.equal import assert_equal
@@ -33,16 +34,14 @@ def test_hindsight_trains(make_env):
         env,
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4},
-        learning_starts=180,
+        learning_starts=160,
         batch_size=64,
         policy_kwargs={"net_arch": [32, 32]},
         seed=0,
     )
-    before = [p.detach().clone() for p in model.actor.parameters()]
-    model.learn(300)
-    assert any(
-        (p != old).any() for p, old in zip(model.actor.parameters(), before, strict=True)
-    )
+    before = parameters_to_vector(model.actor.parameters()).detach()
+    model.learn(240)
+    assert not before.equal(parameters_to_vector(model.actor.parameters()).detach())
     assert len(model.ep_info_buffer) >= 3
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer)
     batch = model.replay_buffer.sample(400)
@@ -72,12 +71,8 @@ def test_same_as_dummy_vec_env():
         assert ours.reset_infos == theirs.reset_infos
         towards = observation["desired_goal"] - observation["achieved_goal"]
         action = np.clip(towards * rng.uniform(1, 8), -1, 1).astype(np.float32)
-        (observation, *rest), (expected, *others) = ours.step(action), theirs.step(action)
-        for info in others[-1]:
-            # Gymnasium's wrapper adds it to some infos.
-            assert info.pop("TimeLimit.truncated") in (True, False)
-        for info in rest[-1]:
-            assert info.pop("TimeLimit.truncated") is False
+        observation, *rest = ours.step(action)
+        expected, *others = theirs.step(action)
         assert_equal(rest, others)
         number_of_ends += rest[1]
     ours.close()
@@ -120,7 +115,7 @@ def test_attributes_and_methods():
         env.get_attr("speed")
     env.reset()
     env.set_options({"state": {}})
-    with pytest.raises(ValueError, match="vector_env.reset"):
+    with pytest.raises(ValueError, match=r"vector_env\.reset"):
         env.reset()
     assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     env.close()

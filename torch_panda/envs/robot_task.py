@@ -4,7 +4,7 @@ import functools
 import operator
 import secrets
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ from torch_panda.envs.state import read_state
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
+
+OnDivergence = Literal["raise", "reset"]
 
 
 class RobotTaskEnv(EnvBase):
@@ -44,6 +46,9 @@ class RobotTaskEnv(EnvBase):
         max_episode_steps: steps until ``truncated``; None means the task's number.
         terminate_on_success: whether success ends an episode, as in panda-gym 3; the
             paper's episodes go on.
+        on_divergence: what happens when a step leaves an environment in a state that is
+            not finite. It is put at the start of its next episode; then "raise" raises
+            `BulletError`, while "reset" lets the step end there, ``truncated``.
 
     Raises:
         ValueError: an argument is out of range.
@@ -62,9 +67,15 @@ class RobotTaskEnv(EnvBase):
         device: torch.device | str | int | None = None,
         max_episode_steps: int | None = None,
         terminate_on_success: bool = False,
+        on_divergence: OnDivergence = "raise",
     ) -> None:
         _check_positive(num_envs=num_envs, num_threads=num_threads)
         _check_positive(max_episode_steps=max_episode_steps)
+        if on_divergence not in get_args(OnDivergence):
+            raise ValueError(
+                f"on_divergence must be one of {get_args(OnDivergence)}, "
+                f"got {on_divergence!r}"
+            )
         batch_size = () if num_envs is None else (num_envs,)
         super().__init__(
             device="cpu" if device is None else device, batch_size=batch_size
@@ -74,6 +85,7 @@ class RobotTaskEnv(EnvBase):
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
+        self.on_divergence = on_divergence
         self._make_specs()
         self._constructor_seed = seed
         self._set_seed(seed)
@@ -157,6 +169,7 @@ class RobotTaskEnv(EnvBase):
             device=self.device,
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
+            on_divergence=self.on_divergence,
         )
         return build, ()
 
@@ -170,6 +183,8 @@ class RobotTaskEnv(EnvBase):
         self._step_count += 1 if stepped is None else stepped
         envs = None if stepped is None else _indices(stepped)
         self._simulation.step(self.robot.control_type, envs)
+        if diverged := self._simulation.diverged():
+            self._recover(diverged)
 
         observation = self._observe()
         reward = self.compute_reward(
@@ -198,10 +213,7 @@ class RobotTaskEnv(EnvBase):
             self._start_episode(env)
         for key, value in given.items():
             state[key][envs] = value
-        if self._simulation.scene.targets:
-            target_pose = self.task.target_pose(self._goal[envs])
-            self._simulation.target_pose[envs] = target_pose
-        self._simulation.reset(envs)
+        self._place(envs)
         return self._make_tensordict(self._observe())
 
     def _set_seed(self, seed: int | None) -> None:
@@ -244,6 +256,26 @@ class RobotTaskEnv(EnvBase):
                 self.task.sample_objects(rng), dtype=torch.float64
             )
             simulation.object_velocity[env] = 0.0
+
+    def _place(self, envs: list[int]) -> None:
+        """Put robots, objects and markers where the state tensors say."""
+        if self._simulation.scene.targets:
+            target_pose = self.task.target_pose(self._goal[envs])
+            self._simulation.target_pose[envs] = target_pose
+        self._simulation.reset(envs)
+
+    def _recover(self, envs: list[int]) -> None:
+        """Start the next episode of environments whose physics has diverged."""
+        for env in envs:
+            self._simulation.rebuild(env)
+            self._start_episode(env)
+        self._place(envs)
+        if self.on_divergence == "raise":
+            raise BulletError(
+                f"the physics of environments {envs} diverged: their state was not "
+                f"finite; they are at the start of their next episode"
+            )
+        self._step_count[envs] = self.max_episode_steps
 
     def _observe(self) -> dict[str, Tensor]:
         """Observation, goals, success and ends, (n, ...), in new tensors."""
@@ -329,14 +361,15 @@ class RobotTaskEnv(EnvBase):
             raise ValueError(
                 f"the action must be on device {self.device}, got {action.device}"
             )
-        action = action.detach().to("cpu", torch.float32).reshape(-1, shape[-1])
+        action = action.detach().to("cpu").reshape(-1, shape[-1])
         finite = action.isfinite().all(dim=1)
         if not finite.all():
             env = int((~finite).nonzero()[0])
             raise ValueError(
                 f"the action of environment {env} is not finite: {action[env].tolist()}"
             )
-        return action.clamp(-1.0, 1.0)
+        # Clipped first: what is large in float64 would be infinite in float32.
+        return action.clamp(-1.0, 1.0).float()
 
     def _read_mask(self, tensordict: TensorDictBase, key: str) -> Tensor | None:
         """A mask of environments, (n, 1) bool; None where there is none."""

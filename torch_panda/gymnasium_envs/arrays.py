@@ -17,7 +17,7 @@ Observation = dict[str, NDArray[np.float32]]
 _KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
-def observation_space(env: RobotTaskEnv) -> spaces.Dict:
+def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     """The space of one environment's observation and goals, float32."""
     spec = env.observation_spec
     return spaces.Dict(
@@ -25,7 +25,7 @@ def observation_space(env: RobotTaskEnv) -> spaces.Dict:
     )
 
 
-def action_space(env: RobotTaskEnv) -> spaces.Box:
+def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     """The space of one environment's action, float32 in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (env.robot.action_dim,))
 
