@@ -214,7 +214,11 @@ class RobotTaskEnv(EnvBase):
         for key, value in given.items():
             state[key][envs] = value
         self._place(envs)
-        return self._make_tensordict(self._observe())
+        observation = self._observe()
+        for key in ("terminated", "truncated", "done"):
+            # A given state may be an episode's last; the next step ends it again.
+            observation[key][envs] = False
+        return self._make_tensordict(observation)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
