@@ -3,6 +3,7 @@
 import functools
 import operator
 import secrets
+import sys
 from types import TracebackType
 from typing import Any, Literal, get_args
 
@@ -52,6 +53,8 @@ class RobotTaskEnv(EnvBase):
 
     Raises:
         ValueError: an argument is out of range.
+        TypeError: an argument has a wrong type.
+        RuntimeError: torch knows no such device.
     """
 
     _supports_set_state = True
@@ -410,5 +413,7 @@ def _check_seed(seed: int) -> int:
 
 def _check_positive(**arguments: int | None) -> None:
     for name, value in arguments.items():
-        if value is not None and operator.index(value) < 1:
-            raise ValueError(f"{name} must be at least 1 or None, got {value}")
+        if value is not None and not 1 <= operator.index(value) <= sys.maxsize:
+            raise ValueError(
+                f"{name} must be None or from 1 to {sys.maxsize}, got {value}"
+            )

@@ -44,14 +44,24 @@ def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> TensorDict:
     """The state to start from that the options of a reset give: maybe empty.
 
     Raises:
-        ValueError: there are other options.
+        ValueError: there are other options, or a value is not for all environments.
+        TypeError: the state is no mapping of names to arrays of numbers.
     """
     if unknown := set(options) - {"state"}:
-        raise ValueError(f"accepted options are state, got {', '.join(unknown)}")
-    state = {
-        key: torch.as_tensor(value) for key, value in options.get("state", {}).items()
-    }
-    return TensorDict(state, batch_size=env.batch_size)
+        raise ValueError(f"accepted options are state, got {sorted(map(str, unknown))}")
+    given = options.get("state", {})
+    if not isinstance(given, Mapping | TensorDict):
+        raise TypeError(f"the state must be a mapping to arrays, got {given!r}")
+    state = TensorDict(batch_size=env.batch_size)
+    for key, value in given.items():
+        tensor = torch.from_numpy(np.array(value))
+        if tensor.shape[: env.batch_dims] != env.batch_size:
+            raise ValueError(
+                f"{key} must have shape ({env.num_envs}, ...), "
+                f"got {tuple(tensor.shape)}"
+            )
+        state[key] = tensor
+    return state
 
 
 class GoalFunctions:

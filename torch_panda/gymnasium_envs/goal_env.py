@@ -66,6 +66,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Raises:
             ValueError: an option is unknown, or the state is wrong.
+            TypeError: the state is no mapping of names to arrays of numbers.
         """
         state = arrays.read_state(options or {}, self.torch_env)
         super().reset(seed=seed)

@@ -88,8 +88,9 @@ class GoalVectorEnv(
                 ``state``, as `RobotTaskEnv.get_state` returns it, to start from.
 
         Raises:
-            ValueError: an option is unknown, has a wrong shape or type, or the number
-                of seeds is wrong.
+            ValueError: an option is unknown or has a wrong shape, or the number of
+                seeds is wrong.
+            TypeError: an option or a seed has a wrong type.
         """
         rest = dict(options or {})
         mask = self._read_mask(rest.pop("reset_mask", None))
