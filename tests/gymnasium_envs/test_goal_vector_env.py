@@ -1,5 +1,6 @@
 """The vector environment gives what SyncVectorEnv gives."""
 
+import gc
 import itertools
 
 import gymnasium
@@ -128,6 +129,7 @@ def test_bad_resets(arguments, error, message):
     env.close()
 
 
+@pytest.mark.filterwarnings("error")
 def test_bad_arguments():
     with pytest.raises(ValueError, match="Sometimes"):
         GoalVectorEnv("PandaReach-v1", autoreset_mode="Sometimes")
@@ -136,6 +138,7 @@ def test_bad_arguments():
         pytest.raises(ValueError, match=r"must be \[num_envs\], got \[\]"),
     ):
         GoalVectorEnv(single)
+    gc.collect()
 
 
 def test_render(monkeypatch):

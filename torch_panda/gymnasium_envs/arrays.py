@@ -37,7 +37,7 @@ def observation(tensordict: TensorDictBase) -> Observation:
 
 def action(values: ArrayLike) -> Tensor:
     """An action of any real type; the environment checks the rest."""
-    return torch.from_numpy(np.array(values, dtype=np.float64))
+    return torch.from_numpy(np.asarray(values).astype(np.float64))
 
 
 def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> TensorDict:
@@ -54,7 +54,7 @@ def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> TensorDict:
         raise TypeError(f"the state must be a mapping to arrays, got {given!r}")
     state = TensorDict(batch_size=env.batch_size)
     for key, value in given.items():
-        tensor = torch.from_numpy(np.array(value))
+        tensor = torch.from_numpy(np.asarray(value).copy())
         if tensor.shape[: env.batch_dims] != env.batch_size:
             raise ValueError(
                 f"{key} must have shape ({env.num_envs}, ...), "
@@ -114,7 +114,7 @@ class GoalFunctions:
 
 
 def _tensor(goal: ArrayLike) -> Tensor:
-    return torch.from_numpy(np.array(goal, dtype=np.float32))
+    return torch.from_numpy(np.asarray(goal).astype(np.float32))
 
 
 def _array(values: Tensor) -> NDArray[Any]:

@@ -67,20 +67,21 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: an option is unknown, or the state is wrong.
             TypeError: the state is no mapping of names to arrays of numbers.
+            gymnasium.error.Error: the seed is negative.
         """
         state = arrays.read_state(options or {}, self.torch_env)
         super().reset(seed=seed)
         if seed is not None:
             self.torch_env.set_env_seed(0, seed)
-        start = self.torch_env.reset(state, set_state=True)
+        start = self.torch_env._reset(state, set_state=True)
         return arrays.observation(start), {"is_success": start["success"].item()}
 
     def step(
         self, action: ArrayLike
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one step; see `RobotTaskEnv` for what is raised."""
-        taken = TensorDict({"action": arrays.action(action)})
-        after = self.torch_env.step(taken)["next"]
+        # The method that torchrl's `step` calls, without its checks of specs.
+        after = self.torch_env._step(TensorDict({"action": arrays.action(action)}))
         return (
             arrays.observation(after),
             after["reward"].item(),

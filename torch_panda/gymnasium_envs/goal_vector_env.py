@@ -54,6 +54,7 @@ class GoalVectorEnv(
         render_mode: str | None = None,
         **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
     ) -> None:
+        self.closed = True  # there is nothing to close until all is built
         self._autoreset_mode = AutoresetMode(autoreset_mode)
         if isinstance(env, str):
             env = make(env, num_envs=num_envs, **arguments)
@@ -73,6 +74,7 @@ class GoalVectorEnv(
         # Which environments have to be reset: (num_envs,).
         self._ended = self._all
         self._was_reset = False
+        self.closed = False
 
     def reset(
         self,
@@ -91,6 +93,7 @@ class GoalVectorEnv(
             ValueError: an option is unknown or has a wrong shape, or the number of
                 seeds is wrong.
             TypeError: an option or a seed has a wrong type.
+            gymnasium.error.Error: the seed is negative.
         """
         rest = dict(options or {})
         mask = self._read_mask(rest.pop("reset_mask", None))
@@ -163,8 +166,7 @@ class GoalVectorEnv(
     ) -> TensorDict:
         """Reset some environments; what all of them observe then.
 
-        This calls the method that torchrl calls, because torchrl's own `reset` wants
-        to be given what the other environments observed.
+        torchrl's own `reset` would have to be given what the others observed.
         """
         start = TensorDict() if state is None else state
         return self.torch_env._reset(start.set("_reset", mask), set_state=True)
