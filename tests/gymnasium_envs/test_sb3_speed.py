@@ -3,7 +3,9 @@
 ``OMP_NUM_THREADS=1 pytest -m slow -s tests/gymnasium_envs/test_sb3_speed.py``
 """
 
+import os
 import statistics
+import sys
 import time
 
 import gymnasium
@@ -16,7 +18,7 @@ from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
 
 pytestmark = pytest.mark.slow
 NUM_ENVS = 16
-STEPS = 100
+STEPS = 50
 ROUNDS = 5
 
 
@@ -35,31 +37,47 @@ def make_model(env):
     )
 
 
-def time_collection(model):
-    start = time.perf_counter()
+def cpu_seconds(pids):
+    """CPU time that processes have used so far."""
+    ticks = 0
+    for pid in pids:
+        with open(f"/proc/{pid}/stat") as stat:
+            fields = stat.read().rsplit(")", 1)[1].split()
+        ticks += int(fields[11]) + int(fields[12])  # of the user and of the system
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def measure_collection(model, pids):
+    """Steps per second, and CPU time of a step [ms]."""
+    start, used = time.perf_counter(), cpu_seconds(pids)
     model.learn(NUM_ENVS * STEPS, reset_num_timesteps=False)
-    return NUM_ENVS * STEPS / (time.perf_counter() - start)
+    seconds, used = time.perf_counter() - start, cpu_seconds(pids) - used
+    return NUM_ENVS * STEPS / seconds, 1e3 * used / (NUM_ENVS * STEPS)
 
 
-def test_faster_than_panda_gym_in_processes():
-    envs = {
-        "SB3VecEnv": SB3VecEnv("PandaPush-v3", num_envs=NUM_ENVS),
-        "SubprocVecEnv of panda-gym": SubprocVecEnv([make_panda_gym] * NUM_ENVS),
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_cheaper_than_panda_gym_in_processes():
+    ours = SB3VecEnv("PandaPush-v3", num_envs=NUM_ENVS)
+    theirs = SubprocVecEnv([make_panda_gym] * NUM_ENVS)
+    workers = [process.pid for process in theirs.processes]
+    runs = {
+        "SB3VecEnv": (make_model(ours), [os.getpid()]),
+        "SubprocVecEnv of panda-gym": (make_model(theirs), [os.getpid(), *workers]),
     }
-    models = {name: make_model(env) for name, env in envs.items()}
-    speeds = {name: [] for name in envs}
+    results = {name: [] for name in runs}
     for _ in range(ROUNDS + 1):
-        for name, model in models.items():
-            speeds[name].append(time_collection(model))
-    for env in envs.values():
-        env.close()
-    medians = {}
-    for name, (_, *values) in speeds.items():
-        medians[name] = statistics.median(values)
+        for name, run in runs.items():
+            results[name].append(measure_collection(*run))
+    ours.close()
+    theirs.close()
+    costs = []
+    for name, (_, *values) in results.items():
+        speeds, cpu_times = zip(*values, strict=True)
+        costs.append(statistics.median(cpu_times))
         print(
-            f"{name}: {medians[name]:.0f} steps/s "
-            f"({min(values):.0f} to {max(values):.0f})"
+            f"{name}: {statistics.median(speeds):.0f} steps/s ({min(speeds):.0f} to "
+            f"{max(speeds):.0f}), {costs[-1]:.2f} ms of CPU time a step"
         )
-    ours, theirs = medians.values()
-    print(f"ratio: {ours / theirs:.2f}")
-    assert ours > 1.2 * theirs
+    # Steps per second follow only where nothing else runs: 16 processes get more of a
+    # busy machine than two threads.
+    assert costs[1] > 1.2 * costs[0]
