@@ -2,7 +2,8 @@
 
 from torch_panda.bullet import BulletError, Camera
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.registry import ENV_IDS, make
+from torch_panda.gymnasium_envs import register_envs
+from torch_panda.registry import ENV_IDS, make, max_episode_steps
 from torch_panda.robots import Panda, Robot
 from torch_panda.tasks import (
     Flip,
@@ -29,4 +30,7 @@ __all__ = [
     "Stack",
     "Task",
     "make",
+    "max_episode_steps",
 ]
+
+register_envs()

@@ -70,14 +70,7 @@ def make(
     Raises:
         ValueError: the id is unknown, or an argument is out of range.
     """
-    if env_id not in _ENVS:
-        close = difflib.get_close_matches(str(env_id), ENV_IDS, n=3)
-        hint = f"did you mean {' or '.join(close)}? " if close else ""
-        raise ValueError(
-            f"unknown environment id {env_id!r}; {hint}accepted are "
-            f"Panda{{{','.join(_TASKS)}}}{{,Joints}}{{,Dense}}-v{{1,3}}"
-        )
-    task, control, reward, version = _ENVS[env_id]
+    task, control, reward, version = _parts(env_id)
     arguments = _V3_ARGUMENTS.get(task, {}) if version == "v3" else {}
     return RobotTaskEnv(
         robot=Panda(
@@ -90,3 +83,24 @@ def make(
         device=device,
         **({"terminate_on_success": version == "v3"} | options),
     )
+
+
+def max_episode_steps(env_id: str) -> int:
+    """The number of steps after which an id's episodes are truncated.
+
+    Raises:
+        ValueError: the id is unknown.
+    """
+    return _TASKS[_parts(env_id)[0]].max_episode_steps
+
+
+def _parts(env_id: str) -> tuple[str, str, str, str]:
+    """Task, control, reward and version of an id."""
+    if env_id not in _ENVS:
+        close = difflib.get_close_matches(str(env_id), ENV_IDS, n=3)
+        hint = f"did you mean {' or '.join(close)}? " if close else ""
+        raise ValueError(
+            f"unknown environment id {env_id!r}; {hint}accepted are "
+            f"Panda{{{','.join(_TASKS)}}}{{,Joints}}{{,Dense}}-v{{1,3}}"
+        )
+    return _ENVS[env_id]

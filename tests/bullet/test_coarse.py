@@ -75,7 +75,7 @@ def test_the_arm_looks_the_same_from_afar():
     for cell in (0.0, 0.013):
         with VisualClient(mesh_cell=cell) as client:
             arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
-            client.set_joints(arm, (1, 3, 5), (0.41, -1.85, 2.26))
+            client.set_joints(arm, (1, 3, 5), (0.41, -1.85, 2.26), (0.0,) * 3)
             image = client.draw(camera, segmentation=True)
             images.append((image.rgb.astype(int), image.segmentation == arm))
     (fine, is_arm), (coarse, is_coarse_arm) = images

@@ -185,6 +185,23 @@ def test_bad_state_changes_nothing(env, key, change, message):
     assert (env.get_state() == state).all()
 
 
+@pytest.mark.parametrize(
+    ("env_id", "end"), [("PandaReach-v1", "truncated"), ("PandaReach-v3", "terminated")]
+)
+def test_last_state_of_an_episode(env_id, end):
+    with torch_panda.make(env_id, num_envs=2, seed=0) as env:
+        td = env.reset()
+        td["action"] = torch.zeros(2, 3)
+        env.step(td)
+        state = env.get_state()
+        state["step_count"][:] = 50
+        state["desired_goal"] = env.step(td)["next", "achieved_goal"].double()
+        td = env.reset(state, set_state=True)
+        assert not td["done"].any()
+        td = env.step(td.set("action", torch.zeros(2, 3)))["next"]
+        assert td[end].all()
+
+
 def test_unbatched():
     with torch_panda.make("PandaStack-v1", seed=0) as env:
         assert env.batch_size == torch.Size([])

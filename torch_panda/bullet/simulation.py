@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from ctypes import memmove
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -89,12 +90,14 @@ class VectorSimulation:
             num_threads = os.cpu_count() or 1
         self.n_substeps = n_substeps
         self.dt = timestep * n_substeps
+        self._make_client = partial(PhysicsClient, timestep=timestep, gravity=gravity)
+        self._build = build
         self._clients: list[PhysicsClient] = []
         self._built_worlds: list[BuiltWorld] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
         try:
             for _ in range(num_envs):
-                client = PhysicsClient(timestep=timestep, gravity=gravity)
+                client = self._make_client()
                 self._clients.append(client)
                 scene = build(client)
                 self._built_worlds.append(BuiltWorld(client))
@@ -159,6 +162,26 @@ class VectorSimulation:
             WorkerError: Bullet failed in one client; it names the client.
         """
         self._pool.run(self._reset_one, envs)
+
+    def diverged(self) -> list[int]:
+        """The clients whose state is not finite."""
+        state = (
+            self.joint_position,
+            self.ee_velocity,
+            self.object_pose.flatten(1),
+            self.object_velocity.flatten(1),
+        )
+        finite = torch.cat(state, dim=1).isfinite()
+        if finite.all():
+            return []
+        return (~finite).any(dim=1).nonzero().flatten().tolist()
+
+    def rebuild(self, env: int) -> None:
+        """Replace a client by a new one: no reset cures Bullet of a NaN."""
+        self._clients[env].close()
+        client = self._clients[env] = self._make_client()
+        self._build(client)
+        self._built_worlds[env] = BuiltWorld(client)
 
     def close(self) -> None:
         """Free all clients and end the threads. Closing again does nothing."""

@@ -1,5 +1,5 @@
 """The environment that joins a robot and a task."""
 
-from torch_panda.envs.robot_task import RobotTaskEnv
+from torch_panda.envs.robot_task import OnDivergence, RobotTaskEnv
 
-__all__ = ["RobotTaskEnv"]
+__all__ = ["OnDivergence", "RobotTaskEnv"]

@@ -3,9 +3,10 @@
 import functools
 import operator
 import secrets
+import sys
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -30,6 +31,8 @@ from torch_panda.envs.twin import VisualTwin, segmentation_ids
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
+
+OnDivergence = Literal["raise", "reset"]
 
 
 class RobotTaskEnv(EnvBase):
@@ -67,10 +70,14 @@ class RobotTaskEnv(EnvBase):
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         sensors: which of "wrist_force_torque", "finger_contact" and "joint_torque" to
             observe, each under its own key, float32; see `Touch`.
+        on_divergence: what happens when a step leaves an environment in a state that is
+            not finite. It is put at the start of its next episode; then "raise" raises
+            `BulletError`, while "reset" lets the step end there, ``truncated``.
 
     Raises:
         ValueError: an argument is out of range.
-        RuntimeError: EGL is asked for and does not work here.
+        TypeError: an argument has a wrong type.
+        RuntimeError: torch knows no such device, or EGL is asked for and does not work.
     """
 
     _supports_set_state = True
@@ -94,6 +101,7 @@ class RobotTaskEnv(EnvBase):
         segmentation: bool = False,
         renderer: RendererName = "tiny",
         sensors: Sequence[str] = (),
+        on_divergence: OnDivergence = "raise",
     ) -> None:
         self._options = SenseOptions(
             from_pixels=from_pixels,
@@ -108,6 +116,11 @@ class RobotTaskEnv(EnvBase):
         self._options.check(robot)
         _check_positive(num_envs=num_envs, num_threads=num_threads)
         _check_positive(max_episode_steps=max_episode_steps)
+        if on_divergence not in get_args(OnDivergence):
+            raise ValueError(
+                f"on_divergence must be one of {get_args(OnDivergence)}, "
+                f"got {on_divergence!r}"
+            )
         batch_size = () if num_envs is None else (num_envs,)
         super().__init__(
             device="cpu" if device is None else device, batch_size=batch_size
@@ -117,6 +130,7 @@ class RobotTaskEnv(EnvBase):
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
+        self.on_divergence = on_divergence
         self._constructor_seed = seed
         self._set_seed(seed)
         count = num_envs or 1
@@ -154,6 +168,17 @@ class RobotTaskEnv(EnvBase):
         ``object1`` and ``object2``, unless the task's looks name bodies otherwise.
         """
         return segmentation_ids(self._build_scene)
+
+    def set_env_seed(self, env: int, seed: int) -> None:
+        """Let environment ``env`` draw what the first one draws under ``seed``.
+
+        For interfaces that seed environments one by one, such as Gymnasium's.
+
+        Raises:
+            ValueError: the seed is negative.
+        """
+        self._streams[env] = (_check_seed(seed), 0)
+        self._episodes[env] = 0
 
     def get_state(self) -> TensorDict:
         """The physical state, from which ``reset(state, set_state=True)`` starts.
@@ -238,6 +263,7 @@ class RobotTaskEnv(EnvBase):
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
             **vars(self._options),
+            on_divergence=self.on_divergence,
         )
         return build, ()
 
@@ -251,6 +277,8 @@ class RobotTaskEnv(EnvBase):
         self._step_count += 1 if stepped is None else stepped
         envs = None if stepped is None else _indices(stepped)
         self._simulation.step(self.robot.control_type, envs)
+        if diverged := self._simulation.diverged():
+            self._recover(diverged)
         for sense in self._senses:
             sense.after_step(range(len(self._goal)) if envs is None else envs)
 
@@ -281,28 +309,29 @@ class RobotTaskEnv(EnvBase):
             self._start_episode(env)
         for key, value in given.items():
             state[key][envs] = value
-        if self._simulation.scene.targets:
-            target_pose = self.task.target_pose(self._goal[envs])
-            self._simulation.target_pose[envs] = target_pose
-        self._simulation.reset(envs)
-        for sense in self._senses:
-            sense.after_reset(envs)
-        return self._make_tensordict(self._observe())
+        self._place(envs)
+        observation = self._observe()
+        for key in ("terminated", "truncated", "done"):
+            # A given state may be an episode's last; the next step ends it again.
+            observation[key][envs] = False
+        return self._make_tensordict(observation)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             # Different in every process, also in those that unpickle this environment.
             seed = secrets.randbits(63)
-        elif operator.index(seed) < 0:
-            raise ValueError(f"seed must be a non-negative integer, got {seed}")
-        self._seed = operator.index(seed)
-        self._episodes = [0] * (self.num_envs or 1)
+        count = self.num_envs or 1
+        self._streams = [(_check_seed(seed), env) for env in range(count)]
+        self._episodes = [0] * count
 
     # ---- parts of a step -----------------------------------------------------------
 
     def _build_scene(self, client: PhysicsClient) -> Scene:
         robot = self.robot.build(client)
         bodies = self.task.build(client)
+        if "wrist_force_torque" in self._options.sensors:
+            assert self.robot.wrist_joint is not None  # checked with the options
+            client.enable_wrench_sensor(robot, self.robot.wrist_joint)
         return Scene(
             robot=robot,
             joints=tuple(j.index for j in client.joints(robot) if j.is_movable),
@@ -325,7 +354,7 @@ class RobotTaskEnv(EnvBase):
     def _start_episode(self, env: int) -> None:
         """Put the start of an environment's next episode into the state tensors."""
         simulation = self._simulation
-        rng = np.random.default_rng((self._seed, env, self._episodes[env]))
+        rng = np.random.default_rng((*self._streams[env], self._episodes[env]))
         self._episodes[env] += 1
         self._step_count[env] = 0
         self._goal[env] = torch.as_tensor(self.task.sample_goal(rng))
@@ -338,6 +367,28 @@ class RobotTaskEnv(EnvBase):
                 self.task.sample_objects(rng), dtype=torch.float64
             )
             simulation.object_velocity[env] = 0.0
+
+    def _place(self, envs: list[int]) -> None:
+        """Put robots, objects and markers where the state tensors say."""
+        if self._simulation.scene.targets:
+            target_pose = self.task.target_pose(self._goal[envs])
+            self._simulation.target_pose[envs] = target_pose
+        self._simulation.reset(envs)
+        for sense in self._senses:
+            sense.after_reset(envs)
+
+    def _recover(self, envs: list[int]) -> None:
+        """Start the next episode of environments whose physics has diverged."""
+        for env in envs:
+            self._simulation.rebuild(env)
+            self._start_episode(env)
+        self._place(envs)
+        if self.on_divergence == "raise":
+            raise BulletError(
+                f"the physics of environments {envs} diverged: their state was not "
+                f"finite; they are at the start of their next episode"
+            )
+        self._step_count[envs] = self.max_episode_steps
 
     def _observe(self) -> dict[str, Tensor]:
         """Observation, goals, success and ends, (n, ...), in new tensors."""
@@ -432,13 +483,14 @@ class RobotTaskEnv(EnvBase):
             raise ValueError(
                 f"the action must be on device {self.device}, got {action.device}"
             )
-        action = action.detach().to("cpu", torch.float32).reshape(-1, shape[-1])
-        if not np.isfinite(action.numpy()).all():
+        action = action.detach().to("cpu").reshape(-1, shape[-1])
+        if not action.isfinite().all():
             env = int((~action.isfinite()).any(dim=1).nonzero()[0])
             raise ValueError(
                 f"the action of environment {env} is not finite: {action[env].tolist()}"
             )
-        return action.clamp(-1.0, 1.0)
+        # Clipped first: what is large in float64 would be infinite in float32.
+        return action.clamp(-1.0, 1.0).float()
 
     def _read_mask(self, tensordict: TensorDictBase, key: str) -> Tensor | None:
         """A mask of environments, (n, 1) bool; None where there is none."""
@@ -468,7 +520,15 @@ def _indices(mask: Tensor) -> list[int]:
     return mask.flatten().nonzero().flatten().tolist()
 
 
+def _check_seed(seed: int) -> int:
+    if operator.index(seed) < 0:
+        raise ValueError(f"seed must be a non-negative integer, got {seed}")
+    return operator.index(seed)
+
+
 def _check_positive(**arguments: int | None) -> None:
     for name, value in arguments.items():
-        if value is not None and operator.index(value) < 1:
-            raise ValueError(f"{name} must be at least 1 or None, got {value}")
+        if value is not None and not 1 <= operator.index(value) <= sys.maxsize:
+            raise ValueError(
+                f"{name} must be None or from 1 to {sys.maxsize}, got {value}"
+            )

@@ -45,11 +45,6 @@ class Touch:
             sensor: torch.zeros(simulation.num_envs, *shapes[sensor])
             for sensor in sensors
         }
-        if "wrist_force_torque" in sensors:
-            assert robot.wrist_joint is not None
-            body = simulation.scene.robot
-            for client in simulation.clients:
-                client.enable_wrench_sensor(body, robot.wrist_joint)
 
     def spec(self, batch: torch.Size, device: torch.device) -> dict[str, TensorSpec]:
         """Specs of what is observed."""

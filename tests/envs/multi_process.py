@@ -1,0 +1,47 @@
+"""What spawned workers build: batched environments that report on their threads."""
+
+import functools
+import threading
+
+import torch
+from torchrl.data import Unbounded
+from torchrl.envs import Transform, TransformedEnv
+
+import torch_panda
+
+NUM_ENVS = 2  # of each worker
+
+
+class ReportThreads(Transform):
+    """Adds the number of this process's stepping threads and of torch's threads."""
+
+    def _report(self, tensordict):
+        names = [thread.name for thread in threading.enumerate()]
+        own = sum(name.startswith("torch_panda") for name in names)
+        report = torch.tensor([own, torch.get_num_threads()])
+        return tensordict.set("threads", report.repeat(*tensordict.batch_size, 1))
+
+    def _step(self, tensordict, next_tensordict):
+        return self._report(next_tensordict)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._report(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec):
+        shape = (*observation_spec.shape, 2)
+        observation_spec["threads"] = Unbounded(shape, dtype=torch.int64)
+        return observation_spec
+
+
+def _make(num_threads):
+    env = torch_panda.make("PandaReach-v1", num_envs=NUM_ENVS, num_threads=num_threads)
+    return TransformedEnv(env, ReportThreads())
+
+
+make_env = functools.partial(_make, num_threads=2)
+
+
+def go_for_the_goal(tensordict):
+    """A deterministic policy."""
+    towards = tensordict["desired_goal"] - tensordict["achieved_goal"]
+    return tensordict.set("action", (5 * towards).clamp(-1, 1))

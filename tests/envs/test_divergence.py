@@ -1,0 +1,107 @@
+"""Physics that diverges is noticed, named, and left behind."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+
+
+def make(on_divergence):
+    return torch_panda.make(
+        "PandaPush-v1", num_envs=3, num_threads=2, seed=0, on_divergence=on_divergence
+    )
+
+
+@pytest.fixture(params=["raise", "reset"])
+def env(request):
+    with make(request.param) as env:
+        yield env
+
+
+def blow_up(env, index, body):
+    """Give a body a velocity whose square overflows, behind the environment's back."""
+    simulation = env._simulation
+    client, scene = simulation._clients[index], simulation.scene
+    if body == "object":
+        (cube,) = scene.objects
+        client.set_base(cube, (0, 0, 0.02), (0, 0, 0, 1), (1e300, 0, 0), (0, 0, 0))
+    else:
+        client.set_joint(scene.robot, scene.joints[1], 0.4, 1e300)
+
+
+def step(env):
+    return env.step(TensorDict({"action": torch.zeros(3, 3)}, batch_size=[3]))["next"]
+
+
+@pytest.mark.parametrize("body", ["object", "robot"])
+def test_divergence(env, body):
+    with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as other:
+        for e in (env, other):
+            e.reset()
+            step(e)
+        blow_up(env, 1, body)
+        expected = step(other)
+        if env.on_divergence == "raise":
+            with pytest.raises(torch_panda.BulletError, match=r"ments \[1\] div"):
+                step(env)
+        else:
+            after = step(env)
+            for key, value in after.items():
+                assert value.isfinite().all(), key
+                assert torch.equal(value[::2], expected[key][::2]), key
+            ends = ("done", "truncated", "terminated")
+            assert [after[key][1].item() for key in ends] == [True, True, False]
+        # The diverged environment is at the start of its next episode.
+        mask = torch.tensor([[False], [True], [False]])
+        start = other.reset(expected.clone().set("_reset", mask))
+        state = env.get_state()
+        assert torch.equal(state["desired_goal"][1].float(), start["desired_goal"][1])
+        count = 0 if env.on_divergence == "raise" else 50
+        assert state["step_count"].flatten().tolist() == [2, count, 2]
+
+
+def test_nothing_of_it_is_left(env):
+    torch.manual_seed(0)
+    env.reset()
+    blow_up(env, 1, "object")
+    if env.on_divergence == "raise":
+        with pytest.raises(torch_panda.BulletError):
+            step(env)
+    else:
+        step(env)
+    with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as other:
+        for _ in range(2):
+            other.reset()
+        td = {"own": env.reset(), "other": other.reset()}
+        for _ in range(30):
+            action = torch.rand(3, 3) * 2 - 1
+            assert torch.equal(
+                env.step(td["own"].set("action", action))["next", "observation"][1],
+                other.step(td["other"].set("action", action))["next", "observation"][1],
+            )
+
+
+def test_collection_goes_on():
+    with make("reset") as env:
+        start = env.reset()
+        blow_up(env, 2, "object")
+        rollout = env.rollout(
+            20, break_when_any_done=False, auto_reset=False, tensordict=start
+        )
+    assert rollout["next", "observation"].isfinite().all()
+    assert rollout["next", "done"][:, 0].flatten().tolist() == [False, False, True]
+    assert not rollout["next", "done"][:, 1:].any()
+
+
+def test_unknown_option():
+    with pytest.raises(ValueError, match="on_divergence must be one of"):
+        torch_panda.make("PandaReach-v1", on_divergence="ignore")
+
+
+def test_states_that_would_diverge_are_refused(env):
+    env.reset()
+    state = env.get_state()
+    state["object_velocity"][2, 0, 0] = 1e300
+    with pytest.raises(ValueError, match=r"object_velocity of environment 2 .* 1e"):
+        env.reset(state, set_state=True)

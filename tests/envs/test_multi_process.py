@@ -1,0 +1,101 @@
+"""Threads, seeds and deaths in worker processes."""
+
+import os
+import signal
+import time
+
+import pytest
+import torch
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import ParallelEnv, SerialEnv
+
+from tests.envs.multi_process import NUM_ENVS, go_for_the_goal, make_env
+from torch_panda.workers import name_dead_workers
+
+STEPS = 5
+PATIENCE = 60  # [s], within which a death must be noticed; torchrl's timeout is hours
+
+
+def kill(process):
+    os.kill(process.pid, signal.SIGKILL)
+    return process.pid, time.monotonic()
+
+
+def check_threads(data):
+    """Each worker has the stepping threads it was given, and one torch thread."""
+    assert (data["next", "threads"] == torch.tensor([2, 1])).all()
+
+
+def goals(data):
+    return {tuple(goal) for goal in data["desired_goal"].reshape(-1, 3).tolist()}
+
+
+def test_parallel_env():
+    env = ParallelEnv(2, make_env, mp_start_method="spawn")
+    serial = SerialEnv(2, make_env)
+    rollouts = []
+    for e in (env, serial):
+        e.set_seed(0)
+        rollouts.append(e.rollout(STEPS, go_for_the_goal))
+    serial.close()
+    check_threads(rollouts[0])
+    # The workers draw what their seeds say, in every run and in any process.
+    for key in ("desired_goal", ("next", "observation")):
+        assert torch.equal(rollouts[0][key], rollouts[1][key])
+    assert len(goals(rollouts[0])) == 2 * NUM_ENVS
+
+    _, start = kill(env._workers[1])
+    with pytest.raises(RuntimeError, match="worker 1 dead"):
+        env.rollout(STEPS)
+    with pytest.raises(RuntimeError, match="worker 1"):
+        env.close()
+    assert time.monotonic() - start < PATIENCE
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [MultiSyncCollector, pytest.param(MultiAsyncCollector, marks=pytest.mark.slow)],
+)
+def test_collectors(kind):
+    frames = 2 * NUM_ENVS * STEPS
+    expected = first_goals(seed=0, num_workers=2)
+    assert len(expected) == 2 * NUM_ENVS
+    collector = kind(
+        [make_env, make_env],
+        go_for_the_goal,
+        frames_per_batch=frames,
+        total_frames=1000 * frames,
+    )
+    collector.set_seed(0)
+    workers = list(collector.procs)
+    seen, killed = set(), None
+    with pytest.raises(RuntimeError) as raised, name_dead_workers(workers):
+        for data in collector:
+            check_threads(data)
+            seen.update(goals(data))
+            # Both workers have drawn what they draw in any run of this seed.
+            if killed is None and expected <= seen:
+                killed = kill(workers[1])
+    pid, start = killed
+    assert time.monotonic() - start < PATIENCE
+    assert f"worker 1 (process {pid}) died with exit code -9" in str(raised.value)
+    collector.shutdown()
+    assert not any(is_alive(worker) for worker in workers)
+
+
+def first_goals(seed, num_workers):
+    """What the workers of a seed draw first: here in one process, one by one."""
+    drawn = set()
+    for _ in range(num_workers):
+        collector = Collector(
+            make_env, go_for_the_goal, frames_per_batch=NUM_ENVS, total_frames=NUM_ENVS
+        )
+        seed = collector.set_seed(seed)
+        collector.reset()  # as multi-process collectors do when they are seeded
+        drawn |= goals(next(iter(collector)))
+        collector.shutdown()
+    return drawn
+
+
+def is_alive(process):
+    return not process._closed and process.is_alive()

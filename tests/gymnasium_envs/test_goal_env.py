@@ -1,0 +1,183 @@
+"""One environment: Gymnasium's contract, and the torch environment's episodes."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDict
+
+import torch_panda
+from tests.gymnasium_envs.equal import assert_equal
+from torch_panda.gymnasium_envs import GoalEnv
+
+# check_env advises against spaces without bounds; positions have none.
+NO_BOUNDS = "ignore:.*A Box observation space"
+# torch_panda ignores it too; pytest forgets such filters.
+NOT_OLD = r"ignore:.*torch_panda/Panda\w+-v1 is out of date"
+
+
+@pytest.fixture
+def env():
+    env = gymnasium.make("torch_panda/PandaPush-v3")
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", torch_panda.ENV_IDS)
+def test_registered(env_id):
+    spec = gymnasium.spec(f"torch_panda/{env_id}")
+    assert spec.max_episode_steps == torch_panda.max_episode_steps(env_id)
+    assert spec.vector_entry_point is not None
+
+
+# Each task, control, reward and version once; what an id means is tested elsewhere.
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        "PandaReach-v1",
+        "PandaPushJoints-v3",
+        "PandaSlideDense-v1",
+        "PandaPickAndPlaceJointsDense-v3",
+        "PandaStack-v3",
+        "PandaFlip-v1",
+    ],
+)
+@pytest.mark.filterwarnings(NO_BOUNDS)
+@pytest.mark.filterwarnings(NOT_OLD)
+@pytest.mark.filterwarnings("error")
+def test_contract(env_id):
+    env = gymnasium.make(f"torch_panda/{env_id}")
+    try:
+        check_env(env.unwrapped, skip_render_check=True)
+        assert all(box.dtype == np.float32 for box in env.observation_space.values())
+        limit = 100 if "Stack" in env_id else 50
+        env.reset(seed=0)
+        ends = []
+        while not (ends and any(ends[-1])):
+            ends.append(env.step(env.action_space.sample())[2:4])
+        assert len(ends) == limit or ends[-1][0]
+    finally:
+        env.close()
+
+
+def test_same_episodes_as_the_torch_environment(env):
+    action = np.random.default_rng(0).uniform(-1, 1, (2, 15, 3)).astype(np.float32)
+    with torch_panda.make("PandaPush-v3", seed=5) as other:
+        for episode in range(2):
+            observation, info = env.reset(seed=5 if episode == 0 else None)
+            start = other.reset()
+            for key, value in observation.items():
+                assert np.array_equal(value, start[key])
+            assert info == {"is_success": start["success"].item()}
+            for step in range(15):
+                observation, reward, terminated, _, info = env.step(
+                    action[episode, step]
+                )
+                after = other.step(
+                    TensorDict({"action": torch.from_numpy(action[episode, step])})
+                )["next"]
+                for key, value in observation.items():
+                    assert np.array_equal(value, after[key])
+                assert reward == after["reward"].item()
+                assert terminated == after["terminated"].item()
+                assert info["is_success"] == after["success"].item()
+
+
+def test_start_from_a_state(env):
+    env.reset(seed=1)
+    before = env.step(np.ones(3))[0]
+    state = env.unwrapped.torch_env.get_state()
+    options = {"state": {key: x.numpy() for key, x in state.items()}}
+    steps = []
+    for _ in range(2):
+        observation, _ = env.reset(options=options)
+        assert env.unwrapped.torch_env.get_state()["step_count"] == 1
+        for key in ("achieved_goal", "desired_goal"):
+            assert np.array_equal(observation[key], before[key])
+        steps.append(env.step(-np.ones(3)))
+    assert_equal(*steps)
+    with pytest.raises(ValueError, match=r"options are state, got .*speed"):
+        env.reset(options={"speed": 1})
+
+
+def test_time_limit_is_gymnasiums():
+    for limit in (3, 60):
+        env = gymnasium.make("torch_panda/PandaReach-v1", max_episode_steps=limit)
+        env.reset(seed=0)
+        ends = [env.step(np.zeros(3, np.float32))[2:4] for _ in range(limit)]
+        env.close()
+        assert ends == [(False, False)] * (limit - 1) + [(False, True)]
+
+
+@pytest.mark.parametrize("env_id", ["PandaReach-v3", "PandaReachDense-v1"])
+def test_goal_functions(env_id):
+    env = GoalEnv(env_id)
+    achieved = np.zeros((4, 3), np.float32)
+    desired = np.array([[0.01, 0, 0], [0.2, 0, 0], [0, 0.03, 0], [0, 0, -1]])
+    goals = achieved, desired.astype(np.float32)
+    reward = env.compute_reward(*goals, [{}] * 4)
+    assert reward.dtype == np.float32
+    if env_id == "PandaReach-v3":
+        assert reward.tolist() == [0, -1, 0, -1]
+        assert env.compute_terminated(*goals, {}).tolist() == [True, False, True, False]
+    else:
+        np.testing.assert_allclose(reward, [-0.01, -0.2, -0.03, -1], rtol=1e-6)
+        assert not env.compute_terminated(*goals, {}).any()
+    assert env.compute_truncated(*goals, {}).tolist() == [False] * 4
+    one = env.compute_reward(achieved[1], goals[1][1], {})
+    assert isinstance(one, np.float32)
+    assert one == reward[1]
+    with pytest.raises(ValueError, match=r"\(\.\.\., 3\)"):
+        env.compute_reward(np.zeros(4), np.zeros(4), {})
+    env.close()
+
+
+def test_step_agrees_with_the_goal_functions(env):
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        observation, reward, terminated, _, info = env.step(env.action_space.sample())
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        assert reward == env.unwrapped.compute_reward(*goals, info)
+        assert terminated == env.unwrapped.compute_terminated(*goals, info)
+
+
+def test_own_task():
+    task = torch_panda.Reach(distance_threshold=0.2)
+    own = torch_panda.RobotTaskEnv(
+        robot=torch_panda.Panda(block_gripper=True), task=task, max_episode_steps=4
+    )
+    env = GoalEnv(own)
+    env.reset(seed=0)
+    assert [env.step(np.zeros(3))[3] for _ in range(4)] == [False] * 3 + [True]
+    env.close()
+    assert own.is_closed
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=2) as batched,
+        pytest.raises(ValueError, match=r"must be \[\], got \[2\]"),
+    ):
+        GoalEnv(batched)
+
+
+def test_render(monkeypatch):
+    image = torch.arange(24, dtype=torch.uint8).reshape(2, 4, 3)
+    monkeypatch.setattr(
+        torch_panda.RobotTaskEnv, "render", lambda self: image, raising=False
+    )
+    for mode in ("rgb_array", None):
+        env = gymnasium.make("torch_panda/PandaReach-v1", render_mode=mode)
+        env.reset()
+        frame = env.render() if mode else env.unwrapped.render()
+        env.close()
+        assert frame is None if mode is None else np.array_equal(frame, image)
+
+
+def test_bad_actions(env):
+    env.reset(seed=0)
+    for action in (np.full(3, np.nan), np.zeros(4), "up"):
+        with pytest.raises(ValueError, match=r"not finite|shape \(3,\)|convert"):
+            env.step(action)
+    env.step([0, 0, 1])
+    env.close()
+    with pytest.raises(torch_panda.BulletError, match="closed"):
+        env.step(np.zeros(3))

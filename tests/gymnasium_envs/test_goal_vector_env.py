@@ -1,0 +1,153 @@
+"""The vector environment gives what SyncVectorEnv gives."""
+
+import gc
+import itertools
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import torch_panda
+from tests.gymnasium_envs.equal import assert_equal
+from torch_panda.gymnasium_envs import GoalVectorEnv
+
+NUM_ENVS = 3
+# Success ends episodes of Reach-v3 at different times, time ends them in the others.
+CASES = [("PandaReach-v3", None), ("PandaPushDense-v1", 7)]
+
+
+def make_pair(env_id, mode, limit):
+    """Our vector environment, and Gymnasium's over single environments."""
+    env_id = f"torch_panda/{env_id}"
+    limits = {} if limit is None else {"max_episode_steps": limit}
+    ours = gymnasium.make_vec(
+        env_id,
+        num_envs=NUM_ENVS,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode=mode,
+        **limits,
+    )
+    singles = [lambda: gymnasium.make(env_id, **limits)] * NUM_ENVS
+    return ours, SyncVectorEnv(singles, autoreset_mode=mode)
+
+
+def act(observation, rng):
+    """Go for the goal, each environment at its own speed."""
+    towards = observation["desired_goal"] - observation["achieved_goal"]
+    noise = rng.uniform(-0.3, 0.3, towards.shape)
+    speed = np.array([[8.0], [3.0], [5.0]])
+    return np.clip(towards * speed + noise, -1, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize(("env_id", "limit"), CASES)
+def test_same_as_sync_vector_env(env_id, limit, mode):
+    ours, theirs = make_pair(env_id, mode, limit)
+    assert isinstance(ours, GoalVectorEnv)
+    assert ours.metadata["autoreset_mode"] is mode
+    for space in ("observation_space", "action_space", "single_observation_space"):
+        assert getattr(ours, space) == getattr(theirs, space)
+    rng = np.random.default_rng(0)
+    result = ours.reset(seed=3)
+    assert_equal(result, theirs.reset(seed=3))
+    ends = []
+    for step in range(50):
+        actions = act(result[0], rng)
+        result = ours.step(actions)
+        assert_equal(result, theirs.step(actions), f"step {step}")
+        ended = result[2] | result[3]
+        ends.append(ended)
+        if mode is AutoresetMode.DISABLED and ended.any():
+            with pytest.raises(ResetNeeded, match=str(int(ended.nonzero()[0][0]))):
+                ours.step(actions)
+            # Some with a new seed, the others with their next episode.
+            seeds = [7, None, step]
+            result = ours.reset(seed=seeds, options={"reset_mask": ended})
+            options = {"reset_mask": ended}
+            assert_equal(result, theirs.reset(seed=seeds, options=options))
+    ours.close()
+    theirs.close()
+    assert np.sum(ends, axis=0).min() >= 3
+
+
+def test_environments_draw_as_the_torch_environment_of_their_seed():
+    env = GoalVectorEnv("PandaPush-v1", num_envs=2)
+    observation, _ = env.reset(seed=8)
+    env.close()
+    for index in range(2):
+        with torch_panda.make("PandaPush-v1", seed=8 + index) as other:
+            goal = other.reset()["desired_goal"]
+        assert np.array_equal(observation["desired_goal"][index], goal)
+
+
+def test_start_from_a_state():
+    env = GoalVectorEnv("PandaPush-v1", num_envs=2)
+    env.reset(seed=0)
+    first, *_ = env.step(np.ones((2, 3)))
+    state = env.torch_env.get_state()
+    env.step(np.ones((2, 3)))
+    mask = np.array([False, True])
+    again, infos = env.reset(options={"state": state, "reset_mask": mask})
+    env.close()
+    assert infos["_is_success"].tolist() == [False, True]
+    pose = slice(6, 9)
+    assert np.array_equal(again["observation"][1, pose], first["observation"][1, pose])
+    assert not np.array_equal(again["observation"][0], first["observation"][0])
+
+
+def test_outputs_are_not_overwritten():
+    env = GoalVectorEnv("PandaReach-v1", num_envs=2)
+    results = [env.reset(seed=0)[0], *(env.step(np.ones((2, 3)))[0] for _ in range(3))]
+    env.close()
+    for first, second in itertools.pairwise(results):
+        assert not np.array_equal(first["observation"], second["observation"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"seed": [1, 2]}, ValueError, "3 seeds, got 2"),
+        ({"seed": [1, -2, 3]}, ValueError, "non-negative"),
+        ({"options": {"mask": 1}}, ValueError, "accepted options are state"),
+        ({"options": {"reset_mask": [True] * 3}}, TypeError, "array of bool"),
+        ({"options": {"reset_mask": np.ones(3)}}, TypeError, "array of bool"),
+        ({"options": {"reset_mask": np.zeros(3, bool)}}, ValueError, "and a True"),
+        ({"options": {"reset_mask": np.ones(2, bool)}}, ValueError, r"shape \(3,\)"),
+    ],
+)
+def test_bad_resets(arguments, error, message):
+    env = GoalVectorEnv("PandaReach-v1", num_envs=3)
+    with pytest.raises(ResetNeeded, match=r"reset environments \[0, 1, 2\]"):
+        env.step(np.zeros((3, 3)))
+    with pytest.raises(error, match=message):
+        env.reset(**arguments)
+    env.reset()
+    env.step(np.zeros((3, 3)))
+    env.close()
+
+
+@pytest.mark.filterwarnings("error")
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="Sometimes"):
+        GoalVectorEnv("PandaReach-v1", autoreset_mode="Sometimes")
+    with (
+        torch_panda.make("PandaReach-v1") as single,
+        pytest.raises(ValueError, match=r"must be \[num_envs\], got \[\]"),
+    ):
+        GoalVectorEnv(single)
+    gc.collect()
+
+
+def test_render(monkeypatch):
+    images = torch.arange(48, dtype=torch.uint8).reshape(2, 2, 4, 3)
+    monkeypatch.setattr(
+        torch_panda.RobotTaskEnv, "render", lambda self: images, raising=False
+    )
+    env = GoalVectorEnv("PandaReach-v1", num_envs=2, render_mode="rgb_array")
+    frames = env.render()
+    env.close()
+    assert isinstance(frames, tuple)
+    assert np.array_equal(np.stack(frames), images)

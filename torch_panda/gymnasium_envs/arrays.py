@@ -1,0 +1,122 @@
+"""Between the TensorDicts of a `RobotTaskEnv` and the arrays of Gymnasium."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torch_panda.envs import RobotTaskEnv
+
+Observation = dict[str, NDArray[np.float32]]
+
+_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
+    """The space of one environment's observation and goals, float32."""
+    spec = env.observation_spec
+    return spaces.Dict(
+        {key: spaces.Box(-np.inf, np.inf, spec[key].shape[-1:]) for key in _KEYS}
+    )
+
+
+def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
+    """The space of one environment's action, float32 in [-1, 1]."""
+    return spaces.Box(-1.0, 1.0, (env.robot.action_dim,))
+
+
+def observation(tensordict: TensorDictBase) -> Observation:
+    """Observation and goals as arrays of the tensordict's batch size."""
+    return {key: tensordict[key].numpy() for key in _KEYS}
+
+
+def action(values: ArrayLike) -> Tensor:
+    """An action of any real type; the environment checks the rest."""
+    return torch.from_numpy(np.asarray(values).astype(np.float64))
+
+
+def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> TensorDict:
+    """The state to start from that the options of a reset give: maybe empty.
+
+    Raises:
+        ValueError: there are other options, or a value is not for all environments.
+        TypeError: the state is no mapping of names to arrays of numbers.
+    """
+    if unknown := set(options) - {"state"}:
+        raise ValueError(f"accepted options are state, got {sorted(map(str, unknown))}")
+    given = options.get("state", {})
+    if not isinstance(given, Mapping | TensorDict):
+        raise TypeError(f"the state must be a mapping to arrays, got {given!r}")
+    state = TensorDict(batch_size=env.batch_size)
+    for key, value in given.items():
+        tensor = torch.from_numpy(np.asarray(value).copy())
+        if tensor.shape[: env.batch_dims] != env.batch_size:
+            raise ValueError(
+                f"{key} must have shape ({env.num_envs}, ...), "
+                f"got {tuple(tensor.shape)}"
+            )
+        state[key] = tensor
+    return state
+
+
+class GoalFunctions:
+    """The pure functions of goals that hindsight relabelling calls."""
+
+    torch_env: RobotTaskEnv
+
+    def compute_reward(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: Any = None,  # noqa: ANN401 (unused, as in Gymnasium-Robotics)
+    ) -> NDArray[np.float32]:
+        """The reward for an achieved goal.
+
+        Args:
+            achieved_goal: (..., goal_dim).
+            desired_goal: (..., goal_dim).
+            info: ignored.
+
+        Returns:
+            (...), float32.
+
+        Raises:
+            ValueError: a last dimension is not ``goal_dim``.
+        """
+        goals = _tensor(achieved_goal), _tensor(desired_goal)
+        return _array(self.torch_env.compute_reward(*goals))
+
+    def compute_terminated(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: Any = None,  # noqa: ANN401
+    ) -> NDArray[np.bool_]:
+        """Whether an achieved goal ends the episode, (...); see `compute_reward`."""
+        goals = _tensor(achieved_goal), _tensor(desired_goal)
+        success = self.torch_env.is_success(*goals)
+        return _array(success & self.torch_env.terminate_on_success)
+
+    def compute_truncated(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: Any = None,  # noqa: ANN401
+    ) -> NDArray[np.bool_]:
+        """False, (...): goals do not end an episode before its time."""
+        goals = _tensor(achieved_goal), _tensor(desired_goal)
+        return _array(torch.zeros_like(self.torch_env.is_success(*goals)))
+
+
+def _tensor(goal: ArrayLike) -> Tensor:
+    return torch.from_numpy(np.asarray(goal).astype(np.float32))
+
+
+def _array(values: Tensor) -> NDArray[Any]:
+    """(..., 1) to an array (...); to a numpy scalar where that is ()."""
+    return values.squeeze(-1).numpy()[()]

@@ -1,0 +1,216 @@
+"""Many environments, stepped in threads, with Gymnasium's vector interface."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from torch_panda.envs import RobotTaskEnv
+from torch_panda.gymnasium_envs import arrays
+from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
+from torch_panda.gymnasium_envs.goal_env import GoalEnv
+from torch_panda.registry import make
+
+
+class GoalVectorEnv(
+    GoalFunctions,
+    VectorEnv[Observation, NDArray[np.float32], NDArray[Any]],
+):
+    """``gymnasium.make_vec("torch_panda/PandaPush-v1", num_envs=16)``.
+
+    Gives what ``SyncVectorEnv`` gives over as many `GoalEnv`, in all autoreset modes,
+    and so seeds environment i with ``seed + i``.
+
+    Args:
+        env: an id of `torch_panda.ENV_IDS`, or an environment of batch size [num_envs].
+        num_envs: number of environments, for an id.
+        autoreset_mode: when an environment whose episode has ended is reset: instead of
+            its next step (NEXT_STEP), within the last one (SAME_STEP, with
+            ``final_obs`` and ``final_info`` in the infos), or only by `reset` with
+            ``options={"reset_mask": ...}`` (DISABLED).
+        render_mode: "rgb_array" or None.
+        **arguments: of `torch_panda.make`, for an id.
+
+    Raises:
+        ValueError: the environment is not batched, or the autoreset mode is unknown.
+
+    Attributes:
+        torch_env: the environment behind it.
+    """
+
+    def __init__(
+        self,
+        env: str | RobotTaskEnv,
+        *,
+        num_envs: int = 1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
+    ) -> None:
+        self.closed = True  # there is nothing to close until all is built
+        self._autoreset_mode = AutoresetMode(autoreset_mode)
+        if isinstance(env, str):
+            env = make(env, num_envs=num_envs, **arguments)
+        if env.num_envs is None:
+            raise ValueError("the batch size must be [num_envs], got []")
+        self.torch_env = env
+        self.num_envs = env.num_envs
+        self.render_mode = render_mode
+        self.metadata = {**GoalEnv.metadata, "autoreset_mode": self._autoreset_mode}
+        self.single_observation_space = arrays.observation_space(env)
+        self.single_action_space = arrays.action_space(env)
+        self.observation_space = batch_space(
+            self.single_observation_space, self.num_envs
+        )
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._all = torch.ones(self.num_envs, dtype=torch.bool)
+        # Which environments have to be reset: (num_envs,).
+        self._ended = self._all
+        self._was_reset = False
+        self.closed = False
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start episodes.
+
+        Args:
+            seed: of environment 0, the others follow; or one per environment.
+            options: ``reset_mask``, (num_envs,) bool, which environments; and
+                ``state``, as `RobotTaskEnv.get_state` returns it, to start from.
+
+        Raises:
+            ValueError: an option is unknown or has a wrong shape, or the number of
+                seeds is wrong.
+            TypeError: an option or a seed has a wrong type.
+            gymnasium.error.Error: the seed is negative.
+        """
+        rest = dict(options or {})
+        mask = self._read_mask(rest.pop("reset_mask", None))
+        state = arrays.read_state(rest, self.torch_env)
+        seeds = self._read_seeds(seed)
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        for index in _indices(mask):
+            own_seed = seeds[index]
+            if own_seed is not None:
+                self.torch_env.set_env_seed(index, own_seed)
+        begun = self._reset_torch_env(mask, state)
+        self._ended = self._ended & ~mask
+        self._was_reset = True
+        return arrays.observation(begun), self._infos(begun, mask)
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[
+        Observation,
+        NDArray[np.float64],
+        NDArray[np.bool_],
+        NDArray[np.bool_],
+        dict[str, Any],
+    ]:
+        """Act for one step; see `RobotTaskEnv` for what else is raised.
+
+        Raises:
+            ResetNeeded: before the first `reset`, or, in the mode DISABLED, when an
+                environment whose episode has ended was not reset.
+        """
+        mode, ended = self._autoreset_mode, self._ended
+        if not self._was_reset or (mode is AutoresetMode.DISABLED and ended.any()):
+            raise ResetNeeded(
+                f"reset environments {_indices(ended)} before they are stepped"
+            )
+        resets_now = mode is AutoresetMode.NEXT_STEP and bool(ended.any())
+        taken = TensorDict({"action": arrays.action(actions)})
+        if resets_now:
+            taken["_step"] = ~ended
+        after = self.torch_env._step(taken)
+        if resets_now:
+            # Gives the others once more what the step gave them.
+            after.update(self._reset_torch_env(ended))
+        outcome = (
+            after["reward"].squeeze(1).double().numpy(),
+            after["terminated"].squeeze(1).numpy(),
+            after["truncated"].squeeze(1).numpy(),
+        )
+        self._ended = after["done"].squeeze(1)
+        infos: dict[str, Any] = {}
+        if mode is AutoresetMode.SAME_STEP and self._ended.any():
+            infos = self._final_infos(after, self._ended)
+            after = self._reset_torch_env(self._ended)
+            self._ended = torch.zeros_like(self._ended)
+        infos |= self._infos(after, self._all)
+        return arrays.observation(after), *outcome, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """An image (height, width, 3) of each, if the render mode is "rgb_array"."""
+        if self.render_mode is None:
+            return None
+        return tuple(np.asarray(self.torch_env.render()))
+
+    def close_extras(self, **kwargs: Any) -> None:  # noqa: ANN401 (Gymnasium's)
+        """Free all clients and threads."""
+        self.torch_env.close()
+
+    def _reset_torch_env(
+        self, mask: Tensor, state: TensorDict | None = None
+    ) -> TensorDict:
+        """Reset some environments; what all of them observe then.
+
+        torchrl's own `reset` would have to be given what the others observed.
+        """
+        start = TensorDict() if state is None else state
+        return self.torch_env._reset(start.set("_reset", mask), set_state=True)
+
+    def _infos(self, after: TensorDict, mask: Tensor) -> dict[str, Any]:
+        success = after["success"].squeeze(1) & mask
+        return {"is_success": success.numpy(), "_is_success": mask.clone().numpy()}
+
+    def _final_infos(self, after: TensorDict, mask: Tensor) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        for index in _indices(mask):
+            last = after[index]
+            final = {
+                "final_obs": arrays.observation(last),
+                "final_info": {"is_success": last["success"].item()},
+            }
+            infos = self._add_info(infos, final, index)
+        return infos
+
+    def _read_mask(self, mask: NDArray[np.bool_] | None) -> Tensor:
+        """Which environments to reset: (num_envs,) bool."""
+        if mask is None:
+            return self._all
+        shape = (self.num_envs,)
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+            raise TypeError(f"reset_mask must be an array of bool, got {mask!r}")
+        if mask.shape != shape or not mask.any():
+            raise ValueError(
+                f"reset_mask must have shape {shape} and a True, got {mask!r}"
+            )
+        return torch.from_numpy(mask.copy())
+
+    def _read_seeds(
+        self, seed: int | Sequence[int | None] | None
+    ) -> Sequence[int | None]:
+        """One seed, or None, for each environment."""
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + index for index in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"there must be {self.num_envs} seeds, got {len(seed)}")
+        return seed
+
+
+def _indices(mask: Tensor) -> list[int]:
+    return mask.nonzero().flatten().tolist()

@@ -1,0 +1,137 @@
+"""Many environments, stepped in threads, for Stable-Baselines3.
+
+Importing this module needs ``stable-baselines3``.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import (
+    VecEnvIndices,
+    VecEnvStepReturn,
+)
+
+from torch_panda.envs import RobotTaskEnv
+from torch_panda.gymnasium_envs.arrays import Observation
+from torch_panda.gymnasium_envs.goal_vector_env import GoalVectorEnv
+
+
+class SB3VecEnv(VecEnv):
+    """A `GoalVectorEnv` as the ``VecEnv`` that Stable-Baselines3 takes.
+
+    The environments share one object: `get_attr` and `env_method` read and call it, and
+    give its answer once for each index.
+
+    Args:
+        env: as for `GoalVectorEnv`.
+        **arguments: of `GoalVectorEnv`, but for the autoreset mode.
+
+    Attributes:
+        vector_env: the `GoalVectorEnv`.
+    """
+
+    def __init__(
+        self,
+        env: str | RobotTaskEnv,
+        **arguments: Any,  # noqa: ANN401 (of GoalVectorEnv)
+    ) -> None:
+        self.vector_env = GoalVectorEnv(
+            env, autoreset_mode=AutoresetMode.SAME_STEP, **arguments
+        )
+        super().__init__(
+            self.vector_env.num_envs,
+            self.vector_env.single_observation_space,
+            self.vector_env.single_action_space,
+        )
+
+    def reset(self) -> Observation:
+        """Start an episode in each environment, with the seeds given to `seed`.
+
+        Raises:
+            ValueError: `set_options` was called.
+        """
+        if any(self._options):
+            raise ValueError("for options, call `vector_env.reset(options=...)`")
+        observation, infos = self.vector_env.reset(seed=self._seeds)
+        self.reset_infos = [{"is_success": bool(x)} for x in infos["is_success"]]
+        self._reset_seeds()
+        return observation
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Take the step, and reset the environments whose episode it ended."""
+        observation, rewards, terminated, truncated, infos = self.vector_env.step(
+            self._actions
+        )
+        done = terminated | truncated
+        # Of an ended episode the infos are those of its last step.
+        success = np.where(
+            done,
+            infos.get("final_info", {}).get("is_success", False),
+            infos["is_success"],
+        )
+        list_of_infos: list[dict[str, Any]] = [
+            {"is_success": bool(s), "TimeLimit.truncated": bool(t)}
+            for s, t in zip(success, truncated & ~terminated, strict=True)
+        ]
+        for index in done.nonzero()[0]:
+            list_of_infos[index]["terminal_observation"] = infos["final_obs"][index]
+            self.reset_infos[index] = {"is_success": bool(infos["is_success"][index])}
+        return observation, rewards.astype(np.float32), done, list_of_infos
+
+    def close(self) -> None:
+        """Free all clients and threads."""
+        self.vector_env.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """An image of each environment."""
+        return self.vector_env.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of the `GoalVectorEnv`, once for each index."""
+        return [getattr(self.vector_env, attr_name)] * self._count(indices)
+
+    def set_attr(
+        self,
+        attr_name: str,
+        value: Any,  # noqa: ANN401 (Stable-Baselines3's signature)
+        indices: VecEnvIndices = None,
+    ) -> None:
+        """Set an attribute of the `GoalVectorEnv`, for all environments.
+
+        Raises:
+            ValueError: not all environments are meant.
+        """
+        if self._count(indices) != self.num_envs:
+            raise ValueError("attributes can only be set for all environments at once")
+        setattr(self.vector_env, attr_name, value)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,  # noqa: ANN401
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,  # noqa: ANN401
+    ) -> list[Any]:
+        """Call a method of the `GoalVectorEnv`; its result once for each index."""
+        method: Callable[..., Any] = getattr(self.vector_env, method_name)
+        return [method(*method_args, **method_kwargs)] * self._count(indices)
+
+    def env_is_wrapped(
+        self,
+        wrapper_class: type[gymnasium.Wrapper],
+        indices: VecEnvIndices = None,
+    ) -> list[bool]:
+        """False: there are no wrappers around single environments."""
+        return [False] * self._count(indices)
+
+    def _count(self, indices: VecEnvIndices) -> int:
+        return len(list(self._get_indices(indices)))
