@@ -27,7 +27,7 @@ class Args:
     """step of the episode that is drawn"""
     seed: int = 4
     """of the environments"""
-    size: tuple[int, int] = (240, 320)
+    size: tuple[int, int] = (300, 400)
     """height and width of a cell [pixels]"""
     out: Path = Path("gallery.png")
     """picture to write"""
@@ -35,9 +35,12 @@ class Args:
 
 def main(args: Args) -> None:
     """Draw all tasks in one picture."""
-    camera = torch_panda.Camera(distance=1.1, target=(0.0, 0.0, 0.1))
     cells = []
     for task in TASKS:
+        far = task == "Slide"  # its goals are
+        camera = torch_panda.Camera(
+            distance=1.3 if far else 0.85, target=(0.25 if far else 0.0, 0.0, 0.1)
+        )
         env_id = f"Panda{task}-v1"
         with (
             torch_panda.make(env_id, num_envs=1, seed=args.seed) as env,

@@ -33,6 +33,7 @@ from agents import Agent, Hyperparameters, replace, save_policy
 from evaluate import evaluate
 from plot import plot_curve
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
+from watch import record
 
 
 @dataclass
@@ -80,6 +81,8 @@ class Args(Hyperparameters):
     """continue the run in that folder, with the same other arguments"""
     tensorboard: bool = False
     """log to TensorBoard, too"""
+    video: bool = True
+    """at the end, record 6 episodes"""
 
 
 PRESETS = {
@@ -87,7 +90,9 @@ PRESETS = {
     "tuned": Args(preset="tuned", gamma=0.95, keep_unmoved=0.1, max_random_eps=1.0),
 }
 # What may differ between a run and its continuation.
-FREE_ARGUMENTS = {"resume", "out", "num_threads", "tensorboard", "save_interval"}
+FREE_ARGUMENTS = {
+    *("resume", "out", "num_threads", "tensorboard", "save_interval", "video")
+}
 SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
 STORED_KEYS = [
     "observation",
@@ -139,8 +144,12 @@ class Run:
         # Made before `load`, because making it draws random numbers.
         self.collector = self.make_collector()
 
-    def train(self) -> None:
-        """Collect, learn and evaluate until the last step or Ctrl-C."""
+    def train(self) -> bool:
+        """Collect, learn and evaluate until the last step or Ctrl-C.
+
+        Returns:
+            whether the last step was reached.
+        """
         args, out = self.args, self.out
         loggers: list[Logger] = [CSVLogger("log", log_dir=str(out))]
         if args.tensorboard:
@@ -173,6 +182,7 @@ class Run:
                 break
             self.reseed(self.env)
         progress.close()
+        return self.steps >= args.total_steps
 
     def make_collector(self) -> Collector:
         """Whole episodes of all environments, one batch [num_envs, steps] each time."""
@@ -378,8 +388,13 @@ def main(args: Args) -> None:
         raise SystemExit(str(error)) from None
     out.mkdir(parents=True, exist_ok=True)
     (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
-    run.train()
+    finished = run.train()
     run.close()
+    if finished and args.video:
+        with torch_panda.make(
+            args.env_id, num_envs=6, seed=args.seed, device=args.device
+        ) as env:
+            record(env, run.agent.policy, out / "video.mp4")
     if run.curve:
         success = run.curve[-1]["success"]
         print(f"success {success:.0%} after {run.steps} steps; see {out}")

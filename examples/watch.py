@@ -107,13 +107,14 @@ class Args:
     num_envs: int = 6
     """environments side by side"""
     seed: int = 0
-    """of the environments"""
+    """of the environments and of random actions"""
     out: Path = Path("watch.mp4")
     """video to write, .mp4 or .gif"""
 
 
 def main(args: Args) -> None:
     """Record a policy."""
+    torch.manual_seed(args.seed)
     checkpoint = None
     if args.policy not in ("random", "expert"):
         path = Path(args.policy)

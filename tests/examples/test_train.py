@@ -8,11 +8,20 @@ import sys
 import time
 from pathlib import Path
 
+import imageio.v3 as iio
 import pytest
 import torch
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-QUICK = ["--eval-interval", "200", "--eval-episodes", "8", "--num-envs", "4"]
+QUICK = [
+    "--no-video",
+    "--eval-interval",
+    "200",
+    "--eval-episodes",
+    "8",
+    "--num-envs",
+    "4",
+]
 
 
 def command(script, *arguments):
@@ -66,12 +75,13 @@ def flatten(state, prefix=""):
 
 
 def test_writes_curve_plot_and_checkpoint(tmp_path):
-    run("train", "--total-steps", 400, "--out", tmp_path, *QUICK)
+    run("train", "--total-steps", 400, "--out", tmp_path, *QUICK, "--video")
     curve = read_curve(tmp_path)
     assert [row["step"] for row in curve] == ["200", "400"]
     assert all(0 <= float(row["success"]) <= 1 for row in curve)
     assert curve[-1]["updates"] == "200"
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert len(iio.imread(tmp_path / "video.mp4")) == 51
     logged = (tmp_path / "log" / "scalars" / "success.csv").read_text().split()
     assert [line.split(",")[0] for line in logged] == ["200", "400"]
     checkpoint = torch.load(tmp_path / "checkpoint.pt")
@@ -108,7 +118,15 @@ def test_algorithms_learn(tmp_path, algo, her, double_q, critics):
     run(
         *("train", "--env-id", "PandaPush-v3", "--algo", algo, "--her", her, double_q),
         *("--num-envs", 2, "--total-steps", 100, "--eval-episodes", 2),
-        *("--batch-size", 32, "--updates-per-step", 0.1, "--out", tmp_path),
+        *(
+            "--no-video",
+            "--batch-size",
+            32,
+            "--updates-per-step",
+            0.1,
+            "--out",
+            tmp_path,
+        ),
     )
     state = torch.load(tmp_path / "resume.pt")
     assert state["updates"] == 10
