@@ -7,9 +7,13 @@ it saw to the learner, which stores all workers' transitions in one replay buffe
 the gradient steps that are due, and gives the worker its new weights. The others go on
 meanwhile, so runs are not reproducible bit for bit.
 
-On a cluster, run `ray start --head` on one machine and `ray start --address=HEAD:6379`
-on the others, and this script with `--address auto` on the first. Every machine needs
-torch_panda; the files of this folder are brought along.
+Without `--address` the workers run on this machine. For a cluster of machines that all
+have torch_panda and the same Ray (this folder's files are brought along):
+
+    ray get-auth-token --generate      # once; copy ~/.ray/auth_token to all machines
+    export RAY_AUTH_MODE=token         # on all machines
+    ray start --head                   # on the first, where this script is run, too
+    ray start --address=FIRST:6379     # on the others
 """
 
 import logging
@@ -124,26 +128,22 @@ class Learner:
             RayActorError: a worker died.
         """
         args = self.args
-        progress = tqdm(
-            total=args.total_steps, unit="step", desc=f"{args.env_id} {args.algo}"
-        )
-        for data in self.collector:
-            before, self.steps = self.steps, self.steps + data.numel()
-            self.learn(data)
-            self.send_weights(worker_of(data, args.num_workers))
-            progress.update(data.numel())
-            finished = self.steps >= args.total_steps
-            if finished or stop or crossed(args.eval_interval, before, self.steps):
-                result = evaluate(self.eval_env, self.agent.policy, args.eval_episodes)
-                self.success = float(result.success.float().mean())
-                progress.set_postfix(success=f"{self.success:.0%}")
-                save_policy(out / "checkpoint.pt", self.agent, args.env_id)
-            if finished or stop:
-                break
-        progress.close()
+        label = f"{args.env_id} {args.algo}"
+        with tqdm(total=args.total_steps, unit="step", desc=label) as progress:
+            for data in self.collector:
+                before, self.steps = self.steps, self.steps + data.numel()
+                self.learn(data)
+                self.send_weights(worker_of(data, args.num_workers))
+                progress.update(data.numel())
+                last = self.steps >= args.total_steps or bool(stop)
+                if last or crossed(args.eval_interval, before, self.steps):
+                    self.evaluate(out)
+                    progress.set_postfix(success=f"{self.success:.0%}")
+                if last:
+                    break
 
     def learn(self, data: TensorDictBase) -> None:
-        """Store a worker's batch and take the gradient steps due for them."""
+        """Store a worker's batch and take the gradient steps that are due."""
         stored = self.buffer[self.buffer.extend(data.reshape(-1))]
         self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
         due = int(self.steps * self.args.updates_per_step) - self.agent.updates
@@ -153,8 +153,15 @@ class Learner:
     def send_weights(self, worker: int) -> None:
         """Give a worker the weights and the normaliser for its next batch."""
         weights = TensorDict.from_module(self.agent.explore).data
-        # Calls of one worker run in order: before its next batch is asked for.
-        self.collector.remote_collectors[worker].update_policy_weights_.remote(weights)
+        # It is idle until this batch is done with, so this is a matter of milliseconds.
+        remote = self.collector.remote_collectors[worker]
+        ray.get(remote.update_policy_weights_.remote(weights))
+
+    def evaluate(self, out: Path) -> None:
+        """Measure the success, and write the policy for `evaluate.py`."""
+        result = evaluate(self.eval_env, self.agent.policy, self.args.eval_episodes)
+        self.success = float(result.success.float().mean())
+        save_policy(out / "checkpoint.pt", self.agent, self.args.env_id)
 
     def close(self) -> None:
         """End the workers and free the environments."""
@@ -241,7 +248,7 @@ def connect(args: Args) -> None:
         address=args.address,
         num_cpus=args.num_workers * args.cpus_per_worker if local else None,
         include_dashboard=False if local else None,
-        runtime_env={"working_dir": str(Path(__file__).parent)},
+        runtime_env={"working_dir": str(Path(__file__).parent), "excludes": ["runs"]},
         logging_level=logging.WARNING,
         log_to_driver=False,  # the collectors' long repr, at every line
     )
