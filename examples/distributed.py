@@ -279,6 +279,8 @@ def main(args: Args) -> None:
         raise SystemExit(str(error)) from None
     except RayActorError as error:
         raise SystemExit(f"a worker died: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted") from None
     finally:
         ray.shutdown()  # ends the workers, and the cluster if it was started here
     print(f"success {learner.success:.0%} after {learner.steps} steps; see {out}")
