@@ -13,7 +13,7 @@ import torch
 from torchrl.envs import GymEnv, ParallelEnv
 
 import torch_panda
-from tests.bare_bullet import is_available, load_bare_bullet
+from torch_panda.bench.bare_bullet import is_available, load_bare_bullet
 
 pytestmark = pytest.mark.slow
 NUM_ENVS = 16

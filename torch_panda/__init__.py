@@ -1,6 +1,6 @@
 """Goal-conditioned Franka Panda tasks as one vectorised TorchRL environment."""
 
-from torch_panda.bullet import BulletError
+from torch_panda.bullet import BulletError, PhysicsName, PhysicsParams
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.registry import ENV_IDS, make
 from torch_panda.robots import Panda, Robot
@@ -19,6 +19,8 @@ __all__ = [
     "BulletError",
     "Flip",
     "Panda",
+    "PhysicsName",
+    "PhysicsParams",
     "PickAndPlace",
     "Push",
     "Reach",

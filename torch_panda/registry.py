@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from torch_panda.bullet import ControlType
+from torch_panda.bullet import ControlType, PhysicsName, PhysicsParams
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.robots import Panda
 from torch_panda.tasks import (
@@ -60,6 +60,7 @@ def make(
     num_threads: int | None = None,
     seed: int | None = None,
     device: torch.device | str | int | None = None,
+    physics: PhysicsParams | PhysicsName = "exact",
 ) -> RobotTaskEnv:
     """Make the environments of an id; see `RobotTaskEnv` for the arguments.
 
@@ -87,4 +88,5 @@ def make(
         seed=seed,
         device=device,
         terminate_on_success=version == "v3",
+        physics=physics,
     )

@@ -13,7 +13,15 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_panda.bullet import BulletError, PhysicsClient, Scene, VectorSimulation
+from torch_panda.bullet import (
+    BulletError,
+    PhysicsClient,
+    PhysicsName,
+    PhysicsParams,
+    Scene,
+    VectorSimulation,
+    read_physics,
+)
 from torch_panda.envs.state import read_state
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
@@ -44,6 +52,7 @@ class RobotTaskEnv(EnvBase):
         max_episode_steps: steps until ``truncated``; None means the task's number.
         terminate_on_success: whether success ends an episode, as in panda-gym 3; the
             paper's episodes go on.
+        physics: how Bullet integrates: "exact" (as panda-gym), "fast", or parameters.
 
     Raises:
         ValueError: an argument is out of range.
@@ -62,6 +71,7 @@ class RobotTaskEnv(EnvBase):
         device: torch.device | str | int | None = None,
         max_episode_steps: int | None = None,
         terminate_on_success: bool = False,
+        physics: PhysicsParams | PhysicsName = "exact",
     ) -> None:
         _check_positive(num_envs=num_envs, num_threads=num_threads)
         _check_positive(max_episode_steps=max_episode_steps)
@@ -74,6 +84,7 @@ class RobotTaskEnv(EnvBase):
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
+        self.physics = read_physics(physics)
         self._make_specs()
         self._constructor_seed = seed
         self._set_seed(seed)
@@ -81,7 +92,7 @@ class RobotTaskEnv(EnvBase):
         self._step_count = torch.zeros(count, 1, dtype=torch.int64)
         self._goal = torch.zeros(count, task.goal_dim, dtype=torch.float64)
         self._simulation = VectorSimulation(
-            self._build_scene, count, num_threads=num_threads
+            self._build_scene, count, num_threads=num_threads, physics=self.physics
         )
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
@@ -146,6 +157,7 @@ class RobotTaskEnv(EnvBase):
             device=self.device,
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
+            physics=self.physics,
         )
         return build, ()
 
