@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from torch_panda.bullet._capi import library_path
 from torch_panda.bullet.client import find_urdf
@@ -13,8 +14,22 @@ from torch_panda.bullet.client import find_urdf
 SOURCE = Path(__file__).with_suffix(".c")
 URDF = "franka_panda/panda.urdf"
 
-# (num_envs, num_threads, steps) to the steps per second of all environments.
-BareBullet = Callable[[int, int, int], float]
+
+class Speed(NamedTuple):
+    """Steps of all environments together, by two clocks.
+
+    Attributes:
+        per_second: steps per second.
+        per_cpu_second: steps per second of processor time, of all processes; other
+            work on the machine hardly changes it.
+    """
+
+    per_second: float
+    per_cpu_second: float
+
+
+# (num_envs, num_threads, steps of each) to the speed.
+BareBullet = Callable[[int, int, int], Speed]
 
 
 def is_available() -> bool:
@@ -33,10 +48,15 @@ def load_bare_bullet(directory: str | Path) -> BareBullet:
     files = (str(SOURCE), library_path(), "-o", str(output))
     subprocess.run(("cc", *flags, *files, "-lpthread"), check=True)
     function = ctypes.CDLL(str(output)).bare_bullet
-    function.restype = ctypes.c_double
+    function.restype = None
     path = find_urdf(URDF).encode()
 
-    def run(num_envs: int, num_threads: int, steps: int) -> float:
-        return float(function(path, num_envs, num_threads, steps))
+    def run(num_envs: int, num_threads: int, steps: int) -> Speed:
+        wall, cpu = ctypes.c_double(), ctypes.c_double()
+        function(
+            path, num_envs, num_threads, steps, ctypes.byref(wall), ctypes.byref(cpu)
+        )
+        count = num_envs * steps
+        return Speed(count / wall.value, count / cpu.value)
 
     return run

@@ -3,27 +3,13 @@
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from statistics import median
 
+from torch_panda.bench.bare_bullet import Speed
 from torch_panda.bench.contenders import CONTENDERS, OURS, Setting
 from torch_panda.bench.runner import ContenderError, Footprint, Runner
 
 # Called with what is being done, whenever a piece of the work begins.
 Progress = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Spread:
-    """The median of some values, and their range."""
-
-    median: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Spread":
-        """Of at least one value."""
-        return cls(median(values), min(values), max(values))
 
 
 @dataclass(frozen=True)
@@ -33,15 +19,15 @@ class Result:
     Attributes:
         setting: what was measured.
         contender: its name, a key of `CONTENDERS`.
-        speeds: steps per second of all environments, a round each.
+        speeds: steps of all environments together, a round each.
         ratios: torch_panda's speed over this one's, a round each.
         footprint: what the environments cost; None where it was not measured.
     """
 
     setting: Setting
     contender: str
-    speeds: tuple[float, ...]
-    ratios: tuple[float, ...]
+    speeds: tuple[Speed, ...]
+    ratios: tuple[Speed, ...]
     footprint: Footprint | None
 
 
@@ -99,7 +85,7 @@ def compare(
                     reason = str(error)
             if reason is not None:
                 absences.append(Absence(setting, name, reason))
-        speeds: dict[str, list[float]] = {name: [] for name in runners}
+        speeds: dict[str, list[Speed]] = {name: [] for name in runners}
         for _ in range(1 + rounds):
             for name, runner in runners.items():
                 progress(f"{setting.env_id} x {setting.num_envs}: {name}")
@@ -111,7 +97,10 @@ def compare(
             setting=setting,
             contender=name,
             speeds=tuple(speeds[name][1:]),
-            ratios=tuple(a / b for a, b in zip(ours, speeds[name][1:], strict=True)),
+            ratios=tuple(
+                Speed(a.per_second / b.per_second, a.per_cpu_second / b.per_cpu_second)
+                for a, b in zip(ours, speeds[name][1:], strict=True)
+            ),
             footprint=footprints[name],
         )
         for name in runners

@@ -21,7 +21,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, GymEnv, ParallelEnv
 
 import torch_panda
-from torch_panda.bench.bare_bullet import is_available, load_bare_bullet
+from torch_panda.bench.bare_bullet import Speed, is_available, load_bare_bullet
+from torch_panda.bench.processes import cpu_time
 
 # Workers are forked, as Gymnasium does by default on Linux: that is how they start
 # fastest and share most memory.
@@ -71,12 +72,14 @@ class Contender(ABC):
     def close(self) -> None:
         """Free all of it."""
 
-    def measure(self, num_envs: int, steps: int) -> float:
-        """Steps per second of all environments over some steps of each."""
-        start = time.perf_counter()
+    def measure(self, num_envs: int, steps: int) -> Speed:
+        """Speed of all environments over some steps of each."""
+        start, cpu_start = time.perf_counter(), cpu_time()
         for _ in range(steps):
             self.step()
-        return num_envs * steps / (time.perf_counter() - start)
+        wall, cpu = time.perf_counter() - start, cpu_time() - cpu_start
+        # Processor time is counted in ticks of 10 ms: a short run may see none.
+        return Speed(num_envs * steps / wall, num_envs * steps / max(cpu, 0.01))
 
 
 class TorchRLContender(Contender):
@@ -144,7 +147,7 @@ class BareBulletContender(Contender):
         """Remove the compiled library."""
         self._directory.cleanup()
 
-    def measure(self, num_envs: int, steps: int) -> float:
+    def measure(self, num_envs: int, steps: int) -> Speed:
         """Build the environments, then time their steps."""
         return self._run(num_envs, self._setting.num_threads, steps)
 

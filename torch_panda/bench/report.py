@@ -5,8 +5,10 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import median
+from typing import Any
 
-from torch_panda.bench.comparison import Absence, Result, Spread
+from torch_panda.bench.comparison import Absence, Result
 from torch_panda.bench.contenders import CONTENDERS
 from torch_panda.info import num_cores, versions
 
@@ -15,8 +17,10 @@ _COLUMNS = (
     "envs",
     "threads",
     "contender",
-    "steps/s (range)",
-    "torch_panda over it (range)",
+    "steps/s",
+    "torch_panda over it",
+    "steps/CPU s",
+    "torch_panda over it",
     "creation [ms]",
     "memory [MB]",
     "reset [ms]",
@@ -24,7 +28,10 @@ _COLUMNS = (
 
 
 def table(results: Sequence[Result]) -> str:
-    """A Markdown table, a row for each result; costs are of one environment."""
+    """A Markdown table, a row for each result.
+
+    Speeds are medians and ranges over the rounds; costs are of one environment.
+    """
     rows = [_COLUMNS, *(_row(result) for result in results)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
     lines = [
@@ -51,14 +58,13 @@ def write_json(
     document = {
         "machine": {"platform": platform.platform(), "cores": num_cores()},
         "versions": versions(),
-        "results": [asdict(result) for result in results],
+        "results": [_figures(result) for result in results],
         "not_measured": [asdict(absence) for absence in absences],
     }
     path.write_text(json.dumps(document, indent=2) + "\n")
 
 
 def _row(result: Result) -> tuple[str, ...]:
-    speed, ratio = Spread.of(result.speeds), Spread.of(result.ratios)
     setting, footprint = result.setting, result.footprint
     costs = ["-", "-", "-"]
     if footprint is not None:
@@ -70,7 +76,25 @@ def _row(result: Result) -> tuple[str, ...]:
         str(setting.num_envs),
         str(setting.num_threads),
         CONTENDERS[result.contender].title,
-        f"{speed.median:.0f} ({speed.low:.0f} to {speed.high:.0f})",
-        f"{ratio.median:.2f} ({ratio.low:.2f} to {ratio.high:.2f})",
+        _spread([speed.per_second for speed in result.speeds], digits=0),
+        _spread([ratio.per_second for ratio in result.ratios], digits=2),
+        _spread([speed.per_cpu_second for speed in result.speeds], digits=0),
+        _spread([ratio.per_cpu_second for ratio in result.ratios], digits=2),
         *costs,
     )
+
+
+def _spread(values: Sequence[float], *, digits: int) -> str:
+    """Median and range."""
+    middle, low, high = (
+        f"{value:.{digits}f}" for value in (median(values), min(values), max(values))
+    )
+    return f"{middle} ({low} to {high})"
+
+
+def _figures(result: Result) -> dict[str, Any]:
+    return {
+        **asdict(result),
+        "speeds": [speed._asdict() for speed in result.speeds],
+        "ratios": [ratio._asdict() for ratio in result.ratios],
+    }

@@ -5,13 +5,14 @@ import os
 import time
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import torch
 
+from torch_panda.bench.bare_bullet import Speed
 from torch_panda.bench.contenders import CONTENDERS, Setting
+from torch_panda.bench.processes import memory
 
 _RESETS = 5
 
@@ -63,14 +64,15 @@ class Runner:
             self.close()
             raise
 
-    def measure(self, steps: int) -> float:
-        """Steps per second of all environments over some steps of each.
+    def measure(self, steps: int) -> Speed:
+        """Speed of all environments over some steps of each.
 
         Raises:
             ContenderError: it failed.
         """
         self._pipe.send(steps)
-        return float(self._receive())
+        speed: Speed = self._receive()
+        return speed
 
     def close(self) -> None:
         """End the process."""
@@ -114,17 +116,17 @@ def _serve(pipe: Connection, name: str, setting: Setting) -> None:
         else:
             # One environment is made before, so that imports are not counted.
             first = entry.make(replace(setting, num_envs=1, num_threads=1))
-            memory, start = _memory(), time.perf_counter()
+            before, start = memory(), time.perf_counter()
             contender = entry.make(setting)
             created = time.perf_counter()
-            grown = _memory() - memory if memory else None
+            after = memory()
             for _ in range(_RESETS):
                 contender.reset()
             reset = (time.perf_counter() - created) / _RESETS
             n = setting.num_envs
             footprint = Footprint(
                 creation=(created - start) / n,
-                memory=None if grown is None else grown / n,
+                memory=(after - before) / n if after and before else None,
                 reset=reset / n,
             )
             first.close()
@@ -141,23 +143,3 @@ def _serve(pipe: Connection, name: str, setting: Setting) -> None:
     except Exception as error:
         # Any error of any contender: as text, since not all can be pickled.
         pipe.send(RuntimeError(f"{type(error).__name__}: {error}"))
-
-
-def _memory() -> float:
-    """Memory of this process and its children [MB]; 0 where it cannot be read."""
-    return sum(_proportional_set_size(pid) for pid in _family(os.getpid())) / 1e6
-
-
-def _family(pid: int) -> list[int]:
-    children = Path(f"/proc/{pid}/task").glob("*/children")
-    pids = [int(child) for file in children for child in file.read_text().split()]
-    return [pid, *(one for child in pids for one in _family(child))]
-
-
-def _proportional_set_size(pid: int) -> int:
-    """Resident memory [bytes], where a page that n processes share counts 1/n."""
-    file = Path(f"/proc/{pid}/smaps_rollup")
-    if not file.exists():
-        return 0
-    lines = file.read_text().splitlines()
-    return 1024 * next(int(s.split()[1]) for s in lines if s.startswith("Pss:"))

@@ -2,7 +2,7 @@
 
 import math
 import operator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 PhysicsName = Literal["exact", "fast"]
@@ -13,8 +13,8 @@ class PhysicsParams:
     """Parameters of the physics; the defaults are those of panda-gym 3.0.7.
 
     The control frequency is 1 / (``timestep`` * ``n_substeps``), 25 Hz by default.
-    Joints follow their targets by ``position_gain`` of the remaining error a substep:
-    who changes the timestep should change the gain too, see `with_substeps`.
+    Motors move joints by ``position_gain`` of the remaining error a substep: with
+    other substeps, another gain keeps the arm as quick, about 1 - 0.9 ** (20 / n).
 
     Args:
         timestep: length of one substep [s].
@@ -59,23 +59,14 @@ class PhysicsParams:
         """Length of one step [s]."""
         return self.timestep * self.n_substeps
 
-    def with_substeps(self, n_substeps: int) -> "PhysicsParams":
-        """The same step cut into other substeps, motors as stiff as before.
-
-        A motor leaves (1 - gain) of the error a substep: the gain changes so that it
-        leaves as much after a step as before.
-        """
-        ratio = self.n_substeps / n_substeps
-        return replace(
-            self,
-            n_substeps=n_substeps,
-            timestep=self.timestep * ratio,
-            position_gain=1 - (1 - self.position_gain) ** ratio,
-        )
-
 
 EXACT = PhysicsParams()
-FAST = EXACT.with_substeps(10)
+# 12 substeps for 20, with a fifth of the solver's iterations. A motor leaves 1 - gain of
+# the error a substep; this gain, somewhat more than 1 - 0.9 ** (20 / 12) = 0.161, makes
+# a struck puck slide as far as it does in exact physics, to about 2 %.
+FAST = PhysicsParams(
+    timestep=1 / 300, n_substeps=12, solver_iterations=10, position_gain=0.175
+)
 
 _NAMED: dict[str, PhysicsParams] = {"exact": EXACT, "fast": FAST}
 
