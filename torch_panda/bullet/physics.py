@@ -61,7 +61,7 @@ class PhysicsParams:
 
 
 EXACT = PhysicsParams()
-# 12 substeps for 20, with a fifth of the solver's iterations. A motor leaves 1 - gain of
+# 12 substeps for 20, with a fifth of the solver iterations. A motor leaves 1 - gain of
 # the error a substep; this gain, somewhat more than 1 - 0.9 ** (20 / 12) = 0.161, makes
 # a struck puck slide as far as it does in exact physics, to about 2 %.
 FAST = PhysicsParams(
