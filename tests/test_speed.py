@@ -13,7 +13,7 @@ import torch
 from torchrl.envs import GymEnv, ParallelEnv
 
 import torch_panda
-from tests.bare_bullet import is_available, load_bare_bullet
+from torch_panda.bench.bare_bullet import is_available, load_bare_bullet
 
 pytestmark = pytest.mark.slow
 NUM_ENVS = 16
@@ -104,7 +104,8 @@ def test_close_to_bare_bullet(tmp_path):
     time_steps(step)
     ratios = []
     for _ in range(pairs):
-        ours, bare = time_steps(step, steps), bare_bullet(NUM_ENVS, num_threads, steps)
+        ours = time_steps(step, steps)
+        bare = bare_bullet(NUM_ENVS, num_threads, steps).per_second
         ratios.append(ours / bare)
         print(f"torch_panda: {ours:.0f}, bare Bullet: {bare:.0f} steps/s")
     env.close()

@@ -1,6 +1,6 @@
 """Goal-conditioned Franka Panda tasks as one vectorised TorchRL environment."""
 
-from torch_panda.bullet import BulletError, Camera
+from torch_panda.bullet import BulletError, Camera, PhysicsName, PhysicsParams
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.gymnasium_envs import register_envs
 from torch_panda.registry import ENV_IDS, make, max_episode_steps
@@ -21,6 +21,8 @@ __all__ = [
     "Camera",
     "Flip",
     "Panda",
+    "PhysicsName",
+    "PhysicsParams",
     "PickAndPlace",
     "Push",
     "Reach",

@@ -233,6 +233,12 @@ physics_set_gravity = bind(
 physics_set_timestep = bind(
     _cheap, "b3PhysicsParamSetTimeStep", c_int, _command, c_double
 )
+physics_set_solver_iterations = bind(
+    _cheap, "b3PhysicsParamSetNumSolverIterations", c_int, _command, c_int
+)
+physics_set_residual_threshold = bind(
+    _cheap, "b3PhysicsParamSetSolverResidualThreshold", c_int, _command, c_double
+)
 step_init = bind(_cheap, "b3InitStepSimulationCommand", _command, _client)
 detect_init = bind(_cheap, "b3InitPerformCollisionDetectionCommand", _command, _client)
 

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 from torch_panda.bullet import _capi
 from torch_panda.bullet.contacts import ContactPoint, read_contact
+from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.shapes import Box, Cylinder, Look, Shape, Sphere
 
 _MAX_DOF = _capi.MAX_MULTI_DOF
-# pybullet's defaults for setJointMotorControlArray(POSITION_CONTROL).
-_KP = (c_double * _MAX_DOF)(*[0.1] * _MAX_DOF)
+# pybullet's default for setJointMotorControlArray(POSITION_CONTROL).
 _KD = (c_double * _MAX_DOF)(*[1.0] * _MAX_DOF)
 _TARGET_VELOCITY = (c_double * _MAX_DOF)()
 # Joints follow the base in Bullet's coordinates: 7 of its pose, 6 of its velocity.
@@ -152,8 +152,7 @@ class PhysicsClient:
     the same bodies to be seen.
 
     Args:
-        timestep: length of one step [s].
-        gravity: acceleration along the world's z axis [m/s^2].
+        physics: how it integrates.
 
     Raises:
         ImportError: the installed pybullet has another C API.
@@ -161,7 +160,7 @@ class PhysicsClient:
 
     _urdf_flags = _capi.URDF_IGNORE_VISUAL_SHAPES
 
-    def __init__(self, *, timestep: float = 1 / 500, gravity: float = -9.81) -> None:
+    def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
         self._bodies: list[int] = []
         self._num_detections = 0
         self._handle: int | None = _capi.connect_direct()
@@ -174,9 +173,12 @@ class PhysicsClient:
             self.close()
             raise _capi.wrong_pybullet(f"its status codes differ: {error}") from None
         command = _capi.physics_init(self._handle)
-        _capi.physics_set_timestep(command, timestep)
-        _capi.physics_set_gravity(command, 0.0, 0.0, gravity)
+        _capi.physics_set_timestep(command, physics.timestep)
+        _capi.physics_set_gravity(command, 0.0, 0.0, physics.gravity)
+        _capi.physics_set_solver_iterations(command, physics.solver_iterations)
+        _capi.physics_set_residual_threshold(command, physics.residual_threshold)
         self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+        self._kp = doubles([physics.position_gain] * _MAX_DOF)
 
     @property
     def is_closed(self) -> bool:
@@ -406,7 +408,8 @@ class PhysicsClient:
     def control_joints(self, body: int, targets: int, forces: Array[c_double]) -> None:
         """Drive all movable joints to target positions.
 
-        Does what pybullet's ``setJointMotorControlArray`` does in position control.
+        Does what pybullet's ``setJointMotorControlArray`` does in position control,
+        with the position gain of the client's physics.
 
         Args:
             body: the body.
@@ -420,7 +423,7 @@ class PhysicsClient:
             count = min(_MAX_DOF, len(forces) - first)
             q, u = first + _Q_OFFSET, first + _U_OFFSET
             _capi.motor_set_positions(command, q, targets + _DOUBLE * first, count)
-            _capi.motor_set_kp(command, u, _KP, count)
+            _capi.motor_set_kp(command, u, self._kp, count)
             _capi.motor_set_velocities(command, u, _TARGET_VELOCITY, count)
             _capi.motor_set_kd(command, u, _KD, count)
             _capi.motor_set_forces(command, u, byref(forces, _DOUBLE * first), count)

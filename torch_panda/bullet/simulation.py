@@ -12,13 +12,10 @@ from torch import Tensor
 
 from torch_panda.bullet.built_world import BuiltWorld
 from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
+from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool
 
 ControlType = Literal["ee", "joints"]
-
-TIMESTEP = 1 / 500  # [s], panda-gym 3.0.7
-N_SUBSTEPS = 20  # so 25 Hz, as the paper
-GRAVITY = -9.81  # [m/s^2]
 
 _DOUBLE = 8  # bytes
 
@@ -59,9 +56,7 @@ class VectorSimulation:
         build: builds the scene in a client; called once per client, in one thread.
         num_envs: number of clients.
         num_threads: number of threads; None means one per core, at most ``num_envs``.
-        timestep: length of one substep [s].
-        n_substeps: substeps per step.
-        gravity: along z [m/s^2].
+        physics: how the clients integrate.
 
     Attributes:
         joint_position: (num_envs, n_joints) [rad] or [m].
@@ -82,15 +77,13 @@ class VectorSimulation:
         num_envs: int,
         *,
         num_threads: int | None = None,
-        timestep: float = TIMESTEP,
-        n_substeps: int = N_SUBSTEPS,
-        gravity: float = GRAVITY,
+        physics: PhysicsParams = EXACT,
     ) -> None:
         if num_threads is None:
             num_threads = os.cpu_count() or 1
-        self.n_substeps = n_substeps
-        self.dt = timestep * n_substeps
-        self._make_client = partial(PhysicsClient, timestep=timestep, gravity=gravity)
+        self.n_substeps = physics.n_substeps
+        self.dt = physics.dt
+        self._make_client = partial(PhysicsClient, physics=physics)
         self._build = build
         self._clients: list[PhysicsClient] = []
         self._built_worlds: list[BuiltWorld] = []

@@ -19,8 +19,11 @@ from torch_panda.bullet import (
     BulletError,
     Camera,
     PhysicsClient,
+    PhysicsName,
+    PhysicsParams,
     Scene,
     VectorSimulation,
+    read_physics,
 )
 from torch_panda.bullet.camera import resized
 from torch_panda.bullet.renderers import RendererName
@@ -59,6 +62,7 @@ class RobotTaskEnv(EnvBase):
         max_episode_steps: steps until ``truncated``; None means the task's number.
         terminate_on_success: whether success ends an episode, as in panda-gym 3; the
             paper's episodes go on.
+        physics: how Bullet integrates: "exact" (as panda-gym), "fast", or parameters.
         from_pixels: observe ``pixels``, uint8 (*batch, height, width, 3).
         pixels_only: leave ``observation`` out; the goals stay.
         camera: of what is observed; None means panda-gym's view in 64 x 64 pixels.
@@ -93,6 +97,7 @@ class RobotTaskEnv(EnvBase):
         device: torch.device | str | int | None = None,
         max_episode_steps: int | None = None,
         terminate_on_success: bool = False,
+        physics: PhysicsParams | PhysicsName = "exact",
         from_pixels: bool = False,
         pixels_only: bool = False,
         camera: Camera | None = None,
@@ -131,13 +136,14 @@ class RobotTaskEnv(EnvBase):
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
+        self.physics = read_physics(physics)
         self._constructor_seed = seed
         self._set_seed(seed)
         count = num_envs or 1
         self._step_count = torch.zeros(count, 1, dtype=torch.int64)
         self._goal = torch.zeros(count, task.goal_dim, dtype=torch.float64)
         self._simulation = VectorSimulation(
-            self._build_scene, count, num_threads=num_threads
+            self._build_scene, count, num_threads=num_threads, physics=self.physics
         )
         self._renderer = Renderer(self._simulation, self._make_twin, renderer=renderer)
         self._senses = self._options.make(self._simulation, self._renderer, robot)
@@ -264,6 +270,7 @@ class RobotTaskEnv(EnvBase):
             terminate_on_success=self.terminate_on_success,
             **vars(self._options),
             on_divergence=self.on_divergence,
+            physics=self.physics,
         )
         return build, ()
 

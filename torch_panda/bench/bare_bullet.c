@@ -202,24 +202,30 @@ static void *work(void *argument) {
     return NULL;
 }
 
-/* Steps per second of all environments together. */
-double bare_bullet(const char *urdf, int num_envs, int num_threads, int steps) {
+static double now(clockid_t clock) { /* [s] */
+    struct timespec time;
+    clock_gettime(clock, &time);
+    return time.tv_sec + time.tv_nsec * 1e-9;
+}
+
+/* The seconds that the steps take, and their processor time. */
+void bare_bullet(const char *urdf, int num_envs, int num_threads, int steps,
+                 double *wall, double *cpu) {
     struct environment *environments = calloc(num_envs, sizeof *environments);
     struct share *shares = calloc(num_threads, sizeof *shares);
     pthread_t *threads = calloc(num_threads, sizeof *threads);
-    struct timespec start, end;
     for (int i = 0; i < num_envs; i++) build(&environments[i], urdf, i);
 
-    clock_gettime(CLOCK_MONOTONIC, &start);
+    *wall = -now(CLOCK_MONOTONIC);
+    *cpu = -now(CLOCK_PROCESS_CPUTIME_ID);
     for (int k = 0; k < num_threads; k++) {
         shares[k] = (struct share){environments, k, num_threads, num_envs, steps};
         pthread_create(&threads[k], NULL, work, &shares[k]);
     }
     for (int k = 0; k < num_threads; k++) pthread_join(threads[k], NULL);
-    clock_gettime(CLOCK_MONOTONIC, &end);
+    *wall += now(CLOCK_MONOTONIC);
+    *cpu += now(CLOCK_PROCESS_CPUTIME_ID);
 
     for (int i = 0; i < num_envs; i++) b3DisconnectSharedMemory(environments[i].client);
     free(environments), free(shares), free(threads);
-    double seconds = (end.tv_sec - start.tv_sec) + (end.tv_nsec - start.tv_nsec) * 1e-9;
-    return num_envs * (double)steps / seconds;
 }

@@ -1,0 +1,107 @@
+"""Physics parameters: what they promise, and what they refuse."""
+
+import pickle
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda import PhysicsParams
+from torch_panda.bullet import EXACT, FAST, PhysicsClient
+from torch_panda.bullet.client import read_doubles
+
+
+def rollout(physics, env_id="PandaPush-v1", steps=20):
+    """Observations while the arm moves to the cube and pushes it, (4, steps, 18)."""
+    with torch_panda.make(env_id, num_envs=4, seed=1, physics=physics) as env:
+
+        def towards_cube(td):
+            offset = td["achieved_goal"] - td["observation"][:, :3]
+            return td.set("action", (offset * 20).clamp(-1, 1))
+
+        return env.rollout(steps, towards_cube)["next", "observation"]
+
+
+def test_exact_is_the_default():
+    assert PhysicsParams() == EXACT
+    assert PhysicsParams(1 / 500, 20, 50, 1e-7, 0.1, -9.81) == EXACT
+    with torch_panda.make("PandaReach-v1") as env:
+        assert env.physics == EXACT
+    explicit = rollout(PhysicsParams(timestep=0.002, n_substeps=20))
+    assert torch.equal(rollout("exact"), explicit)
+
+
+def test_fast_moves_the_arm_as_exact_does():
+    assert pytest.approx(EXACT.dt) == FAST.dt
+    exact, fast = rollout("exact", "PandaReach-v1"), rollout("fast", "PandaReach-v1")
+    assert not torch.equal(exact, fast)
+    distance = (exact - fast)[..., :3].norm(dim=-1)
+    assert distance.max() < 5e-3  # [m]
+
+
+def test_the_named_preset_is_the_parameters():
+    assert torch.equal(rollout("fast"), rollout(FAST))
+
+
+def fall(physics, seconds=0.2):
+    """Height that a body falls [m]."""
+    with PhysicsClient(physics=physics) as client:
+        body = client.create_sphere(0.1, mass=1.0, position=(0.0, 0.0, 0.0))
+        client.step(round(seconds / physics.timestep))
+        return -read_doubles(client.state(body).q, 3)[2]
+
+
+def test_timestep_and_gravity_reach_bullet():
+    # Semi-implicit Euler falls g (t^2 + t dt) / 2, but for Bullet's damping.
+    for physics in (PhysicsParams(), PhysicsParams(timestep=0.01, gravity=-2.0)):
+        t, dt = 0.2, physics.timestep
+        expected = -physics.gravity * (t * t + t * dt) / 2
+        assert fall(physics) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"solver_iterations": 1},
+        {"residual_threshold": 1.0},
+        {"position_gain": 0.2},
+    ],
+)
+def test_every_parameter_reaches_bullet(change):
+    assert not torch.equal(rollout("exact"), rollout(PhysicsParams(**change)))
+
+
+def test_environments_are_pickled_with_their_physics():
+    with torch_panda.make("PandaReach-v1", num_envs=2, physics="fast") as env:
+        pickled = pickle.dumps(env)
+    with pickle.loads(pickled) as copy:
+        assert copy.physics == FAST
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"timestep": 0.0}, "timestep must be positive"),
+        ({"timestep": float("nan")}, "timestep must be positive"),
+        ({"n_substeps": 0}, "n_substeps must be at least 1, got 0"),
+        ({"solver_iterations": -1}, "solver_iterations must be at least 1, got -1"),
+        ({"residual_threshold": -1.0}, "residual_threshold must not be negative"),
+        ({"position_gain": 0.0}, r"position_gain must lie in \(0, 1\], got 0.0"),
+        ({"position_gain": 1.5}, r"position_gain must lie in \(0, 1\], got 1.5"),
+        ({"gravity": float("inf")}, "gravity must be finite"),
+    ],
+)
+def test_bad_parameters(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        PhysicsParams(**arguments)
+
+
+def test_substeps_are_whole_numbers():
+    with pytest.raises(TypeError):
+        PhysicsParams(n_substeps=2.5)
+
+
+@pytest.mark.parametrize("physics", ["fastest", None, 3])
+def test_unknown_physics(physics):
+    with pytest.raises(ValueError, match=r"one of \('exact', 'fast'\), got"):
+        torch_panda.make("PandaReach-v1", physics=physics)

@@ -1,0 +1,72 @@
+"""What the fast preset costs and brings: pytest -m slow -s this file."""
+
+import importlib.util
+import statistics
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda.bench.comparison import compare
+from torch_panda.bench.contenders import Setting
+
+FILE = Path(__file__).parents[2] / "examples" / "experts.py"
+spec = importlib.util.spec_from_file_location("experts_for_physics", FILE)
+experts = importlib.util.module_from_spec(spec)
+# Dataclasses look their module up.
+sys.modules[spec.name] = experts
+spec.loader.exec_module(experts)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("task", ["Push", "Stack"])
+def test_half_as_many_steps_again(task):
+    setting = Setting(f"Panda{task}-v1", num_envs=8, num_threads=1)
+    (_, fast), _ = compare(
+        setting, ["fast"], rounds=5, steps=50, progress=lambda what: None
+    )
+    gains = [1 / ratio.per_cpu_second for ratio in fast.ratios]
+    gain = statistics.median(gains)
+    print(f"{task}: {gain:.2f} ({min(gains):.2f} to {max(gains):.2f}) times as fast")
+    assert gain >= 1.5
+
+
+def success(task, physics, episodes):
+    """Whether an expert succeeds, at the end and at any time: (episodes, 2)."""
+    env_id, flags = f"Panda{task}-v1", []
+    expert = experts.make_expert(env_id)
+    with torch_panda.make(env_id, num_envs=32, seed=7, physics=physics) as env:
+        while len(flags) < episodes:
+            for episode in experts.play(env, expert):
+                reached = episode["next", "success"]
+                flags.append((reached[-1].item(), reached.any().item()))
+    return torch.tensor(flags).double()
+
+
+# Slide and Flip hang by a thread in exact physics, too: more episodes tell.
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("task", "episodes"),
+    [
+        ("Reach", 256),
+        ("Push", 256),
+        ("PickAndPlace", 256),
+        ("Stack", 256),
+        ("Slide", 2048),
+        ("Flip", 1024),
+    ],
+)
+def test_experts_succeed_as_often(task, episodes):
+    """At the end of the episode: within 2 points, but for the sampling error."""
+    exact, fast = (success(task, name, episodes) for name in ("exact", "fast"))
+    change = 100 * (fast - exact)  # the same starts and goals: paired
+    mean, error = change.mean(0), 1.96 * change.std(0) / episodes**0.5
+    for k, when in enumerate(("at the end", "at any time")):
+        print(
+            f"{task}: {when} exact {100 * exact[:, k].mean():.1f} %, "
+            f"fast {100 * fast[:, k].mean():.1f} %, {mean[k]:+.1f} +- {error[k]:.1f}"
+        )
+    assert mean[0] + error[0] > -2

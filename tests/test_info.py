@@ -1,0 +1,23 @@
+"""``python -m torch_panda info``."""
+
+import re
+import subprocess
+import sys
+
+import torch_panda
+
+
+def test_names_versions_ids_and_spaces():
+    command = (sys.executable, "-m", "torch_panda", "info")
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert re.search(r"pybullet 3\.\d", output)
+    assert "cores usable" in output
+    assert "TinyRenderer" in output
+    push = "PandaPush{-v1,-v3,Dense-v1,Dense-v3}"
+    assert f"{push}: observation 18, goal 3, action 3 in [-1, 1], 50 steps" in output
+    named = [
+        family + suffix
+        for family, suffixes in re.findall(r"(Panda\w+)\{(.*?)\}", output)
+        for suffix in suffixes.split(",")
+    ]
+    assert sorted(named) == sorted(torch_panda.ENV_IDS)

@@ -1,0 +1,264 @@
+"""What the benchmark compares: this package, its limit, and other vector environments.
+
+Others are told apart by what is installed, and are imported only when they are made.
+"""
+
+import re
+import tempfile
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, GymEnv, ParallelEnv
+
+import torch_panda
+from torch_panda.bench.bare_bullet import Speed, is_available, load_bare_bullet
+from torch_panda.bench.processes import cpu_time
+
+# Workers are forked, as Gymnasium does by default on Linux: that is how they start
+# fastest and share most memory.
+_START_METHOD = "fork"
+_FETCH_TASKS = ("Reach", "Push", "Slide", "PickAndPlace")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is measured at once.
+
+    Attributes:
+        env_id: one of `torch_panda.ENV_IDS`.
+        num_envs: number of environments.
+        num_threads: threads of what runs in threads.
+    """
+
+    env_id: str
+    num_envs: int
+    num_threads: int
+
+    @property
+    def task(self) -> str:
+        """The task's name, for instance "Push"."""
+        match = re.fullmatch(r"Panda(.+?)(Joints)?(Dense)?-v\d", self.env_id)
+        assert match is not None
+        return match[1]
+
+    @property
+    def is_joints(self) -> bool:
+        """Whether actions are of the joints."""
+        return "Joints" in self.env_id
+
+
+class Contender(ABC):
+    """``num_envs`` environments that are stepped with random actions."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Step all environments once, and reset those whose episode ended."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Reset all environments."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free all of it."""
+
+    def measure(self, num_envs: int, steps: int) -> Speed:
+        """Speed of all environments over some steps of each."""
+        start, cpu_start = time.perf_counter(), cpu_time()
+        for _ in range(steps):
+            self.step()
+        wall, cpu = time.perf_counter() - start, cpu_time() - cpu_start
+        # Processor time is counted in ticks of 10 ms: a short run may see none.
+        return Speed(num_envs * steps / wall, num_envs * steps / max(cpu, 0.01))
+
+
+class TorchRLContender(Contender):
+    """A batched environment of torchrl."""
+
+    def __init__(self, env: EnvBase) -> None:
+        self._env = env
+        self._action_shape = env.action_spec.shape
+        self._td: TensorDictBase = env.reset()
+
+    def step(self) -> None:
+        """Step all environments once."""
+        self._td["action"] = torch.rand(self._action_shape) * 2 - 1
+        _, self._td = self._env.step_and_maybe_reset(self._td)
+
+    def reset(self) -> None:
+        """Reset all environments."""
+        self._td = self._env.reset()
+
+    def close(self) -> None:
+        """Free all of it."""
+        self._env.close()
+
+
+class VectorEnvContender(Contender):
+    """A vector environment of Gymnasium or Stable-Baselines3."""
+
+    def __init__(self, env: Any, num_envs: int, action_dim: int) -> None:  # noqa: ANN401 (two libraries)
+        self._env = env
+        self._action_shape = (num_envs, action_dim)
+        self._rng = np.random.default_rng(0)
+        self.reset()
+
+    def step(self) -> None:
+        """Step all environments once."""
+        action = self._rng.uniform(-1, 1, size=self._action_shape)
+        self._env.step(action.astype(np.float32))
+
+    def reset(self) -> None:
+        """Reset all environments."""
+        self._env.reset()
+
+    def close(self) -> None:
+        """Free all of it."""
+        self._env.close()
+
+
+class BareBulletContender(Contender):
+    """The Push scene, stepped by C threads that never wait for each other."""
+
+    def __init__(self, setting: Setting) -> None:
+        self._setting = setting
+        self._directory = tempfile.TemporaryDirectory()
+        self._run = load_bare_bullet(self._directory.name)
+
+    def step(self) -> None:
+        """Not available: all its steps run in C, see `measure`."""
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Not available: its resets run in C."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Remove the compiled library."""
+        self._directory.cleanup()
+
+    def measure(self, num_envs: int, steps: int) -> Speed:
+        """Build the environments, then time their steps."""
+        return self._run(num_envs, self._setting.num_threads, steps)
+
+
+def _make_ours(physics: torch_panda.PhysicsName, setting: Setting) -> Contender:
+    return TorchRLContender(
+        torch_panda.make(
+            setting.env_id,
+            num_envs=setting.num_envs,
+            num_threads=setting.num_threads,
+            seed=0,
+            physics=physics,
+        )
+    )
+
+
+def _panda_gym_id(setting: Setting) -> str:
+    major = version("panda-gym").split(".")[0]
+    return f"panda_gym:{setting.env_id.rsplit('-', 1)[0]}-v{major}"
+
+
+def _fetch_id(setting: Setting) -> str:
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    prefix = f"Fetch{setting.task}"
+    versions = [
+        spec.version or 0 for spec in gymnasium.registry.values() if spec.name == prefix
+    ]
+    return f"gymnasium_robotics:{prefix}-v{max(versions)}"
+
+
+def _make_async_vector(get_id: Callable[[Setting], str], setting: Setting) -> Contender:
+    make_env = partial(gymnasium.make, get_id(setting))
+    env = gymnasium.vector.AsyncVectorEnv(
+        [make_env] * setting.num_envs, context=_START_METHOD
+    )
+    action_dim = gymnasium.spaces.flatdim(env.single_action_space)
+    return VectorEnvContender(env, setting.num_envs, action_dim)
+
+
+def _make_subproc_vec(setting: Setting) -> Contender:
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    make_env = partial(gymnasium.make, _panda_gym_id(setting))
+    env = SubprocVecEnv([make_env] * setting.num_envs, start_method=_START_METHOD)
+    action_dim = gymnasium.spaces.flatdim(env.action_space)
+    return VectorEnvContender(env, setting.num_envs, action_dim)
+
+
+def _make_parallel(setting: Setting) -> Contender:
+    make_env = partial(GymEnv, _panda_gym_id(setting))
+    return TorchRLContender(
+        ParallelEnv(setting.num_envs, make_env, mp_start_method=_START_METHOD)
+    )
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A contender by name.
+
+    Attributes:
+        title: how the table calls it.
+        make: makes it.
+        needs: modules that must be installed.
+        is_limit: whether it is Bullet alone: no environments that could be reset.
+        is_fetch: whether it runs the Fetch robot's task of the same name.
+    """
+
+    title: str
+    make: Callable[[Setting], Contender]
+    needs: tuple[str, ...] = ()
+    is_limit: bool = False
+    is_fetch: bool = False
+
+    def why_not(self, setting: Setting) -> str | None:
+        """Why it cannot be measured here; None where it can."""
+        missing = [module for module in self.needs if find_spec(module) is None]
+        if missing:
+            return f"{' and '.join(missing)} not installed"
+        if self.is_limit and (setting.task != "Push" or setting.is_joints):
+            return "it steps the scene of Push, with end-effector control, only"
+        if self.is_limit and not is_available():
+            return "needs Linux and a C compiler (cc)"
+        if self.is_fetch and (setting.task not in _FETCH_TASKS or setting.is_joints):
+            return f"Fetch has no task like {setting.env_id}"
+        return None
+
+
+OURS = "torch_panda"
+CONTENDERS: dict[str, Entry] = {
+    OURS: Entry("torch_panda", partial(_make_ours, "exact")),
+    "fast": Entry('torch_panda, physics="fast"', partial(_make_ours, "fast")),
+    "bare-bullet": Entry("bare Bullet, C threads", BareBulletContender, is_limit=True),
+    "async": Entry(
+        "panda-gym, AsyncVectorEnv",
+        partial(_make_async_vector, _panda_gym_id),
+        needs=("panda_gym",),
+    ),
+    "sb3": Entry(
+        "panda-gym, SB3 SubprocVecEnv",
+        _make_subproc_vec,
+        needs=("panda_gym", "stable_baselines3"),
+    ),
+    "parallel": Entry(
+        "panda-gym, torchrl ParallelEnv", _make_parallel, needs=("panda_gym",)
+    ),
+    "fetch": Entry(
+        "Fetch (MuJoCo), AsyncVectorEnv",
+        partial(_make_async_vector, _fetch_id),
+        needs=("gymnasium_robotics",),
+        is_fetch=True,
+    ),
+}
