@@ -8,6 +8,7 @@ import pybullet
 import pybullet_data
 import pytest
 import torch
+from pybullet_utils.bullet_client import BulletClient
 
 from torch_panda.bullet import BulletError, PhysicsClient, _capi
 
@@ -23,12 +24,13 @@ def read(address, count):
 
 @pytest.fixture
 def reference():
-    client = pybullet.connect(pybullet.DIRECT)
-    pybullet.setAdditionalSearchPath(pybullet_data.getDataPath())
-    pybullet.setTimeStep(1 / 500)
-    pybullet.setGravity(0, 0, -9.81)
-    yield pybullet
-    pybullet.disconnect(client)
+    # Not pybullet's default client, which another test may have left connected.
+    client = BulletClient(pybullet.DIRECT)
+    client.setAdditionalSearchPath(pybullet_data.getDataPath())
+    client.setTimeStep(1 / 500)
+    client.setGravity(0, 0, -9.81)
+    yield client
+    client.disconnect()
 
 
 def create(reference, client, kind, mass, position):

@@ -78,8 +78,7 @@ class Contender(ABC):
         for _ in range(steps):
             self.step()
         wall, cpu = time.perf_counter() - start, cpu_time() - cpu_start
-        # Processor time is counted in ticks of 10 ms: a short run may see none.
-        return Speed(num_envs * steps / wall, num_envs * steps / max(cpu, 0.01))
+        return Speed(num_envs * steps / wall, num_envs * steps / cpu)
 
 
 class TorchRLContender(Contender):
