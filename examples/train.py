@@ -50,7 +50,7 @@ class Args(Hyperparameters):
     """share of relabelled transitions, k / (k + 1): k = 4 goals per transition"""
     seed: int = 0
     """of the environments, the networks and the sampling"""
-    num_envs: int = 8
+    num_envs: int = 4
     """environments that are stepped in parallel"""
     num_threads: int | None = None
     """threads that step them; None means one per core"""
@@ -87,7 +87,9 @@ class Args(Hyperparameters):
 
 PRESETS = {
     "paper": Args(),
-    "tuned": Args(preset="tuned", gamma=0.95, keep_unmoved=0.1, max_random_eps=1.0),
+    "tuned": Args(
+        preset="tuned", num_envs=8, gamma=0.95, keep_unmoved=0.1, max_random_eps=1.0
+    ),
 }
 # What may differ between a run and its continuation.
 FREE_ARGUMENTS = {
