@@ -224,15 +224,15 @@ class Entry:
 
     def why_not(self, setting: Setting) -> str | None:
         """Why it cannot be measured here; None where it can."""
-        missing = [module for module in self.needs if find_spec(module) is None]
-        if missing:
-            return f"{' and '.join(missing)} not installed"
         if self.is_limit and (setting.task != "Push" or setting.is_joints):
             return "it steps the scene of Push, with end-effector control, only"
         if self.is_limit and not is_available():
             return "needs Linux and a C compiler (cc)"
         if self.is_fetch and (setting.task not in _FETCH_TASKS or setting.is_joints):
             return f"Fetch has no task like {setting.env_id}"
+        missing = [module for module in self.needs if find_spec(module) is None]
+        if missing:
+            return f"{' and '.join(missing)} not installed"
         return None
 
 
