@@ -54,6 +54,8 @@ class Args(Hyperparameters):
     """environments that are stepped in parallel"""
     num_threads: int | None = None
     """threads that step them; None means one per core"""
+    torch_threads: int = 1
+    """threads of a gradient step on the CPU; more pay off only on idle cores"""
     device: str = "cpu"
     """of the networks and the replay buffer"""
     total_steps: int = 10_000
@@ -93,7 +95,7 @@ PRESETS = {
 }
 # What may differ between a run and its continuation.
 FREE_ARGUMENTS = {
-    *("resume", "out", "num_threads", "tensorboard", "save_interval", "video")
+    *("resume", "out", "num_threads", "tensorboard", "save_interval", "video"),
 }
 SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
 STORED_KEYS = [
@@ -128,6 +130,7 @@ class Run:
             num_threads=args.num_threads,
             device=args.device,
         )
+        torch.set_num_threads(args.torch_threads)
         torch.manual_seed(args.seed)
         self.agent = Agent(
             self.env,
