@@ -26,6 +26,7 @@ from torchrl.objectives.value import TD0Estimator
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
 
 STATE_KEYS = ["observation", "desired_goal"]
+STOCHASTIC = ("sac", "tqc")  # policies that draw their actions
 CLIP_OBSERVATION = 200.0  # the panda-gym paper
 CLIP_NORMALIZED = 5.0  # OpenAI Baselines' HER
 POLICY_DELAY = 2  # TD3: critic updates per actor update (arXiv 1802.09477)
@@ -142,17 +143,12 @@ class Agent(nn.Module):
     ) -> None:
         super().__init__()
         hp = self.hyperparameters = hyperparameters
-        size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
-        action_size = env.action_spec.shape[-1]
-        stochastic = hp.algo in ("sac", "tqc")
         num_q = 2 if hp.double_q and hp.algo != "ddpg" else 1
 
-        self.normalizer = Normalizer(size)
-        normalize = Mod(self.normalizer, STATE_KEYS, ["normalized"])
-        actor = _actor(size, action_size, hp.hidden_size, stochastic)
+        self.normalizer, actor, normalize = _make_policy(env, hp)
         critic = Mod(
             MLP(
-                in_features=size + action_size,
+                in_features=len(self.normalizer.mean) + env.action_spec.shape[-1],
                 out_features=NUM_QUANTILES if hp.algo == "tqc" else 1,
                 num_cells=[hp.hidden_size] * 3,
                 activation_class=nn.ReLU,
@@ -162,7 +158,7 @@ class Agent(nn.Module):
         )
         self.policy = self.explore = Seq(normalize, actor)
         action_spec = env.action_spec_unbatched
-        if stochastic:
+        if hp.algo in STOCHASTIC:
             loss_class = SACLoss if hp.algo == "sac" else TQCLoss
             options: dict[str, object] = {
                 "num_qvalue_nets": num_q,
@@ -239,7 +235,7 @@ class Agent(nn.Module):
     def _losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Losses whose gradients touch only the network that each one trains."""
         algo, loss = self.hyperparameters.algo, self.loss
-        if algo in ("sac", "tqc"):
+        if algo in STOCHASTIC:
             every = loss(batch)
             return {key: every[key] for key in loss.out_keys if key.startswith("loss_")}
         if algo == "ddpg":
@@ -278,22 +274,28 @@ class Agent(nn.Module):
             self.loss.make_value_estimator(gamma=gamma)
 
 
-def _actor(size: int, action_size: int, hidden_size: int, stochastic: bool) -> Mod:
-    """From ``normalized`` (..., size) to ``action`` (..., action_size)."""
+def _make_policy(env: EnvBase, hp: Hyperparameters) -> tuple[Normalizer, Mod, Mod]:
+    """The normaliser, the actor from ``normalized``, and the module between them."""
+    size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
+    normalizer = Normalizer(size)
+    normalize = Mod(normalizer, STATE_KEYS, ["normalized"])
+    stochastic = hp.algo in STOCHASTIC
     net = MLP(
         in_features=size,
-        out_features=action_size * (2 if stochastic else 1),
-        num_cells=[hidden_size] * 3,
+        out_features=env.action_spec.shape[-1] * (2 if stochastic else 1),
+        num_cells=[hp.hidden_size] * 3,
         activation_class=nn.ReLU,
     )
     if not stochastic:
-        return Mod(nn.Sequential(net, nn.Tanh()), ["normalized"], ["action"])
+        actor = Mod(nn.Sequential(net, nn.Tanh()), ["normalized"], ["action"])
+        return normalizer, actor, normalize
     parameters = Mod(
         nn.Sequential(net, NormalParamExtractor()), ["normalized"], ["loc", "scale"]
     )
-    return ProbabilisticActor(
+    actor = ProbabilisticActor(
         parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal
     )
+    return normalizer, actor, normalize
 
 
 def save_policy(path: Path, agent: Agent, env_id: str) -> None:
@@ -316,7 +318,8 @@ def load_policy(checkpoint: dict[str, Any], env: EnvBase) -> Seq:
         ValueError: the environment's spaces are not those it was trained on.
     """
     hp = Hyperparameters(**checkpoint["hyperparameters"])
-    policy = Agent(env, hp, max_episode_steps=50, sparse=True).policy
+    _, actor, normalize = _make_policy(env, hp)
+    policy = Seq(normalize, actor)
     try:
         policy.load_state_dict(checkpoint["policy"])
     except RuntimeError as error:

@@ -95,7 +95,12 @@ PRESETS = {
 }
 # What may differ between a run and its continuation.
 FREE_ARGUMENTS = {
-    *("resume", "out", "num_threads", "tensorboard", "save_interval", "video"),
+    "resume",
+    "out",
+    "num_threads",
+    "tensorboard",
+    "save_interval",
+    "video",
 }
 SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
 STORED_KEYS = [

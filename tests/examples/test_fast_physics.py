@@ -1,23 +1,14 @@
 """What the fast preset costs and brings: pytest -m slow -s this file."""
 
-import importlib.util
 import statistics
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
+import experts
 import torch_panda
 from torch_panda.bench.comparison import compare
 from torch_panda.bench.contenders import Setting
-
-FILE = Path(__file__).parents[2] / "examples" / "experts.py"
-spec = importlib.util.spec_from_file_location("experts_for_physics", FILE)
-experts = importlib.util.module_from_spec(spec)
-# Dataclasses look their module up.
-sys.modules[spec.name] = experts
-spec.loader.exec_module(experts)
 
 pytestmark = pytest.mark.slow
 
