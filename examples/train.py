@@ -56,6 +56,9 @@ class Args(Hyperparameters):
     """threads that step them; None means one per core"""
     torch_threads: int = 1
     """threads of a gradient step on the CPU; more pay off only on idle cores"""
+    matmul_precision: Literal["highest", "high", "medium"] = "medium"
+    """torch's precision of float32 products. "medium" permits bfloat16; on CPUs with
+    AVX-512 it selects oneDNN, there up to twice as fast as MKL"""
     device: str = "cpu"
     """of the networks and the replay buffer"""
     total_steps: int = 10_000
@@ -136,6 +139,7 @@ class Run:
             device=args.device,
         )
         torch.set_num_threads(args.torch_threads)
+        torch.set_float32_matmul_precision(args.matmul_precision)
         torch.manual_seed(args.seed)
         self.agent = Agent(
             self.env,

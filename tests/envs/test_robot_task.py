@@ -295,9 +295,10 @@ def test_nothing_is_left_behind():
     assert threading.active_count() == before
 
 
-def test_error_in_a_worker_names_the_environment(env, monkeypatch):
+@pytest.mark.parametrize("index", [0, 1])
+def test_error_in_a_worker_names_the_environment(env, monkeypatch, index):
     td = env.reset()
-    broken = env._simulation._clients[1]
+    broken = env._simulation._clients[index]
     original = PhysicsClient.step
 
     def step(self, count=1):
@@ -307,7 +308,7 @@ def test_error_in_a_worker_names_the_environment(env, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(PhysicsClient, "step", step)
-        with pytest.raises(RuntimeError, match="environment 1: BulletError"):
+        with pytest.raises(RuntimeError, match=f"environment {index}: BulletError"):
             env.step(td.set("action", torch.zeros(3, 3)))
     assert env.rollout(5).shape == (3, 5)
 

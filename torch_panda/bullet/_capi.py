@@ -208,6 +208,9 @@ _address = POINTER(c_void_p)
 connect_direct = bind(_work, "b3ConnectPhysicsDirect", _client)
 disconnect = bind(_work, "b3DisconnectSharedMemory", None, _client)
 submit = bind(_work, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command)
+submit_quick = bind(  # for what takes Bullet a microsecond
+    _cheap, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command
+)
 status_type = bind(_cheap, "b3GetStatusType", c_int, _status)
 # lfind(key, base, &count, width, compare) of <search.h>, on POSIX systems, calls
 # compare(key, base + k * width) until it answers 0. With compare = submit, key =
@@ -383,15 +386,6 @@ motor_init = bind(_cheap, "b3JointControlCommandInit2", _command, _client, c_int
 motor_set_positions = bind(
     _cheap,
     "b3JointControlSetDesiredPositionMultiDof",
-    c_int,
-    _command,
-    c_int,
-    _doubles,
-    c_int,
-)
-motor_set_velocities = bind(
-    _cheap,
-    "b3JointControlSetDesiredVelocityMultiDof",
     c_int,
     _command,
     c_int,

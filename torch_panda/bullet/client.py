@@ -17,7 +17,6 @@ from torch_panda.bullet.shapes import Box, Cylinder, Look, Shape, Sphere
 _MAX_DOF = _capi.MAX_MULTI_DOF
 # pybullet's default for setJointMotorControlArray(POSITION_CONTROL).
 _KD = (c_double * _MAX_DOF)(*[1.0] * _MAX_DOF)
-_TARGET_VELOCITY = (c_double * _MAX_DOF)()
 # Joints follow the base in Bullet's coordinates: 7 of its pose, 6 of its velocity.
 _Q_OFFSET = 7
 _U_OFFSET = 6
@@ -409,7 +408,8 @@ class PhysicsClient:
         """Drive all movable joints to target positions.
 
         Does what pybullet's ``setJointMotorControlArray`` does in position control,
-        with the position gain of the client's physics.
+        with the position gain of the client's physics. The target velocity that it
+        sets is Bullet's default, 0.
 
         Args:
             body: the body.
@@ -424,11 +424,12 @@ class PhysicsClient:
             q, u = first + _Q_OFFSET, first + _U_OFFSET
             _capi.motor_set_positions(command, q, targets + _DOUBLE * first, count)
             _capi.motor_set_kp(command, u, self._kp, count)
-            _capi.motor_set_velocities(command, u, _TARGET_VELOCITY, count)
             _capi.motor_set_kd(command, u, _KD, count)
             _capi.motor_set_forces(command, u, byref(forces, _DOUBLE * first), count)
-        self._submit(
-            command, _capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
+        # Bullet only takes notes: done before another thread could use the GIL.
+        status = _capi.submit_quick(self._open(), command)
+        self._check(
+            status, _capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
         )
 
     def step(self, count: int = 1) -> None:
