@@ -11,7 +11,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule as Mod
 from tensordict.nn import TensorDictSequential as Seq
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 from torchrl.modules import (
     MLP,
     AdditiveGaussianModule,
@@ -22,6 +21,9 @@ from torchrl.modules import (
 )
 from torchrl.objectives import DDPGLoss, SACLoss, SoftUpdate, TD3Loss, TQCLoss
 from torchrl.objectives.value import TD0Estimator
+
+from geometry import Geometry, read_geometry
+from torch_panda import RobotTaskEnv
 
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
 
@@ -61,6 +63,10 @@ class Hyperparameters:
     """DDPG, TD3: standard deviation of the Gaussian noise on actions"""
     policy_noise: float = 0.2
     """TD3: standard deviation of the noise on target actions, clipped at 0.5"""
+    relative_inputs: bool = False
+    """give the networks objects from the end-effector and goals from objects, too"""
+    mirror: bool = False
+    """mirror half of each batch in the plane in which robot and table are symmetric"""
     alpha: float = 0.2
     """SAC, TQC: entropy coefficient, or its first value"""
     learn_alpha: bool = False
@@ -70,7 +76,12 @@ class Hyperparameters:
 
 
 class Normalizer(nn.Module):
-    """Running standardisation of what the networks see, as in OpenAI Baselines."""
+    """Running standardisation of what the networks see, as in OpenAI Baselines.
+
+    Args:
+        size: of observation and goal together.
+        geometry: whose differences the networks see, too.
+    """
 
     count: Tensor
     total: Tensor
@@ -78,8 +89,10 @@ class Normalizer(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, geometry: Geometry | None = None) -> None:
         super().__init__()
+        self.geometry = geometry
+        size += 0 if geometry is None else len(geometry.later)
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
@@ -88,8 +101,7 @@ class Normalizer(nn.Module):
 
     def update(self, observation: Tensor, goal: Tensor) -> None:
         """Take more rows, (..., size of each), into the statistics."""
-        rows = torch.cat((observation, goal), -1).flatten(0, -2).double()
-        rows = rows.clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
+        rows = self._inputs(observation, goal).flatten(0, -2).double()
         self.count += len(rows)
         self.total += rows.sum(0)
         self.total_squared += rows.square().sum(0)
@@ -100,10 +112,14 @@ class Normalizer(nn.Module):
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Standardise (..., size of each) to (..., size)."""
-        inputs = torch.cat((observation, goal), -1)
-        inputs = inputs.clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
-        normalized = (inputs - self.mean) / self.std
+        normalized = (self._inputs(observation, goal) - self.mean) / self.std
         return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+
+    def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
+        inputs = [observation, goal]
+        if self.geometry is not None:
+            inputs.append(self.geometry.differences(observation, goal))
+        return torch.cat(inputs, -1).clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
 
 
 class ClippedTD0(TD0Estimator):
@@ -135,7 +151,7 @@ class Agent(nn.Module):
 
     def __init__(
         self,
-        env: EnvBase,
+        env: RobotTaskEnv,
         hyperparameters: Hyperparameters,
         *,
         max_episode_steps: int,
@@ -145,6 +161,11 @@ class Agent(nn.Module):
         hp = self.hyperparameters = hyperparameters
         num_q = 2 if hp.double_q and hp.algo != "ddpg" else 1
 
+        self.geometry = read_geometry(env) if hp.mirror else None
+        if self.geometry is not None and self.geometry.action is None:
+            raise ValueError(
+                "mirror needs end-effector control, the environment has joint control"
+            )
         self.normalizer, actor, normalize = _make_policy(env, hp)
         critic = Mod(
             MLP(
@@ -222,6 +243,8 @@ class Agent(nn.Module):
         Returns:
             the losses, scalars.
         """
+        if self.geometry is not None:
+            self.geometry.mirror(batch)
         batch = batch.set("normalized", self._normalize(batch))
         batch.set(("next", "normalized"), self._normalize(batch["next"]))
         losses = self._losses(batch)
@@ -274,14 +297,14 @@ class Agent(nn.Module):
             self.loss.make_value_estimator(gamma=gamma)
 
 
-def _make_policy(env: EnvBase, hp: Hyperparameters) -> tuple[Normalizer, Mod, Mod]:
+def _make_policy(env: RobotTaskEnv, hp: Hyperparameters) -> tuple[Normalizer, Mod, Mod]:
     """The normaliser, the actor from ``normalized``, and the module between them."""
     size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
-    normalizer = Normalizer(size)
+    normalizer = Normalizer(size, read_geometry(env) if hp.relative_inputs else None)
     normalize = Mod(normalizer, STATE_KEYS, ["normalized"])
     stochastic = hp.algo in STOCHASTIC
     net = MLP(
-        in_features=size,
+        in_features=len(normalizer.mean),
         out_features=env.action_spec.shape[-1] * (2 if stochastic else 1),
         num_cells=[hp.hidden_size] * 3,
         activation_class=nn.ReLU,
@@ -311,7 +334,7 @@ def save_policy(path: Path, agent: Agent, env_id: str) -> None:
     replace(path, lambda temporary: torch.save(state, temporary))
 
 
-def load_policy(checkpoint: dict[str, Any], env: EnvBase) -> Seq:
+def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Seq:
     """The policy of a checkpoint that `save_policy` wrote.
 
     Raises:

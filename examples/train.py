@@ -93,7 +93,13 @@ class Args(Hyperparameters):
 PRESETS = {
     "paper": Args(),
     "tuned": Args(
-        preset="tuned", num_envs=8, gamma=0.95, keep_unmoved=0.1, max_random_eps=1.0
+        preset="tuned",
+        num_envs=8,
+        gamma=0.95,
+        keep_unmoved=0.1,
+        max_random_eps=1.0,
+        relative_inputs=True,
+        mirror=True,
     ),
 }
 # What may differ between a run and its continuation.

@@ -1,0 +1,82 @@
+"""What an agent may know of the shipped tasks: where things are, and the symmetry."""
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_panda import RobotTaskEnv
+
+# Factors that mirror a quantity in the plane y = 0, in which robot and table are
+# symmetric.
+_POINT = (1.0, -1.0, 1.0)  # also a velocity
+_ANGLES = (-1.0, 1.0, -1.0)  # also an angular velocity
+_QUATERNION = (-1.0, 1.0, -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Of a task, by the layout of its observations and goals.
+
+    Attributes:
+        later: indices into (observation, goal), of each object and each goal.
+        earlier: of the end-effector for an object, of the object for its goal.
+        observation: factors that mirror an observation, (observation size,).
+        goal: factors that mirror a goal, (goal size,).
+        action: factors that mirror an action; None with joint control.
+    """
+
+    later: tuple[int, ...]
+    earlier: tuple[int, ...]
+    observation: tuple[float, ...]
+    goal: tuple[float, ...]
+    action: tuple[float, ...] | None
+
+    def mirror(self, batch: TensorDictBase) -> None:
+        """Mirror every second row of a batch of transitions, in place."""
+        assert self.action is not None
+        factors = {
+            "observation": self.observation,
+            "desired_goal": self.goal,
+            "action": self.action,
+            ("next", "observation"): self.observation,
+            ("next", "desired_goal"): self.goal,
+        }
+        for key, values in factors.items():
+            batch[key][::2] *= batch[key].new_tensor(values)
+
+    def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Objects from the end-effector and goals from objects, (..., n) [m]."""
+        inputs = torch.cat((observation, goal), -1)
+        return inputs[..., self.later] - inputs[..., self.earlier]
+
+
+def read_geometry(env: RobotTaskEnv) -> Geometry:
+    """The geometry of one of `torch_panda.ENV_IDS`."""
+    robot, task = env.robot, env.task
+    rotates = task.goal_dim == 4  # Flip: orientations are quaternions
+    gripper = (1.0,) * (robot.observation_dim - 6)
+    rotation = _QUATERNION if rotates else _ANGLES
+    one_object = (*_POINT, *rotation, *_POINT, *_ANGLES)
+    num_objects = task.observation_dim // len(one_object)
+    size = robot.observation_dim + task.observation_dim
+
+    end_effector = range(3)
+    starts = [robot.observation_dim + len(one_object) * i for i in range(num_objects)]
+    objects = [range(start, start + 3) for start in starts]
+    goals = (
+        []
+        if rotates
+        else [range(i, i + 3) for i in range(size, size + task.goal_dim, 3)]
+    )
+    movable = objects or [end_effector]
+    pairs = [(end_effector, x) for x in objects]
+    pairs += zip(movable, goals, strict=not rotates)
+    return Geometry(
+        later=tuple(i for _, there in pairs for i in there),
+        earlier=tuple(i for here, _ in pairs for i in here),
+        observation=(*_POINT, *_POINT, *gripper, *one_object * num_objects),
+        goal=_QUATERNION if rotates else _POINT * len(goals),
+        action=(*_POINT, *gripper) if robot.control_type == "ee" else None,
+    )
