@@ -34,7 +34,7 @@ class Geometry:
     action: tuple[float, ...] | None
 
     def mirror(self, batch: TensorDictBase) -> None:
-        """Mirror every second row of a batch of transitions, in place."""
+        """Mirror every second row of a batch of transitions."""
         assert self.action is not None
         factors = {
             "observation": self.observation,
@@ -44,7 +44,9 @@ class Geometry:
             ("next", "desired_goal"): self.goal,
         }
         for key, values in factors.items():
-            batch[key][::2] *= batch[key].new_tensor(values)
+            value = batch[key].clone()
+            value[::2] *= value.new_tensor(values)
+            batch[key] = value
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Objects from the end-effector and goals from objects, (..., n) [m]."""
