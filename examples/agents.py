@@ -67,6 +67,8 @@ class Hyperparameters:
     """give the networks objects from the end-effector and goals from objects, too"""
     mirror: bool = False
     """mirror half of each batch in the plane in which robot and table are symmetric"""
+    shift: float = 0.0
+    """move the scene in half of each batch by up to so much in x and y [m]"""
     alpha: float = 0.2
     """SAC, TQC: entropy coefficient, or its first value"""
     learn_alpha: bool = False
@@ -161,10 +163,11 @@ class Agent(nn.Module):
         hp = self.hyperparameters = hyperparameters
         num_q = 2 if hp.double_q and hp.algo != "ddpg" else 1
 
-        self.geometry = read_geometry(env) if hp.mirror else None
-        if self.geometry is not None and self.geometry.action is None:
+        self.geometry = read_geometry(env)
+        if (hp.mirror or hp.shift) and self.geometry.action is None:
             raise ValueError(
-                "mirror needs end-effector control, the environment has joint control"
+                "mirror and shift are for end-effector control: with joint control "
+                "pass --no-mirror --shift 0"
             )
         self.normalizer, actor, normalize = _make_policy(env, hp)
         critic = Mod(
@@ -243,8 +246,10 @@ class Agent(nn.Module):
         Returns:
             the losses, scalars.
         """
-        if self.geometry is not None:
+        if self.hyperparameters.mirror:
             self.geometry.mirror(batch)
+        if self.hyperparameters.shift:
+            self.geometry.shift(batch, self.hyperparameters.shift)
         batch = batch.set("normalized", self._normalize(batch))
         batch.set(("next", "normalized"), self._normalize(batch["next"]))
         losses = self._losses(batch)

@@ -25,6 +25,8 @@ class Geometry:
         observation: factors that mirror an observation, (observation size,).
         goal: factors that mirror a goal, (goal size,).
         action: factors that mirror an action; None with joint control.
+        positions: where positions begin in an observation.
+        goal_positions: where they begin in a goal.
     """
 
     later: tuple[int, ...]
@@ -32,6 +34,8 @@ class Geometry:
     observation: tuple[float, ...]
     goal: tuple[float, ...]
     action: tuple[float, ...] | None
+    positions: tuple[int, ...]
+    goal_positions: tuple[int, ...]
 
     def mirror(self, batch: TensorDictBase) -> None:
         """Mirror every second row of a batch of transitions."""
@@ -46,6 +50,26 @@ class Geometry:
         for key, values in factors.items():
             value = batch[key].clone()
             value[::2] *= value.new_tensor(values)
+            batch[key] = value
+
+    def shift(self, batch: TensorDictBase, distance: float) -> None:
+        """Move half of the rows of a batch, each by up to ``distance`` in x and y [m].
+
+        Hand, objects and goals move together, as if the robot stood elsewhere.
+        """
+        rows = slice(len(batch) // 2, None)
+        offset = batch["desired_goal"].new_empty(len(batch) - rows.start, 2)
+        offset.uniform_(-distance, distance)
+        starts = {
+            "observation": self.positions,
+            "desired_goal": self.goal_positions,
+            ("next", "observation"): self.positions,
+            ("next", "desired_goal"): self.goal_positions,
+        }
+        for key, positions in starts.items():
+            value = batch[key].clone()
+            for start in positions:
+                value[rows, start : start + 2] += offset
             batch[key] = value
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
@@ -64,21 +88,19 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
     num_objects = task.observation_dim // len(one_object)
     size = robot.observation_dim + task.observation_dim
 
-    end_effector = range(3)
     starts = [robot.observation_dim + len(one_object) * i for i in range(num_objects)]
-    objects = [range(start, start + 3) for start in starts]
-    goals = (
-        []
-        if rotates
-        else [range(i, i + 3) for i in range(size, size + task.goal_dim, 3)]
-    )
-    movable = objects or [end_effector]
-    pairs = [(end_effector, x) for x in objects]
-    pairs += zip(movable, goals, strict=not rotates)
+    goals = () if rotates else tuple(range(0, task.goal_dim, 3))
+    # What an object is seen from, and a goal: the hand, and what is to be moved there.
+    pairs = [(0, start) for start in starts]
+    pairs += [
+        (here, size + goal) for here, goal in zip(starts or (0,), goals, strict=False)
+    ]
     return Geometry(
-        later=tuple(i for _, there in pairs for i in there),
-        earlier=tuple(i for here, _ in pairs for i in here),
+        later=tuple(there + axis for _, there in pairs for axis in range(3)),
+        earlier=tuple(here + axis for here, _ in pairs for axis in range(3)),
         observation=(*_POINT, *_POINT, *gripper, *one_object * num_objects),
         goal=_QUATERNION if rotates else _POINT * len(goals),
         action=(*_POINT, *gripper) if robot.control_type == "ee" else None,
+        positions=(0, *starts),
+        goal_positions=goals,
     )

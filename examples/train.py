@@ -100,6 +100,7 @@ PRESETS = {
         max_random_eps=1.0,
         relative_inputs=True,
         mirror=True,
+        shift=0.15,
     ),
 }
 # What may differ between a run and its continuation.

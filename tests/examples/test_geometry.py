@@ -58,3 +58,29 @@ def test_differences(task):
         from_hand = objects - td["observation"][:, None, :3]
         expected = torch.cat((from_hand, goals - objects), 1).flatten(1)
         torch.testing.assert_close(found, expected)
+
+
+def test_shift():
+    with torch_panda.make("PandaStack-v1", num_envs=8, seed=0) as env:
+        geometry = read_geometry(env)
+        batch = env.rollout(1).reshape(-1)
+        before = batch.clone()
+        geometry.shift(batch, 0.2)
+    assert (batch[:4] == before[:4]).all()
+    for now, was in ((batch[4:], before[4:]), (batch["next"][4:], before["next"][4:])):
+        differences = [
+            geometry.differences(td["observation"], td["desired_goal"])
+            for td in (now, was)
+        ]
+        torch.testing.assert_close(*differences)
+        moved = now["desired_goal"] - was["desired_goal"]
+        assert (moved[:, [0, 1]].abs().amax(0) > 0.05).all()
+        assert (moved[:, [0, 1]].abs() <= 0.2).all()
+        torch.testing.assert_close(moved[:, :3], moved[:, 3:])
+        assert (moved[:, 2] == 0).all()
+        changed = (now["observation"] != was["observation"]).any(0).nonzero().flatten()
+        assert changed.tolist() == [0, 1, 7, 8, 19, 20]
+    torch.testing.assert_close(
+        batch["observation"] - before["observation"],
+        batch["next", "observation"] - before["next", "observation"],
+    )
