@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
 from agents import load_policy
+from torch_panda import PhysicsName
 
 
 class Evaluation(NamedTuple):
@@ -84,6 +85,8 @@ class Args:
     """threads that step them; None means one per core"""
     seed: int = 1_000
     """of the environments"""
+    physics: PhysicsName = "exact"
+    """how Bullet integrates: as panda-gym, or faster and coarser"""
 
 
 def main(args: Args) -> None:
@@ -101,6 +104,7 @@ def main(args: Args) -> None:
             num_envs=min(args.num_envs, args.episodes),
             num_threads=args.num_threads,
             seed=args.seed,
+            physics=args.physics,
         )
     except ValueError as error:
         raise SystemExit(str(error)) from None
@@ -110,7 +114,7 @@ def main(args: Args) -> None:
         except ValueError as error:
             raise SystemExit(str(error)) from None
         result = evaluate(env, policy, args.episodes)
-    print(f"{env_id}, {args.episodes} episodes")
+    print(f"{env_id}, {args.episodes} episodes, {args.physics} physics")
     for name, flags in (
         ("success at the end", result.success),
         ("success at any time", result.ever),
