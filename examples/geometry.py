@@ -1,4 +1,8 @@
-"""What an agent may know of the shipped tasks: where things are, and the symmetry."""
+"""What an agent may know of the shipped tasks: where things are, and the symmetry.
+
+Transitions that are mirrored or moved over the table are as possible as those that were
+seen, nearly: see Invariant Transform Experience Replay (arXiv 1909.10707) for mirrors.
+"""
 
 from dataclasses import dataclass
 

@@ -102,6 +102,11 @@ def line_label(args: dict[str, object]) -> str:
     )
     if not args["double_q"]:
         parts.append("one Q")
+    if args.get("demos"):
+        parts.append("demonstrations")
+    if args["preset"] == "tuned":
+        wanted = {"mirror": "mirror", "relative_inputs": "relative", "shift": "shift"}
+        parts += [f"no {name}" for key, name in wanted.items() if not args.get(key)]
     return ", ".join(parts)
 
 
