@@ -46,13 +46,15 @@ def plot_panels(
     figure, panels = plt.subplots(
         1,
         len(runs),
-        figsize=(4 * len(runs), 3.2),
+        figsize=(4 * len(runs), 4.2),
         squeeze=False,
         sharey=True,
         layout="constrained",
     )
     labels = sorted({label for lines in runs.values() for label in lines})
-    colors = {label: f"C{i}" for i, label in enumerate(labels)}
+    colors = dict(
+        zip(labels, plt.cm.turbo(np.linspace(0, 0.95, len(labels))), strict=True)
+    )
     for axes, (task, lines) in zip(panels[0], sorted(runs.items()), strict=True):
         for label, curves in sorted(lines.items()):
             # Seeds that are still running end earlier: up to where all have come.
@@ -64,7 +66,7 @@ def plot_panels(
             axes.plot(steps, median, color=colors[label], label=name)
             axes.fill_between(steps, low, high, color=colors[label], alpha=0.2, lw=0)
         _label(axes, task)
-        axes.legend(fontsize="small")
+        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18))
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
