@@ -227,7 +227,7 @@ class GoalMemory:
 
     def find(self, serial: Integers) -> tuple[Integers, Integers]:
         """Returns trajectory and step of transitions not below the floor, (n,) each."""
-        if self._waiting and serial.max() >= self._sorted:
+        if self._waiting and serial.max(initial=-1) >= self._sorted:
             self._sort()
         trajectory, step = self._ring.take(serial % len(self._ring), 0).T
         return trajectory, step

@@ -97,6 +97,15 @@ def test_no_goal_is_wrong(
         check_untouched(batch, stored)
 
 
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_samples_of_whole_episodes_while_others_wait(strategy):
+    envs = Envs(1, [5])
+    rb = make_buffer(strategy=strategy, batch_size=1, seed=0)
+    for _ in range(40):  # ended episodes, most of which a sample leaves alone
+        rb.extend(flatten(envs.chunk(5), "env_first"))
+        check_batch(rb.sample(), rb.storage[:], strategy)
+
+
 @pytest.mark.parametrize("layout", ["env_first", "time_first", "none"])
 @pytest.mark.parametrize("steps", [1, 10, 50])
 def test_no_mixed_goals_where_her_buffer_has_them(layout, steps, record_property):
