@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from torch_panda.transforms.blocks import GoalBlocks
@@ -59,7 +58,7 @@ class GoalMemory:
         self._forgotten = 0  # floor that trajectories are cut at; lags behind
         self._unit = 1  # transitions written at one index of the storage
         self._origin = 0  # serial, in units, that index 0 is counted from
-        self._waiting: list[tuple[NDArray[Any], NDArray[Any], Tensor]] = []
+        self._waiting: list[tuple[Tensor, Tensor, Tensor]] = []
         self._ring = np.zeros((0, 2), dtype=np.int32)  # (rows, [trajectory, step])
         self._blocks = GoalBlocks()
         self._open: dict[int, int] = {}  # stream -> trajectory that may go on
@@ -80,17 +79,15 @@ class GoalMemory:
             goals: what it achieved, (n, *goal).
             unit: transitions that the buffer writes at one index.
         """
-        serial = np.arange(self.head, self.head + len(goals))
         self._unit = unit
         # Copies, as collectors reuse their tensors.
-        flags = (stream.cpu().numpy().copy(), done.cpu().numpy().copy())
-        self._waiting.append((*flags, goals.clone()))
-        self.head += len(goals)
+        self._waiting.append((stream.clone(), done.clone(), goals.clone()))
+        start, self.head = self.head, self.head + len(goals)
         if self.capacity is not None:
             self.floor = max(self.floor, self.head - self.capacity)
         if self.head - self._sorted >= MAX_WAITING:
             self._sort()
-        return torch.from_numpy(serial).to(goals.device)
+        return torch.arange(start, self.head, device=goals.device)
 
     def _sort(self) -> None:
         """Sorts what waits into trajectories."""
@@ -100,7 +97,8 @@ class GoalMemory:
         self._waiting.clear()
         goals = torch.cat(parts)
         self._make_room(goals)
-        runs = split_runs(np.concatenate(streams), np.concatenate(dones))
+        stream, done = (torch.cat(x).cpu().numpy() for x in (streams, dones))
+        runs = split_runs(stream, done)
         trajectory = self._trajectories_of(runs)
         base, begin = self._blocks.append(trajectory, runs.length)
         over = [t for t, end in zip(trajectory, runs.ended, strict=True) if end]
