@@ -69,6 +69,9 @@ class Hyperparameters:
     """mirror half of each batch in the plane in which robot and table are symmetric"""
     shift: float = 0.0
     """move the scene in half of each batch by up to so much in x and y [m]"""
+    bc_weight: float = 20.0
+    """DDPG, TD3: weight, in the actor's loss, of the squared difference to the actions
+    of demonstrations where the critic prefers these (arXiv 1709.10089)"""
     alpha: float = 0.2
     """SAC, TQC: entropy coefficient, or its first value"""
     learn_alpha: bool = False
@@ -233,6 +236,7 @@ class Agent(nn.Module):
                     action_spec=action_spec,
                 )
             actor.module.register_forward_hook(self._remember_action)
+            critic.module.register_forward_hook(self._remember_value)
         self._set_discount(hp.gamma or 1 - 1 / max_episode_steps, sparse)
         self.soft_update = SoftUpdate(self.loss, tau=hp.tau)
         self.optimizer = torch.optim.Adam(
@@ -240,19 +244,25 @@ class Agent(nn.Module):
         )
         self.updates = 0
 
-    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """One gradient step on a batch of transitions.
+    def update(
+        self, batch: TensorDictBase, demos: TensorDictBase | None = None
+    ) -> dict[str, Tensor]:
+        """One gradient step on a batch of transitions, and one of demonstrations.
 
         Returns:
             the losses, scalars.
         """
-        if self.hyperparameters.mirror:
-            self.geometry.mirror(batch)
-        if self.hyperparameters.shift:
-            self.geometry.shift(batch, self.hyperparameters.shift)
+        for part in (batch,) if demos is None else (batch, demos):
+            if self.hyperparameters.mirror:
+                self.geometry.mirror(part)
+            if self.hyperparameters.shift:
+                self.geometry.shift(part, self.hyperparameters.shift)
+        num_demos = 0 if demos is None else len(demos)
+        if demos is not None:
+            batch = torch.cat((batch, demos))
         batch = batch.set("normalized", self._normalize(batch))
         batch.set(("next", "normalized"), self._normalize(batch["next"]))
-        losses = self._losses(batch)
+        losses = self._losses(batch, num_demos)
         self.optimizer.zero_grad()
         torch.stack(tuple(losses.values())).sum().backward()
         self.optimizer.step()
@@ -260,29 +270,46 @@ class Agent(nn.Module):
         self.updates += 1
         return {key: value.detach() for key, value in losses.items()}
 
-    def _losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Losses whose gradients touch only the network that each one trains."""
+    def _losses(self, batch: TensorDictBase, num_demos: int) -> dict[str, Tensor]:
+        """Losses whose gradients touch only the network that each one trains.
+
+        The last rows of the batch are demonstrations.
+        """
         algo, loss = self.hyperparameters.algo, self.loss
         if algo in STOCHASTIC:
             every = loss(batch)
             return {key: every[key] for key in loss.out_keys if key.startswith("loss_")}
         if algo == "ddpg":
             losses = {"loss_value": loss.loss_value(batch)[0]}
+            stored_value = self._value
             losses["loss_actor"] = loss.loss_actor(batch)[0]
         else:
             losses = {"loss_value": loss.value_loss(batch)[0]}
+            stored_value = self._value
             if self.updates % POLICY_DELAY == 0:
                 losses["loss_actor"] = loss.actor_loss(batch)[0]
         if "loss_actor" in losses:
-            # The actor's loss has just computed the actions; see _remember_action.
+            # The actor's loss has just computed its actions and their values.
             penalty = self.hyperparameters.action_l2 * self._action.square().mean()
             losses["loss_actor"] = losses["loss_actor"] + penalty
+            if num_demos:
+                demos = slice(-num_demos, None)
+                better = stored_value[demos] > self._value[demos]
+                error = (self._action - batch["action"])[demos].square()
+                losses["loss_bc"] = self.hyperparameters.bc_weight * (
+                    (error * better).mean()
+                )
         return losses
 
     def _remember_action(self, module: nn.Module, inputs: object, out: Tensor) -> None:
         """Keep the actions that gradients flow through: torchrl's losses do not."""
         if out.requires_grad:
             self._action = out
+
+    def _remember_value(self, module: nn.Module, inputs: object, out: Tensor) -> None:
+        """Keep the values of the batch: targets are computed without gradients."""
+        if out.requires_grad:
+            self._value = out.detach()
 
     def _normalize(self, tensordict: TensorDictBase) -> Tensor:
         return self.normalizer(*(tensordict[key] for key in STATE_KEYS))

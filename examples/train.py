@@ -68,7 +68,9 @@ class Args(Hyperparameters):
     batch_size: int = 256
     """transitions per gradient step"""
     demos: Path | None = None
-    """transitions to start the buffer with, as examples/experts.py writes them"""
+    """transitions to learn from beside one's own, as examples/experts.py writes them"""
+    demo_ratio: float = 0.25
+    """share of each batch that is drawn from them"""
     keep_unmoved: float = 1.0
     """share of the episodes in which nothing moved that are stored (filtered HER, see
     arXiv 2012.08850): every goal that they could be given is reached without acting"""
@@ -154,11 +156,17 @@ class Run:
             max_episode_steps=self.env.max_episode_steps,
             sparse="Dense" not in args.env_id,
         ).to(args.device)
-        demos = None if args.demos is None else read_demos(args.demos, self.env)
-        self.buffer = make_buffer(args, self.env, 0 if demos is None else len(demos))
-        if demos is not None:
-            self.buffer.extend(demos)
+        iteration = args.num_envs * self.env.max_episode_steps
+        self.buffer = make_buffer(args, self.env, args.total_steps + iteration)
+        self.demos: TensorDictReplayBuffer | None = None
+        self.batch_sizes = [args.batch_size, 0]
+        if args.demos is not None:
+            demos = read_demos(args.demos, self.env)
+            self.demos = make_buffer(args, self.env, len(demos))
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
+            self.demos.extend(demos)
+            number = round(args.demo_ratio * args.batch_size)
+            self.batch_sizes = [args.batch_size - number, number]
         self.curve: list[dict[str, float]] = []
         self.steps = 0
         self.seconds = 0.0
@@ -237,9 +245,18 @@ class Run:
         due = int(self.steps * self.args.updates_per_step) - self.agent.updates
         losses: dict[str, list[Tensor]] = {}
         for _ in range(due):
-            for key, loss in self.agent.update(self.buffer.sample()).items():
+            for key, loss in self.agent.update(*self.sample()).items():
                 losses.setdefault(key, []).append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
+
+    def sample(self) -> list[TensorDictBase]:
+        """A batch of the run's own transitions, and one of demonstrations if any."""
+        buffers = (self.buffer, self.demos)
+        return [
+            buffer.sample(size)
+            for buffer, size in zip(buffers, self.batch_sizes, strict=True)
+            if buffer is not None and size
+        ]
 
     def evaluate(self) -> None:
         """Add a point to the curve, and write and draw it."""
@@ -278,6 +295,7 @@ class Run:
             "optimizer": self.agent.optimizer.state_dict(),
             "updates": self.agent.updates,
             "buffer": self.buffer.state_dict(),
+            "demos": None if self.demos is None else self.demos.state_dict(),
             "random": torch.get_rng_state(),
             "cuda_random": torch.cuda.get_rng_state_all(),
             "curve": self.curve,
@@ -305,6 +323,8 @@ class Run:
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]
         self.buffer.load_state_dict(state["buffer"])
+        if self.demos is not None:
+            self.demos.load_state_dict(state["demos"])
         torch.set_rng_state(state["random"])
         torch.cuda.set_rng_state_all(state["cuda_random"])
         self.curve = state["curve"]
@@ -353,11 +373,10 @@ def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
 
 
 def make_buffer(
-    args: Args, env: torch_panda.RobotTaskEnv, num_demos: int
+    args: Args, env: torch_panda.RobotTaskEnv, num_transitions: int
 ) -> TensorDictReplayBuffer:
-    """The replay buffer with the chosen kind of hindsight."""
-    iteration = args.num_envs * env.max_episode_steps
-    capacity = min(args.buffer_size, args.total_steps + iteration + num_demos)
+    """A replay buffer for so many with the chosen kind of hindsight."""
+    capacity = min(args.buffer_size, num_transitions)
     transform: HindsightRelabel | HindsightAugment | None = None
     if args.her == "relabel":
         transform = HindsightRelabel(

@@ -1,0 +1,85 @@
+"""Learning from demonstrations beside one's own transitions."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from agents import Agent, Hyperparameters
+from tests.examples.test_train import run
+
+
+@pytest.fixture
+def env():
+    with torch_panda.make("PandaPush-v1", num_envs=2) as env:
+        yield env
+
+
+def transitions(env, number):
+    """Random ones, of the sizes of an environment's."""
+    spec = env.observation_spec_unbatched
+
+    def observation():
+        keys = ("observation", "desired_goal")
+        return {key: torch.randn(number, *spec[key].shape) for key in keys}
+
+    flag = torch.zeros(number, 1, dtype=torch.bool)
+    end = {"done": flag, "terminated": flag, "reward": torch.full((number, 1), -1.0)}
+    action = torch.rand(number, *env.action_spec_unbatched.shape) * 2 - 1
+    return TensorDict(
+        {**observation(), "action": action, "next": {**observation(), **end}}, [number]
+    )
+
+
+def values(agent, batch, action):
+    """What the critic gives actions, (n, 1)."""
+    loss, critic = agent.loss, agent.loss.value_network
+    inputs = TensorDict({"normalized": agent._normalize(batch), "action": action})
+    with torch.no_grad(), loss.value_network_params.to_module(critic):
+        return critic(inputs)["state_action_value"]
+
+
+def test_imitates_only_what_the_critic_prefers(env):
+    torch.manual_seed(0)
+    hp = Hyperparameters(bc_weight=3.0)
+    agent = Agent(env, hp, max_episode_steps=50, sparse=True)
+    batch, demos = transitions(env, 64), transitions(env, 32)
+    with torch.no_grad():
+        action = agent.policy(demos.clone())["action"]
+    demonstrated = values(agent, demos, demos["action"])
+    better = demonstrated > values(agent, demos, action)
+    assert 0 < better.sum() < len(better)
+    expected = 3 * ((action - demos["action"]).square() * better).mean()
+
+    losses = agent.update(batch.clone(), demos.clone())
+    torch.testing.assert_close(losses["loss_bc"], expected)
+    assert "loss_bc" not in agent.update(batch.clone())
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+def test_policy_comes_closer_to_demonstrations(env, algo):
+    torch.manual_seed(0)
+    hp = Hyperparameters(algo=algo, bc_weight=1000.0, learning_rate=1e-4)
+    agent = Agent(env, hp, max_episode_steps=50, sparse=True)
+    batch, demos = transitions(env, 64), transitions(env, 32)
+    losses = [agent.update(batch.clone(), demos.clone()) for _ in range(19)]
+    assert 0 < losses[-1]["loss_bc"] < 0.9 * losses[0]["loss_bc"]
+
+
+def test_training_stores_demonstrations_apart(tmp_path):
+    demos = tmp_path / "demos.pt"
+    run("experts", "--env-id", "PandaPush-v1", "--episodes", 4, "--out", demos)
+    arguments = [*("--env-id", "PandaPush-v1", "--demos", demos, "--num-envs", 2)]
+    arguments += [*("--eval-episodes", 2, "--updates-per-step", 0.05, "--no-video")]
+    arguments += [*("--total-steps", 200, "--save-interval", 100, "--batch-size", 16)]
+    out = tmp_path / "run"
+    run("train", *arguments, "--out", out)
+    state = torch.load(out / "resume.pt")
+    assert state["demos"]["_storage"]["_len"] == 200
+    assert state["buffer"]["_storage"]["_len"] == 200
+    assert state["agent"]["normalizer.count"] == 400
+
+    wrong = [*arguments, "--env-id", "PandaPickAndPlace-v1", "--out", out]
+    refused = run("train", *wrong, check=False)
+    assert refused.returncode == 1
+    assert "observation has size 18, the task's has 19" in refused.stderr
