@@ -156,13 +156,14 @@ class Run:
             max_episode_steps=self.env.max_episode_steps,
             sparse="Dense" not in args.env_id,
         ).to(args.device)
-        iteration = args.num_envs * self.env.max_episode_steps
-        self.buffer = make_buffer(args, self.env, args.total_steps + iteration)
+        self.buffer = make_buffer(args, self.env)
         self.demos: TensorDictReplayBuffer | None = None
         self.batch_sizes = [args.batch_size, 0]
         if args.demos is not None:
             demos = read_demos(args.demos, self.env)
-            self.demos = make_buffer(args, self.env, len(demos))
+            self.demos = TensorDictReplayBuffer(
+                storage=LazyTensorStorage(len(demos), device=args.device)
+            )
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
             self.demos.extend(demos)
             number = round(args.demo_ratio * args.batch_size)
@@ -372,11 +373,10 @@ def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
     return demos.to(env.device)
 
 
-def make_buffer(
-    args: Args, env: torch_panda.RobotTaskEnv, num_transitions: int
-) -> TensorDictReplayBuffer:
-    """A replay buffer for so many with the chosen kind of hindsight."""
-    capacity = min(args.buffer_size, num_transitions)
+def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBuffer:
+    """The replay buffer with the chosen kind of hindsight."""
+    iteration = args.num_envs * env.max_episode_steps
+    capacity = min(args.buffer_size, args.total_steps + iteration)
     transform: HindsightRelabel | HindsightAugment | None = None
     if args.her == "relabel":
         transform = HindsightRelabel(
