@@ -71,7 +71,9 @@ class Hyperparameters:
     """move the scene in half of each batch by up to so much in x and y [m]"""
     bc_weight: float = 20.0
     """DDPG, TD3: weight, in the actor's loss, of the squared difference to the actions
-    of demonstrations where the critic prefers these (arXiv 1709.10089)"""
+    of demonstrations (arXiv 1709.10089)"""
+    q_filter: bool = True
+    """imitate only demonstrations whose action the critic prefers to the policy's"""
     alpha: float = 0.2
     """SAC, TQC: entropy coefficient, or its first value"""
     learn_alpha: bool = False
@@ -294,11 +296,10 @@ class Agent(nn.Module):
             losses["loss_actor"] = losses["loss_actor"] + penalty
             if num_demos:
                 demos = slice(-num_demos, None)
-                better = stored_value[demos] > self._value[demos]
                 error = (self._action - batch["action"])[demos].square()
-                losses["loss_bc"] = self.hyperparameters.bc_weight * (
-                    (error * better).mean()
-                )
+                if self.hyperparameters.q_filter:
+                    error = error * (stored_value[demos] > self._value[demos])
+                losses["loss_bc"] = self.hyperparameters.bc_weight * error.mean()
         return losses
 
     def _remember_action(self, module: nn.Module, inputs: object, out: Tensor) -> None:

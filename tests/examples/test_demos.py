@@ -39,9 +39,10 @@ def values(agent, batch, action):
         return critic(inputs)["state_action_value"]
 
 
-def test_imitates_only_what_the_critic_prefers(env):
+@pytest.mark.parametrize("q_filter", [True, False])
+def test_imitates_what_the_critic_prefers_or_all(env, q_filter):
     torch.manual_seed(0)
-    hp = Hyperparameters(bc_weight=3.0)
+    hp = Hyperparameters(bc_weight=3.0, q_filter=q_filter)
     agent = Agent(env, hp, max_episode_steps=50, sparse=True)
     batch, demos = transitions(env, 64), transitions(env, 32)
     with torch.no_grad():
@@ -49,7 +50,8 @@ def test_imitates_only_what_the_critic_prefers(env):
     demonstrated = values(agent, demos, demos["action"])
     better = demonstrated > values(agent, demos, action)
     assert 0 < better.sum() < len(better)
-    expected = 3 * ((action - demos["action"]).square() * better).mean()
+    error = (action - demos["action"]).square()
+    expected = 3 * (error * better if q_filter else error).mean()
 
     losses = agent.update(batch.clone(), demos.clone())
     torch.testing.assert_close(losses["loss_bc"], expected)
