@@ -387,9 +387,7 @@ def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBu
         transform = HindsightAugment(env.compute_reward, k=k, seed=args.seed)
         capacity *= k + 1
     return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, device=args.device),
-        transform=transform,
-        batch_size=args.batch_size,
+        storage=LazyTensorStorage(capacity, device=args.device), transform=transform
     )
 
 
