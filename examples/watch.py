@@ -1,11 +1,13 @@
-"""Watch a policy: a video of several environments side by side.
+"""Watch a policy: a video of several environments side by side, or a window.
 
     python examples/watch.py --policy runs/PandaPush-v1-ddpg-relabel-0 --out push.mp4
     python examples/watch.py --policy expert --env-id PandaStack-v1 --out stack.gif
+    python examples/watch.py --policy expert --env-id PandaStack-v1 --human
 
 Goals are drawn translucent; every cell says its step and turns green on success.
 """
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,9 +49,12 @@ def record(
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"a video's name must end in .mp4 or .gif, got {path.name!r}")
-    frames = list(
-        tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame")
-    )
+    frames = [
+        draw(env, state, step)
+        for step, state in enumerate(
+            tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame")
+        )
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     options = (
         {"loop": 0, "duration": 1000 / FPS} if path.suffix == ".gif" else {"fps": FPS}
@@ -59,14 +64,31 @@ def record(
 
 def play(
     env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Run an episode and draw it, a frame a step and one of the start."""
+) -> Iterator[TensorDictBase]:
+    """Run an episode: what it starts with, and what every step leads to."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
-        yield draw(env, state, 0)
-        for step in range(1, env.max_episode_steps + 1):
+        yield state
+        for _ in range(env.max_episode_steps):
             state = step_mdp(env.step(policy(state)))
-            yield draw(env, state, step)
+            yield state
+
+
+def show(
+    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase, episodes: int
+) -> None:
+    """Play episodes of the first environment in a window, in real time."""
+    with env.open_window() as window:
+        for episode in range(1, episodes + 1):
+            due = time.perf_counter()
+            success = False
+            for state in play(env, policy):
+                window.show(0)
+                success = bool(state["success"][0])
+                due += 1 / FPS
+                time.sleep(max(0.0, due - time.perf_counter()))
+            outcome = "success" if success else "no success"
+            print(f"episode {episode} of {episodes}: {outcome}", flush=True)
 
 
 def draw(
@@ -105,15 +127,17 @@ class Args:
     env_id: str | None = None
     """task; None means the one the policy was trained on, or Push"""
     num_envs: int = 6
-    """environments side by side"""
+    """environments side by side; with a window, episodes one after the other"""
     seed: int = 0
     """of the environments and of random actions"""
     out: Path = Path("watch.mp4")
     """video to write, .mp4 or .gif"""
+    human: bool = False
+    """show it in a window of pybullet's GUI instead, at the speed of the real robot"""
 
 
 def main(args: Args) -> None:
-    """Record a policy."""
+    """Record a policy, or show it."""
     torch.manual_seed(args.seed)
     checkpoint = None
     if args.policy not in ("random", "expert"):
@@ -126,7 +150,8 @@ def main(args: Args) -> None:
         checkpoint = torch.load(path)
     env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
     try:
-        with torch_panda.make(env_id, num_envs=args.num_envs, seed=args.seed) as env:
+        num_envs = 1 if args.human else args.num_envs
+        with torch_panda.make(env_id, num_envs=num_envs, seed=args.seed) as env:
             policy: TensorDictModuleBase
             if checkpoint:
                 policy = load_policy(checkpoint, env)
@@ -134,10 +159,15 @@ def main(args: Args) -> None:
                 policy = make_expert(env_id)
             else:
                 policy = RandomPolicy(env.action_spec)
-            record(env, policy, args.out)
-    except ValueError as error:
+            if args.human:
+                show(env, policy, args.num_envs)
+            else:
+                record(env, policy, args.out)
+                print(f"wrote {args.out}")
+    except (ValueError, torch_panda.BulletError) as error:
         raise SystemExit(str(error)) from None
-    print(f"wrote {args.out}")
+    except KeyboardInterrupt:
+        raise SystemExit("stopped") from None
 
 
 if __name__ == "__main__":

@@ -1,5 +1,11 @@
 """The examples that draw: a video of a policy, and the picture of all tasks."""
 
+import os
+import shutil
+import subprocess
+import sys
+import time
+
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -36,6 +42,69 @@ def test_bad_input_is_one_line(tmp_path, arguments, message):
         arguments["out"] = tmp_path / arguments["out"]
     with pytest.raises(SystemExit, match=message):
         watch.main(watch.Args(**arguments))
+
+
+def start_human(display, episodes):
+    environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
+    if display is not None:
+        environment["DISPLAY"] = display
+    command = [sys.executable, watch.__file__, "--human", f"--num-envs={episodes}"]
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.fixture
+def screen(tmp_path):
+    """A virtual display: its name, and what it shows as (height, width, 4) bytes."""
+    server = subprocess.Popen(
+        "Xvfb -displayfd 1 -screen 0 1024x768x24 -fbdir".split() + [str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    number = server.stdout.readline().strip()
+
+    def look():
+        # An XWD file: sizes of 4 bytes, big-endian, then colours, then the picture.
+        data = (tmp_path / "Xvfb_screen0").read_bytes()
+        size = 4 * 1024 * 768
+        return np.frombuffer(data[-size:], np.uint8).reshape(768, 1024, 4)
+
+    yield f":{number}", look
+    server.terminate()
+    server.wait()
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="needs Xvfb")
+def test_window_shows_the_arm_move(screen):
+    display, look = screen
+    process = start_human(display, episodes=2)
+    views = []
+    while process.poll() is None:
+        view = look()
+        # The background has one colour, the scene in light and shade has many.
+        if len(np.unique(view.reshape(-1, 4), axis=0)) > 50:
+            views.append(view.astype(int))
+        time.sleep(0.5)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert "episode 2 of 2: success" in output
+    assert len(views) > 2
+    assert any(np.abs(view - views[0]).max() > 50 for view in views[1:])
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="DISPLAY is of X11")
+def test_window_without_a_display_is_one_line():
+    process = start_human(None, episodes=1)
+    output = process.communicate()[0]
+    assert process.returncode == 1
+    assert output.count("needs a display with OpenGL") == 1
+    assert "Traceback" not in output
 
 
 def test_gallery(tmp_path):

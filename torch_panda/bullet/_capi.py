@@ -16,6 +16,7 @@ The file is found, not imported: importing pybullet prints a line on stdout.
 import ctypes
 import importlib.metadata
 import importlib.util
+import sys
 from ctypes import (
     POINTER,
     c_char,
@@ -555,3 +556,33 @@ plugin_set_suffix = bind(
     _cheap, "b3CustomCommandLoadPluginSetPostFix", None, _command, c_char_p
 )
 status_plugin = bind(_cheap, "b3GetStatusPluginUniqueId", c_int, _status)
+
+# The window of pybullet's GUI
+connect_window = bind(
+    _work,
+    "b3CreateInProcessPhysicsServerAndConnectMainThread"
+    if sys.platform == "darwin"
+    else "b3CreateInProcessPhysicsServerAndConnect",
+    _client,
+    c_int,
+    POINTER(c_char_p),
+)
+window_init = bind(_cheap, "b3InitConfigureOpenGLVisualizer", _command, _client)
+window_set_flag = bind(
+    _cheap,
+    "b3ConfigureOpenGLVisualizerSetVisualizationFlags",
+    None,
+    _command,
+    c_int,
+    c_int,
+)
+window_set_camera = bind(
+    _cheap,
+    "b3ConfigureOpenGLVisualizerSetViewMatrix",
+    None,
+    _command,
+    c_float,  # distance
+    c_float,  # pitch
+    c_float,  # yaw
+    _floats,  # target
+)

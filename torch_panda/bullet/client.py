@@ -162,9 +162,9 @@ class PhysicsClient:
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
         self._bodies: list[int] = []
         self._num_detections = 0
-        self._handle: int | None = _capi.connect_direct()
+        self._handle: int | None = self._connect()
         if not self._handle:
-            raise BulletError("Bullet could not create a DIRECT client")
+            raise BulletError("Bullet could not create a client")
         # The last status code in use: it moves when another version adds one before.
         try:
             self.detect_collisions()
@@ -178,6 +178,11 @@ class PhysicsClient:
         _capi.physics_set_residual_threshold(command, physics.residual_threshold)
         self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
         self._kp = doubles([physics.position_gain] * _MAX_DOF)
+
+    def _connect(self) -> int | None:
+        """Make a world, and return the handle by which Bullet knows the client."""
+        handle: int | None = _capi.connect_direct()
+        return handle
 
     @property
     def is_closed(self) -> bool:

@@ -20,7 +20,7 @@ from torch_panda.bullet.coarse import coarse_urdf
 from torch_panda.bullet.renderers import RendererName
 from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Look, Shape, Sphere
 
-Layer = Literal["solids", "markers"]
+Layer = Literal["solids", "markers", "all"]
 
 _Z_AXIS = 2
 _NOT_SHINY = doubles((0.0, 0.0, 0.0))
@@ -49,7 +49,8 @@ class VisualClient(PhysicsClient):
     translucent are two layers, in a client each, for the caller to blend.
 
     Args:
-        layer: what is seen: "solids", or the "markers" only.
+        layer: what is seen: "solids", the "markers" only, or "all", for a renderer
+            that draws markers translucent itself.
         renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, whose
             client must be made, used and closed by one thread.
         mesh_cell: merge the vertices of robots' meshes in cubes of this edge length
@@ -73,7 +74,7 @@ class VisualClient(PhysicsClient):
             self._load_egl()
         self._layer = layer
         self._mesh_cell = mesh_cell
-        if layer == "solids":
+        if layer != "markers":
             self._urdf_flags = 0
         self.looks: dict[int, Look] = {}
 
@@ -192,7 +193,8 @@ class VisualClient(PhysicsClient):
             case Sphere(radius):
                 _capi.visual_add_sphere(command, radius)
         color = look.color if look.texture is None else WHITE
-        _capi.visual_set_color(command, 0, doubles((*color, 1.0)))
+        opacity = look.opacity if is_marker and self._layer == "all" else 1.0
+        _capi.visual_set_color(command, 0, doubles((*color, opacity)))
         _capi.visual_set_specular(command, 0, _NOT_SHINY)
         status = self._submit(
             command, _capi.CMD_CREATE_VISUAL_SHAPE_COMPLETED, "create a visual shape"
@@ -200,7 +202,7 @@ class VisualClient(PhysicsClient):
         return _capi.status_visual(status)
 
     def _draws(self, is_marker: bool) -> bool:
-        return is_marker == (self._layer == "markers")
+        return self._layer == "all" or is_marker == (self._layer == "markers")
 
 
 def add_textured_box(

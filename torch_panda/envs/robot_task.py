@@ -31,6 +31,7 @@ from torch_panda.envs.renderer import Renderer
 from torch_panda.envs.senses import SenseOptions
 from torch_panda.envs.state import read_state
 from torch_panda.envs.twin import VisualTwin, segmentation_ids
+from torch_panda.envs.window import Window
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
@@ -237,6 +238,20 @@ class RobotTaskEnv(EnvBase):
                 raise ValueError(f"there is no environment {env} that was reset")
         pixels = self._renderer.picture(envs, camera).to(self.device)
         return pixels[0] if single else pixels
+
+    def open_window(self, camera: Camera | None = None) -> Window:
+        """Open pybullet's GUI: ``show(i)`` of the result shows environment i.
+
+        It needs a display. Close it, or use it under ``with``.
+
+        Args:
+            camera: where the view starts; None means `Camera`'s defaults.
+
+        Raises:
+            BulletError: there is no display, or the environment is closed.
+        """
+        self._check_open()
+        return Window(self._simulation, self._build_scene, camera or Camera())
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all clients and threads. Closing again does nothing."""

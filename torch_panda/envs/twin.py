@@ -105,11 +105,7 @@ class VisualTwin:
             row: where in ``frames``.
         """
         solids, scene = self._solids, self._scene
-        joints = simulation.joint_position[env].tolist()
-        solids.set_joints(scene.robot, scene.joints, joints, (0.0,) * len(joints))
-        poses = simulation.object_pose[env].tolist()
-        for body, pose in zip(scene.objects, poses, strict=True):
-            solids.set_base(body, pose[:3], pose[3:])
+        pose_solids(solids, scene, simulation, env)
         image = solids.draw(camera, segmentation=frames.segmentation is not None)
         pixels = frames.pixels[row].numpy()
         pixels[:] = image.rgb
@@ -118,14 +114,27 @@ class VisualTwin:
         if frames.segmentation is not None:
             frames.segmentation[row].numpy()[..., 0] = image.segmentation
         if self._markers is not None:
-            poses = simulation.target_pose[env].tolist()
-            for body, pose in zip(self._marker_bodies, poses, strict=True):
-                self._markers.set_base(body, pose[:3], pose[3:])
+            pose_bodies(self._markers, self._marker_bodies, simulation.target_pose[env])
             marks = self._markers.draw(camera, segmentation=True, shadow=False)
             assert marks.segmentation is not None
             seen = marks.depth < image.depth
             opacity = self._opacity[marks.segmentation[seen]]
             blend(pixels, marks.rgb, seen, opacity)
+
+
+def pose_solids(
+    client: PhysicsClient, scene: Scene, simulation: VectorSimulation, env: int
+) -> None:
+    """Put the robot and the objects of a client where they are in an environment."""
+    joints = simulation.joint_position[env].tolist()
+    client.set_joints(scene.robot, scene.joints, joints, (0.0,) * len(joints))
+    pose_bodies(client, scene.objects, simulation.object_pose[env])
+
+
+def pose_bodies(client: PhysicsClient, bodies: tuple[int, ...], poses: Tensor) -> None:
+    """Put bodies at poses, (len(bodies), 7: position [m], quaternion xyzw)."""
+    for body, pose in zip(bodies, poses.tolist(), strict=True):
+        client.set_base(body, pose[:3], pose[3:])
 
 
 def blend(
