@@ -62,7 +62,7 @@ def start_human(display, episodes):
 def screen(tmp_path):
     """A virtual display: its name, and what it shows as (height, width, 4) bytes."""
     server = subprocess.Popen(
-        "Xvfb -displayfd 1 -screen 0 1024x768x24 -fbdir".split() + [str(tmp_path)],
+        ["Xvfb", "-displayfd", "1", "-screen", "0", "1024x768x24", "-fbdir", tmp_path],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
