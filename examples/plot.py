@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 
 Curve = list[dict[str, float]]
+COLUMNS = 3  # of panels
 
 
 def plot_curve(curve: Curve, title: str, path: Path) -> None:
@@ -43,19 +44,23 @@ def plot_panels(
         metric: the column to draw.
         path: where to write the picture.
     """
+    columns = min(len(runs), COLUMNS)
+    rows = -(-len(runs) // columns)
+    most = max(len(lines) for lines in runs.values())
     figure, panels = plt.subplots(
-        1,
-        len(runs),
-        figsize=(4 * len(runs), 4.2),
+        rows,
+        columns,
+        figsize=(5 * columns, (3.5 + 0.2 * most) * rows),  # legends are below
         squeeze=False,
-        sharey=True,
         layout="constrained",
     )
+    for axes in panels.flat[len(runs) :]:
+        axes.remove()
     labels = sorted({label for lines in runs.values() for label in lines})
     colors = dict(
         zip(labels, plt.cm.turbo(np.linspace(0, 0.95, len(labels))), strict=True)
     )
-    for axes, (task, lines) in zip(panels[0], sorted(runs.items()), strict=True):
+    for axes, (task, lines) in zip(panels.flat, sorted(runs.items()), strict=False):
         for label, curves in sorted(lines.items()):
             # Seeds that are still running end earlier: up to where all have come.
             length = min(len(curve) for curve in curves)
@@ -66,7 +71,7 @@ def plot_panels(
             axes.plot(steps, median, color=colors[label], label=name)
             axes.fill_between(steps, low, high, color=colors[label], alpha=0.2, lw=0)
         _label(axes, task)
-        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.18))
+        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
@@ -119,6 +124,7 @@ def _label(axes: plt.Axes, title: str) -> None:
         ylim=(-0.05, 1.05),
         title=title,
     )
+    axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 0))
     axes.grid(alpha=0.3)
 
 
