@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torch_panda.bench.bare_bullet import Speed
 from torch_panda.bench.contenders import CONTENDERS, OURS, Setting
+from torch_panda.bench.processes import available_memory
 from torch_panda.bench.runner import ContenderError, Footprint, Runner
 
 # Called with what is being done, whenever a piece of the work begins.
@@ -68,22 +69,33 @@ def compare(
         what was measured, torch_panda first, and what was not.
 
     Raises:
-        ContenderError: torch_panda itself failed, or one failed while it ran.
+        ContenderError: torch_panda itself failed or needs more memory than is free, or
+            one failed while it ran.
     """
     absences: list[Absence] = []
+    # All live at the same time, and a system without memory ends any process.
+    memory = 0.9 * available_memory()
     with ExitStack() as stack:
         runners: dict[str, Runner] = {}
         for name in [OURS, *(name for name in contenders if name != OURS)]:
             progress(f"start {name}")
-            reason = CONTENDERS[name].why_not(setting)
+            entry = CONTENDERS[name]
+            needed = entry.memory * setting.num_envs
+            reason = entry.why_not(setting)
+            if reason is None and needed > memory:
+                reason = (
+                    f"{setting.num_envs} environments need about "
+                    f"{needed / 1000:.1f} GB more, {memory / 1000:.1f} GB are free"
+                )
             if reason is None:
                 try:
                     runners[name] = stack.enter_context(Runner(name, setting))
+                    memory -= needed
                 except ContenderError as error:
-                    if name == OURS:
-                        raise
                     reason = str(error)
             if reason is not None:
+                if name == OURS:
+                    raise ContenderError(reason)
                 absences.append(Absence(setting, name, reason))
         speeds: dict[str, list[Speed]] = {name: [] for name in runners}
         for _ in range(1 + rounds):

@@ -211,6 +211,7 @@ class Entry:
     Attributes:
         title: how the table calls it.
         make: makes it.
+        memory: what one of its environments takes, about [MB].
         needs: modules that must be installed.
         is_limit: whether it is Bullet alone: no environments that could be reset.
         is_fetch: whether it runs the Fetch robot's task of the same name.
@@ -218,6 +219,7 @@ class Entry:
 
     title: str
     make: Callable[[Setting], Contender]
+    memory: float
     needs: tuple[str, ...] = ()
     is_limit: bool = False
     is_fetch: bool = False
@@ -238,25 +240,35 @@ class Entry:
 
 OURS = "torch_panda"
 CONTENDERS: dict[str, Entry] = {
-    OURS: Entry("torch_panda", partial(_make_ours, "exact")),
-    "fast": Entry('torch_panda, physics="fast"', partial(_make_ours, "fast")),
-    "bare-bullet": Entry("bare Bullet, C threads", BareBulletContender, is_limit=True),
+    OURS: Entry("torch_panda", partial(_make_ours, "exact"), memory=45),
+    "fast": Entry(
+        'torch_panda, physics="fast"', partial(_make_ours, "fast"), memory=45
+    ),
+    "bare-bullet": Entry(
+        "bare Bullet, C threads", BareBulletContender, memory=45, is_limit=True
+    ),
     "async": Entry(
         "panda-gym, AsyncVectorEnv",
         partial(_make_async_vector, _panda_gym_id),
+        memory=115,
         needs=("panda_gym",),
     ),
     "sb3": Entry(
         "panda-gym, SB3 SubprocVecEnv",
         _make_subproc_vec,
+        memory=155,
         needs=("panda_gym", "stable_baselines3"),
     ),
     "parallel": Entry(
-        "panda-gym, torchrl ParallelEnv", _make_parallel, needs=("panda_gym",)
+        "panda-gym, torchrl ParallelEnv",
+        _make_parallel,
+        memory=115,
+        needs=("panda_gym",),
     ),
     "fetch": Entry(
         "Fetch (MuJoCo), AsyncVectorEnv",
         partial(_make_async_vector, _fetch_id),
+        memory=50,
         needs=("gymnasium_robotics",),
         is_fetch=True,
     ),

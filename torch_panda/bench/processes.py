@@ -1,5 +1,6 @@
 """What a process and its children use, as Linux tells."""
 
+import math
 import os
 import time
 from pathlib import Path
@@ -13,6 +14,15 @@ def memory() -> float | None:
     if not Path("/proc/self/smaps_rollup").exists():
         return None
     return sum(_proportional_set_size(pid) for pid in _family(os.getpid())) / 1e6
+
+
+def available_memory() -> float:
+    """What the system can still give [MB]; infinite where it does not tell."""
+    path = Path("/proc/meminfo")
+    if not path.exists():
+        return math.inf
+    (line,) = (x for x in path.read_text().splitlines() if x.startswith("MemAvailable"))
+    return int(line.split()[1]) * 1024 / 1e6
 
 
 def cpu_time() -> float:

@@ -1,0 +1,37 @@
+"""What is compared, and what is left out."""
+
+import pytest
+
+from torch_panda.bench import comparison
+from torch_panda.bench.contenders import Setting
+from torch_panda.bench.processes import available_memory
+from torch_panda.bench.runner import ContenderError
+
+SETTING = Setting("PandaPush-v3", num_envs=2, num_threads=1)
+
+
+def run(contenders):
+    return comparison.compare(
+        SETTING, contenders, rounds=1, steps=1, progress=lambda what: None
+    )
+
+
+def test_memory_is_read():
+    assert 100 < available_memory() < 100_000_000  # [MB]
+
+
+def test_what_does_not_fit_into_memory_is_left_out(monkeypatch):
+    # Two environments of ours, and two of the fast ones, but not two processes more.
+    monkeypatch.setattr(comparison, "available_memory", lambda: 250.0)
+    results, absences = run(["fast", "async"])
+    assert [result.contender for result in results] == ["torch_panda", "fast"]
+    assert [absence.contender for absence in absences] == ["async"]
+    assert (
+        absences[0].reason == "2 environments need about 0.2 GB more, 0.0 GB are free"
+    )
+
+
+def test_our_own_must_fit(monkeypatch):
+    monkeypatch.setattr(comparison, "available_memory", lambda: 80.0)
+    with pytest.raises(ContenderError, match=r"2 environments need about 0\.1 GB more"):
+        run([])
