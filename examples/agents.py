@@ -282,15 +282,15 @@ class Agent(nn.Module):
             every = loss(batch)
             return {key: every[key] for key in loss.out_keys if key.startswith("loss_")}
         if algo == "ddpg":
-            losses = {"loss_value": loss.loss_value(batch)[0]}
-            stored_value = self._value
-            losses["loss_actor"] = loss.loss_actor(batch)[0]
+            value_loss, actor_loss = loss.loss_value, loss.loss_actor
+            delay = 1
         else:
-            losses = {"loss_value": loss.value_loss(batch)[0]}
-            stored_value = self._value
-            if self.updates % POLICY_DELAY == 0:
-                losses["loss_actor"] = loss.actor_loss(batch)[0]
-        if "loss_actor" in losses:
+            value_loss, actor_loss = loss.value_loss, loss.actor_loss
+            delay = POLICY_DELAY
+        losses = {"loss_value": value_loss(batch)[0]}
+        stored_value = self._value
+        if self.updates % delay == 0:
+            losses["loss_actor"] = actor_loss(batch)[0]
             # The actor's loss has just computed its actions and their values.
             penalty = self.hyperparameters.action_l2 * self._action.square().mean()
             losses["loss_actor"] = losses["loss_actor"] + penalty

@@ -158,7 +158,7 @@ class Run:
         ).to(args.device)
         self.buffer = make_buffer(args, self.env)
         self.demos: TensorDictReplayBuffer | None = None
-        self.batch_sizes = [args.batch_size, 0]
+        self.num_demos = 0  # of each batch
         if args.demos is not None:
             demos = read_demos(args.demos, self.env)
             self.demos = TensorDictReplayBuffer(
@@ -166,8 +166,12 @@ class Run:
             )
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
             self.demos.extend(demos)
-            number = round(args.demo_ratio * args.batch_size)
-            self.batch_sizes = [args.batch_size - number, number]
+            self.num_demos = round(args.demo_ratio * args.batch_size)
+            if not 0 <= self.num_demos < args.batch_size:
+                raise ValueError(
+                    f"demo_ratio must be from 0 to below 1, so that each batch has "
+                    f"transitions of one's own, got {args.demo_ratio}"
+                )
         self.curve: list[dict[str, float]] = []
         self.steps = 0
         self.seconds = 0.0
@@ -252,12 +256,10 @@ class Run:
 
     def sample(self) -> list[TensorDictBase]:
         """A batch of the run's own transitions, and one of demonstrations if any."""
-        buffers = (self.buffer, self.demos)
-        return [
-            buffer.sample(size)
-            for buffer, size in zip(buffers, self.batch_sizes, strict=True)
-            if buffer is not None and size
-        ]
+        batches = [self.buffer.sample(self.args.batch_size - self.num_demos)]
+        if self.demos is not None and self.num_demos:
+            batches.append(self.demos.sample(self.num_demos))
+        return batches
 
     def evaluate(self) -> None:
         """Add a point to the curve, and write and draw it."""

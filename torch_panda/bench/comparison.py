@@ -80,17 +80,11 @@ def compare(
         for name in [OURS, *(name for name in contenders if name != OURS)]:
             progress(f"start {name}")
             entry = CONTENDERS[name]
-            needed = entry.memory * setting.num_envs
-            reason = entry.why_not(setting)
-            if reason is None and needed > memory:
-                reason = (
-                    f"{setting.num_envs} environments need about "
-                    f"{needed / 1000:.1f} GB more, {memory / 1000:.1f} GB are free"
-                )
+            reason = entry.why_not(setting, memory)
             if reason is None:
                 try:
                     runners[name] = stack.enter_context(Runner(name, setting))
-                    memory -= needed
+                    memory -= entry.memory * setting.num_envs
                 except ContenderError as error:
                     reason = str(error)
             if reason is not None:

@@ -224,8 +224,8 @@ class Entry:
     is_limit: bool = False
     is_fetch: bool = False
 
-    def why_not(self, setting: Setting) -> str | None:
-        """Why it cannot be measured here; None where it can."""
+    def why_not(self, setting: Setting, memory: float) -> str | None:
+        """Why it cannot be measured here, with so much memory [MB]; None: it can."""
         if self.is_limit and (setting.task != "Push" or setting.is_joints):
             return "it steps the scene of Push, with end-effector control, only"
         if self.is_limit and not is_available():
@@ -235,6 +235,12 @@ class Entry:
         missing = [module for module in self.needs if find_spec(module) is None]
         if missing:
             return f"{' and '.join(missing)} not installed"
+        needed = self.memory * setting.num_envs
+        if needed > memory:
+            return (
+                f"{setting.num_envs} environments need about {needed / 1000:.1f} GB "
+                f"more, {memory / 1000:.1f} GB are free"
+            )
         return None
 
 

@@ -5,7 +5,6 @@ import os
 import time
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ import torch
 from torch_panda.bench.bare_bullet import Speed
 from torch_panda.bench.contenders import CONTENDERS, Setting
 from torch_panda.bench.processes import memory
+from torch_panda.closing import Closing
 
 _RESETS = 5
 
@@ -37,7 +37,7 @@ class Footprint:
     reset: float
 
 
-class Runner:
+class Runner(Closing):
     """A contender in its own process.
 
     Args:
@@ -81,17 +81,6 @@ class Runner:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-
-    def __enter__(self) -> "Runner":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _receive(self) -> Any:  # noqa: ANN401 (what the process sends)
         try:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from ctypes import Array, byref, c_double, c_int, c_size_t, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 from torch_panda.bullet import _capi
 from torch_panda.bullet.contacts import ContactPoint, read_contact
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.shapes import Box, Cylinder, Look, Shape, Sphere
+from torch_panda.closing import Closing
 
 _MAX_DOF = _capi.MAX_MULTI_DOF
 # pybullet's default for setJointMotorControlArray(POSITION_CONTROL).
@@ -138,7 +138,7 @@ def _check_collision_filters(file: str) -> None:
             )
 
 
-class PhysicsClient:
+class PhysicsClient(Closing):
     """One DIRECT client: a world of bodies, and the owner of its handle.
 
     A client must be used by one thread at a time. Clients of one process are
@@ -204,17 +204,6 @@ class PhysicsClient:
         if self._handle is not None:
             _capi.disconnect(self._handle)
             self._handle = None
-
-    def __enter__(self) -> "PhysicsClient":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def __reduce__(self) -> "tuple[object, ...]":
         raise TypeError("a PhysicsClient owns native memory and cannot be pickled")

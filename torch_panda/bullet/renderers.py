@@ -40,12 +40,23 @@ def check_renderer(renderer: str) -> None:
 @functools.cache
 def _check_egl() -> None:
     """In a process of its own: where EGL fails, Bullet ends the process."""
-    probe = subprocess.run(
-        [sys.executable, "-c", _EGL_PROBE], capture_output=True, text=True
-    )
-    if probe.returncode != 0:
-        output = (probe.stdout + probe.stderr).strip().splitlines() or ["no output"]
+    if complaint := probe(_EGL_PROBE):
         raise RuntimeError(
             f"renderer='egl' does not work on this machine, use 'tiny' "
-            f"(EGL said: {output[-1]})"
+            f"(EGL said: {complaint})"
         )
+
+
+def probe(code: str) -> str | None:
+    """Run Python code in a process of its own, which it may end.
+
+    Returns:
+        its last words if it failed.
+    """
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True
+    )
+    if process.returncode == 0:
+        return None
+    output = (process.stdout + process.stderr).strip()
+    return output.splitlines()[-1].strip() if output else "no output"

@@ -1,12 +1,11 @@
 """A client whose world pybullet's GUI shows in a window."""
 
-import subprocess
-import sys
 from ctypes import c_char_p, c_float
 
 from torch_panda.bullet import _capi
 from torch_panda.bullet.camera import Camera
 from torch_panda.bullet.client import BulletError
+from torch_panda.bullet.renderers import probe
 from torch_panda.bullet.visual import VisualClient
 
 # enum b3ConfigureDebugVisualizerEnum
@@ -60,12 +59,8 @@ class WindowClient(VisualClient):
 
 def _check_display() -> None:
     """In a process of its own: where there is no display, Bullet ends the process."""
-    probe = subprocess.run(
-        [sys.executable, "-c", _PROBE], capture_output=True, text=True
-    )
-    if probe.returncode != 0:
-        output = (probe.stdout + probe.stderr).strip().splitlines() or ["no output"]
+    if complaint := probe(_PROBE):
         raise BulletError(
             f"Bullet could not open a window, which needs a display with OpenGL "
-            f"(it said: {output[-1].strip()})"
+            f"(it said: {complaint})"
         )

@@ -5,7 +5,6 @@ import operator
 import secrets
 import sys
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -27,6 +26,7 @@ from torch_panda.bullet import (
 )
 from torch_panda.bullet.camera import resized
 from torch_panda.bullet.renderers import RendererName
+from torch_panda.closing import Closing
 from torch_panda.envs.renderer import Renderer
 from torch_panda.envs.senses import SenseOptions
 from torch_panda.envs.state import read_state
@@ -39,7 +39,7 @@ from torch_panda.tasks.base import RewardFunction
 OnDivergence = Literal["raise", "reset"]
 
 
-class RobotTaskEnv(EnvBase):
+class RobotTaskEnv(EnvBase, Closing):
     """Goal-conditioned environments of one robot and one task, stepped in parallel.
 
     What an environment draws depends on (``seed``, its index, the number of its
@@ -259,17 +259,6 @@ class RobotTaskEnv(EnvBase):
             super().close(raise_if_closed=raise_if_closed)
             self._renderer.close()
             self._simulation.close()
-
-    def __enter__(self) -> "RobotTaskEnv":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Physics cannot be copied: a pickle holds how to build the environment anew.

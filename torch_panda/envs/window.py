@@ -1,14 +1,14 @@
 """A window in which one environment after the other can be watched."""
 
 from collections.abc import Callable
-from types import TracebackType
 
 from torch_panda.bullet import Camera, PhysicsClient, Scene, VectorSimulation
 from torch_panda.bullet.window import WindowClient
+from torch_panda.closing import Closing
 from torch_panda.envs.twin import pose_bodies, pose_solids
 
 
-class Window:
+class Window(Closing):
     """pybullet's GUI on a visual twin; see `RobotTaskEnv.open_window`.
 
     Args:
@@ -48,14 +48,3 @@ class Window:
     def close(self) -> None:
         """Close the window. Closing again does nothing."""
         self._client.close()
-
-    def __enter__(self) -> "Window":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
