@@ -1,6 +1,7 @@
 """A user's own task and a user's own robot, as the README shows them."""
 
 import numpy as np
+import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
@@ -63,6 +64,23 @@ def test_own_task():
         assert td["truncated"].all()
         # The arm is sent at the balls and moves them.
         assert ((td["achieved_goal"] - start).norm(dim=1) > 0.005).all()
+
+
+@pytest.mark.parametrize(
+    ("function", "values"),
+    [
+        ("sample_goal", (0.1,)),
+        ("sample_goal", (0.1, 0.1, float("nan"))),
+        ("sample_objects", ((0.1, 0.1, RADIUS),)),
+    ],
+)
+def test_what_a_task_draws_is_checked(monkeypatch, function, values):
+    monkeypatch.setattr(PushBall, function, lambda self, rng: values)
+    with (
+        RobotTaskEnv(robot=Panda(block_gripper=True), task=PushBall()) as env,
+        pytest.raises(ValueError, match=f"{function} must return finite numbers"),
+    ):
+        env.reset()
 
 
 def test_own_robot_reaches():

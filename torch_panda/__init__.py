@@ -1,6 +1,12 @@
 """Goal-conditioned Franka Panda tasks as one vectorised TorchRL environment."""
 
-from torch_panda.bullet import BulletError, Camera, PhysicsName, PhysicsParams
+from torch_panda.bullet import (
+    BulletError,
+    Camera,
+    PhysicsName,
+    PhysicsParams,
+    WorkerError,
+)
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.gymnasium_envs import register_envs
 from torch_panda.registry import ENV_IDS, make, max_episode_steps
@@ -31,6 +37,7 @@ __all__ = [
     "Slide",
     "Stack",
     "Task",
+    "WorkerError",
     "make",
     "max_episode_steps",
 ]

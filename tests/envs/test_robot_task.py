@@ -101,6 +101,35 @@ def test_global_random_state_is_untouched(env):
     assert torch.equal(before, torch.get_rng_state())
 
 
+def test_a_pickle_keeps_the_last_seed(env):
+    env.set_seed(5)
+    with pickle.loads(pickle.dumps(env)) as copy:
+        assert torch.equal(env.reset()["desired_goal"], copy.reset()["desired_goal"])
+
+
+def test_default_dtype_and_device_change_nothing():
+    def observe():
+        with torch_panda.make(
+            "PandaPush-v1", seed=0, depth=True, sensors=("joint_torque",)
+        ) as env:
+            td = env.rollout(2, lambda td: td.set("action", torch.ones(3).cpu()))
+            return td["next"], env.get_state()
+
+    expected = observe()
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = observe()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for before, after in zip(expected, found, strict=True):
+        for key in set(before.keys()):
+            assert before[key].dtype == after[key].dtype, key
+            assert torch.equal(before[key], after[key]), key
+    with torch.device("meta"), torch_panda.make("PandaPush-v1", seed=0) as env:
+        start = env._reset()
+    assert start["observation"].device.type == "cpu"
+
+
 def test_default_seeds_differ():
     goals = []
     for _ in range(2):
@@ -110,6 +139,21 @@ def test_default_seeds_differ():
 
 
 # ---- resets and states -------------------------------------------------------
+
+
+def test_nothing_but_a_reset_comes_first(env):
+    action = TensorDict({"action": torch.zeros(3, 3)}, batch_size=[3])
+    with pytest.raises(torch_panda.BulletError, match="never reset"):
+        env.step(action)
+    with pytest.raises(torch_panda.BulletError, match="never reset"):
+        env.get_state()
+    only_first = torch.tensor([[True], [False], [False]])
+    env.reset(TensorDict({"_reset": only_first}, batch_size=[3]))
+    with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as other:
+        other.reset()
+        assert (env.get_state() == other.get_state()).all()
+    env.set_seed(1)
+    env.step(action)  # a new seed is for the next episode
 
 
 def test_partial_reset_leaves_the_others_alone(env):
@@ -242,12 +286,28 @@ def test_large_actions_are_clipped(env):
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"num_envs": 0}, {"num_threads": -1}, {"seed": -1}]
+    ("arguments", "error"),
+    [
+        ({"num_envs": 0}, ValueError),
+        ({"num_envs": "a"}, TypeError),
+        ({"num_threads": -1}, ValueError),
+        ({"num_threads": 2.5}, TypeError),
+        ({"seed": -1}, ValueError),
+        ({"seed": 1.5}, TypeError),
+        ({"render_size": 64}, ValueError),  # of no picture
+        ({"camera": torch_panda.Camera()}, ValueError),
+    ],
 )
-def test_bad_arguments(arguments):
+def test_bad_arguments(arguments, error):
     (name,) = arguments
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(error, match=name):
         torch_panda.make("PandaReach-v1", **arguments)
+
+
+@pytest.mark.parametrize("size", [0, "a", (64, 64, 3)])
+def test_bad_render_size(size):
+    with pytest.raises(ValueError, match=r"size|width"):
+        torch_panda.make("PandaReach-v1", from_pixels=True, render_size=size)
 
 
 def test_unknown_id_suggests():
@@ -293,6 +353,24 @@ def test_nothing_is_left_behind():
         del env  # a forgotten environment closes itself
     gc.collect()
     assert threading.active_count() == before
+
+
+def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):
+    clients = []
+    connect = PhysicsClient.__init__
+    monkeypatch.setattr(
+        PhysicsClient,
+        "__init__",
+        lambda self, **options: clients.append(self) or connect(self, **options),
+    )
+    task = torch_panda.Reach()
+    task.goal_dim = 2
+    with pytest.raises(ValueError, match=r"achieved_goal must return shape \(2, 2\)"):
+        torch_panda.RobotTaskEnv(robot=torch_panda.Panda(), task=task, num_envs=2)
+    assert len(clients) == 2
+    for client in clients:
+        with pytest.raises(torch_panda.BulletError, match="closed"):
+            client.step(1)
 
 
 @pytest.mark.parametrize("index", [0, 1])

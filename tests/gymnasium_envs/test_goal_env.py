@@ -101,6 +101,36 @@ def test_start_from_a_state(env):
         env.reset(options={"speed": 1})
 
 
+@pytest.mark.filterwarnings(NO_BOUNDS)
+def test_pixels_and_sensors_are_observed():
+    env = GoalEnv(
+        "PandaReach-v1",
+        from_pixels=True,
+        pixels_only=True,
+        segmentation=True,
+        sensors=("joint_torque",),
+    )
+    try:
+        check_env(env, skip_render_check=True)
+        observation, _ = env.reset()
+        space = env.observation_space
+        assert (
+            set(space)
+            == set(observation)
+            == {
+                "achieved_goal",
+                "desired_goal",
+                "joint_torque",
+                "pixels",
+                "segmentation",
+            }
+        )
+        assert space["pixels"] == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
+        assert space["segmentation"].dtype == np.int32
+    finally:
+        env.close()
+
+
 def test_time_limit_is_gymnasiums():
     for limit in (3, 60):
         env = gymnasium.make("torch_panda/PandaReach-v1", max_episode_steps=limit)

@@ -1,6 +1,7 @@
 """A camera, and the distances that it sees."""
 
 import dataclasses
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,10 +58,19 @@ class Camera:
 
 
 def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """The same view in another size: (height, width), or both in one; None: as is."""
+    """The same view in another size: (height, width), or both in one; None: as is.
+
+    Raises:
+        ValueError: it is no such size.
+    """
     if size is None:
         return camera
-    height, width = (size, size) if isinstance(size, int) else size
+    try:
+        height, width = map(operator.index, np.broadcast_to(size, 2))
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"a size must be an integer or (height, width) [pixels], got {size!r}"
+        ) from None
     return dataclasses.replace(camera, height=height, width=width)
 
 

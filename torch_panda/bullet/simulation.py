@@ -211,7 +211,7 @@ class VectorSimulation:
         n_joints, n_objects = len(scene.joint_forces), len(scene.objects)
 
         def zeros(*shape: int) -> Tensor:
-            return torch.zeros(n, *shape, dtype=torch.float64)
+            return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
 
         sizes = (n_joints, n_joints, 3, 3, 7 * n_objects, 6 * n_objects)
         # In one tensor, which one look finds finite or not.
@@ -231,7 +231,9 @@ class VectorSimulation:
         self.target_pose = zeros(len(scene.targets), 7)
         self._ik_result = zeros(n_joints)
         self._forces = doubles(scene.joint_forces)
-        self._ee_orientation = torch.tensor(scene.ee_orientation, dtype=torch.float64)
+        self._ee_orientation = torch.tensor(
+            scene.ee_orientation, dtype=torch.float64, device="cpu"
+        )
 
     def _step_one(self, control: Work, env: int) -> None:
         self._begin_step(control, self.n_substeps, env)

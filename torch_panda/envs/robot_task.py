@@ -48,7 +48,8 @@ class RobotTaskEnv(EnvBase, Closing):
     A step takes ``action``, float32 in [-1, 1] (values beyond are clipped), and gives
     under ``next``: ``observation``, ``achieved_goal``, ``desired_goal`` (float32),
     ``success``, ``terminated``, ``truncated`` and ``done`` (bool) and ``reward``
-    (float32), the last five of shape (*batch, 1).
+    (float32), the last five of shape (*batch, 1). A step or reset that fails in one
+    environment raises `WorkerError`, which names it; the others have gone on.
 
     Args:
         robot: the robot.
@@ -128,9 +129,7 @@ class RobotTaskEnv(EnvBase, Closing):
                 f"got {on_divergence!r}"
             )
         batch_size = () if num_envs is None else (num_envs,)
-        super().__init__(
-            device="cpu" if device is None else device, batch_size=batch_size
-        )
+        super().__init__(device=_check_device(device), batch_size=batch_size)
         self.robot = robot
         self.task = task
         self.num_envs = num_envs
@@ -138,17 +137,26 @@ class RobotTaskEnv(EnvBase, Closing):
         self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
         self.physics = read_physics(physics)
-        self._constructor_seed = seed
         self._set_seed(seed)
         count = num_envs or 1
-        self._step_count = torch.zeros(count, 1, dtype=torch.int64)
-        self._goal = torch.zeros(count, task.goal_dim, dtype=torch.float64)
+        self._never_reset = set(range(count))
+        self._step_count = torch.zeros(count, 1, dtype=torch.int64, device="cpu")
+        self._goal = torch.zeros(
+            count, task.goal_dim, dtype=torch.float64, device="cpu"
+        )
         self._simulation = VectorSimulation(
             self._build_scene, count, num_threads=num_threads, physics=self.physics
         )
-        self._renderer = Renderer(self._simulation, self._make_twin, renderer=renderer)
-        self._senses = self._options.make(self._simulation, self._renderer, robot)
-        self._make_specs()
+        try:
+            self._renderer = Renderer(
+                self._simulation, self._make_twin, renderer=renderer
+            )
+            self._senses = self._options.make(self._simulation, self._renderer, robot)
+            self._make_specs()
+            self._check_sizes()
+        except BaseException:
+            self._simulation.close()
+            raise
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
 
@@ -197,8 +205,9 @@ class RobotTaskEnv(EnvBase, Closing):
             ``step_count`` (*batch, 1), int64.
 
         Raises:
-            BulletError: the environment is closed.
+            BulletError: the environment is closed or was never reset.
         """
+        self._check_was_reset()
         state = self._current_state()
         values = {key: self._emit(value.clone()) for key, value in state.items()}
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
@@ -225,18 +234,19 @@ class RobotTaskEnv(EnvBase, Closing):
         Raises:
             BulletError: the environment is closed.
             ValueError: an index is out of range, or its environment was never reset.
+            TypeError: an index is no integer.
         """
         self._check_open()
         camera = resized(camera or Camera(), size)
-        single = isinstance(envs, int) or (envs is None and self.num_envs is None)
         if envs is None:
-            envs = range(len(self._goal))
-        elif isinstance(envs, int):
-            envs = [envs]
-        for env in envs:
-            if env not in range(len(self._goal)) or not self._episodes[env]:
+            chosen, single = range(len(self._goal)), self.num_envs is None
+        else:
+            chosen, single = np.atleast_1d(envs).tolist(), np.ndim(envs) == 0
+        for env in chosen:
+            known = _integer("an index", env) in range(len(self._goal))
+            if not known or env in self._never_reset:
                 raise ValueError(f"there is no environment {env} that was reset")
-        pixels = self._renderer.picture(envs, camera).to(self.device)
+        pixels = self._renderer.picture(chosen, camera).to(self.device)
         return pixels[0] if single else pixels
 
     def open_window(self, camera: Camera | None = None) -> Window:
@@ -268,7 +278,7 @@ class RobotTaskEnv(EnvBase, Closing):
             task=self.task,
             num_envs=self.num_envs,
             num_threads=self.num_threads,
-            seed=self._constructor_seed,
+            seed=self._seed,
             device=self.device,
             max_episode_steps=self.max_episode_steps,
             terminate_on_success=self.terminate_on_success,
@@ -282,6 +292,7 @@ class RobotTaskEnv(EnvBase, Closing):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_open()
+        self._check_was_reset()
         action = self._read_action(tensordict)
         stepped = self._read_mask(tensordict, "_step")
         self.robot.set_action(action, self._simulation)
@@ -312,6 +323,7 @@ class RobotTaskEnv(EnvBase, Closing):
         state = self._current_state()
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = list(range(len(self._goal))) if mask is None else _indices(mask)
+        envs = sorted({*envs, *self._never_reset})
         if set_state and tensordict is not None:
             given = read_state(tensordict, like=state, envs=envs)
         else:
@@ -328,6 +340,7 @@ class RobotTaskEnv(EnvBase, Closing):
         return self._make_tensordict(observation)
 
     def _set_seed(self, seed: int | None) -> None:
+        self._seed = seed  # what a pickle gives the copy
         if seed is None:
             # Different in every process, also in those that unpickle this environment.
             seed = secrets.randbits(63)
@@ -367,16 +380,14 @@ class RobotTaskEnv(EnvBase, Closing):
         simulation = self._simulation
         rng = np.random.default_rng((*self._streams[env], self._episodes[env]))
         self._episodes[env] += 1
+        self._never_reset.discard(env)
         self._step_count[env] = 0
-        self._goal[env] = torch.as_tensor(self.task.sample_goal(rng))
-        simulation.joint_position[env] = torch.tensor(
-            self.robot.neutral_joint_position, dtype=torch.float64
-        )
+        _fill(self._goal[env], self.task.sample_goal(rng), "sample_goal")
+        simulation.joint_position[env] = _double(self.robot.neutral_joint_position)
         simulation.joint_velocity[env] = 0.0
         if simulation.scene.objects:
-            simulation.object_pose[env] = torch.as_tensor(
-                self.task.sample_objects(rng), dtype=torch.float64
-            )
+            poses = self.task.sample_objects(rng)
+            _fill(simulation.object_pose[env], poses, "sample_objects")
             simulation.object_velocity[env] = 0.0
 
     def _place(self, envs: list[int]) -> None:
@@ -526,20 +537,74 @@ class RobotTaskEnv(EnvBase, Closing):
         if self.is_closed:
             raise BulletError("the environment is closed")
 
+    def _check_was_reset(self) -> None:
+        if self._never_reset:
+            raise BulletError(
+                f"environments {sorted(self._never_reset)} were never reset: call "
+                f"reset first"
+            )
+
+    def _check_sizes(self) -> None:
+        """Make sure that robot and task observe as many numbers as they say."""
+        robot, task = self.robot, self.task
+        for function, size in (
+            (robot.observation, robot.observation_dim),
+            (task.observation, task.observation_dim),
+            (task.achieved_goal, task.goal_dim),
+        ):
+            expected = (len(self._goal), size)
+            shape = tuple(function(self._simulation).shape)
+            if shape != expected:
+                raise ValueError(
+                    f"{function.__qualname__} must return shape {expected}, got {shape}"
+                )
+
+
+def _double(values: object) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float64, device="cpu")
+
+
+def _fill(row: Tensor, values: object, function: str) -> None:
+    """Take what a task has drawn for one environment, (...)."""
+    drawn = _double(values)
+    if drawn.shape != row.shape or not drawn.isfinite().all():
+        raise ValueError(
+            f"{function} must return finite numbers of shape {tuple(row.shape)}, "
+            f"got {values}"
+        )
+    row.copy_(drawn)
+
 
 def _indices(mask: Tensor) -> list[int]:
     return mask.flatten().nonzero().flatten().tolist()
 
 
 def _check_seed(seed: int) -> int:
-    if operator.index(seed) < 0:
+    number = _integer("seed", seed)
+    if number < 0:
         raise ValueError(f"seed must be a non-negative integer, got {seed}")
-    return operator.index(seed)
+    return number
+
+
+def _integer(name: str, value: int) -> int:
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} must be an integer, got {value!r}") from None
+
+
+def _check_device(device: torch.device | str | int | None) -> torch.device:
+    device = torch.device("cpu" if device is None else device)
+    try:
+        torch.empty(0, device=device)
+    except AssertionError as error:  # torch was built without it
+        raise RuntimeError(f"device {device} does not work: {error}") from None
+    return device
 
 
 def _check_positive(**arguments: int | None) -> None:
     for name, value in arguments.items():
-        if value is not None and not 1 <= operator.index(value) <= sys.maxsize:
+        if value is not None and not 1 <= _integer(name, value) <= sys.maxsize:
             raise ValueError(
                 f"{name} must be None or from 1 to {sys.maxsize}, got {value}"
             )

@@ -46,15 +46,27 @@ class SenseOptions:
     renderer: RendererName
     sensors: Sequence[str]
 
+    @property
+    def sees(self) -> bool:
+        """Whether pictures are observed."""
+        return self.from_pixels or self.depth or self.segmentation
+
     def check(self, robot: Robot) -> None:
         """Make sure that a robot on this machine can have these senses.
 
         Raises:
-            ValueError: the options contradict each other, or the robot.
+            ValueError: the options contradict each other, or the robot, or a size is
+                out of range.
             RuntimeError: EGL is asked for and does not work here.
         """
         if self.pixels_only and not self.from_pixels:
             raise ValueError("pixels_only=True needs from_pixels=True")
+        view = self.camera is not None or self.render_size is not None
+        if view and not self.sees:
+            raise ValueError(
+                "camera and render_size need from_pixels, depth or segmentation"
+            )
+        resized(self.camera or PIXELS_CAMERA, self.render_size)
         check_renderer(self.renderer)
         check_sensors(robot, self.sensors)
 
@@ -63,7 +75,7 @@ class SenseOptions:
     ) -> list[Sense]:
         """The senses, none of which exists unless it was asked for."""
         senses: list[Sense] = []
-        if self.from_pixels or self.depth or self.segmentation:
+        if self.sees:
             vision = Vision(
                 renderer,
                 simulation.num_envs,

@@ -42,7 +42,9 @@ class Touch:
         self._robot = robot
         shapes = sensor_shapes(robot)
         self._values = {
-            sensor: torch.zeros(simulation.num_envs, *shapes[sensor])
+            sensor: torch.zeros(
+                simulation.num_envs, *shapes[sensor], dtype=torch.float32, device="cpu"
+            )
             for sensor in sensors
         }
 

@@ -35,11 +35,15 @@ class Frames:
         cls, n: int, camera: Camera, *, depth: bool = False, segmentation: bool = False
     ) -> "Frames":
         """Black pictures of a camera's size."""
-        size = (n, camera.height, camera.width)
+
+        def zeros(channels: int, dtype: torch.dtype) -> Tensor:
+            shape = (n, camera.height, camera.width, channels)
+            return torch.zeros(shape, dtype=dtype, device="cpu")
+
         return cls(
-            torch.zeros(*size, 3, dtype=torch.uint8),
-            torch.zeros(*size, 1) if depth else None,
-            torch.zeros(*size, 1, dtype=torch.int32) if segmentation else None,
+            zeros(3, torch.uint8),
+            zeros(1, torch.float32) if depth else None,
+            zeros(1, torch.int32) if segmentation else None,
         )
 
 

@@ -9,20 +9,33 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 
 from torch_panda.envs import RobotTaskEnv
 
-Observation = dict[str, NDArray[np.float32]]
+Observation = dict[str, NDArray[Any]]
 
-_KEYS = ("observation", "achieved_goal", "desired_goal")
+# What Gymnasium gives beside the observation, or in the infos.
+_OUTCOME = {"success", "reward", "terminated", "truncated", "done"}
 
 
 def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
-    """The space of one environment's observation and goals, float32."""
-    spec = env.observation_spec
-    return spaces.Dict(
-        {key: spaces.Box(-np.inf, np.inf, spec[key].shape[-1:]) for key in _KEYS}
-    )
+    """The space of what one environment observes, and of its goals.
+
+    float32 without bounds, and integers with those of their type.
+    """
+    boxes: dict[str, spaces.Space[Any]] = {}
+    for key in _keys(env.observation_spec):
+        zero = env.observation_spec[key].zero().numpy()
+        shape = zero.shape[env.batch_dims :]
+        bounds = np.iinfo(zero.dtype) if zero.dtype.kind in "iu" else None
+        low, high = (bounds.min, bounds.max) if bounds else (-np.inf, np.inf)
+        boxes[key] = spaces.Box(low, high, shape, zero.dtype.type)
+    return spaces.Dict(boxes)
+
+
+def _keys(observed: Composite | TensorDictBase) -> list[str]:
+    return sorted(set(observed.keys()) - _OUTCOME)
 
 
 def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
@@ -31,8 +44,8 @@ def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
 
 
 def observation(tensordict: TensorDictBase) -> Observation:
-    """Observation and goals as arrays of the tensordict's batch size."""
-    return {key: tensordict[key].numpy() for key in _KEYS}
+    """What is observed, and the goals, as arrays of the tensordict's batch size."""
+    return {key: tensordict[key].numpy() for key in _keys(tensordict)}
 
 
 def action(values: ArrayLike) -> Tensor:

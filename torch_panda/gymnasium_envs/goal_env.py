@@ -18,7 +18,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
     """A goal environment: ``gymnasium.make("torch_panda/PandaPush-v1")``.
 
     Observations are dictionaries of ``observation``, ``achieved_goal`` and
-    ``desired_goal``, float32; ``info["is_success"]`` says whether the goal is reached.
+    ``desired_goal``, float32, and of pixels or sensors if asked for;
+    ``info["is_success"]`` says whether the goal is reached.
 
     Args:
         env: an id of `torch_panda.ENV_IDS`, whose episodes ``gymnasium.make``

@@ -90,7 +90,7 @@ class Task(ABC):
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation: (num_envs, observation_dim), float64."""
-        return torch.zeros(simulation.num_envs, 0, dtype=torch.float64)
+        return simulation.ee_position[:, :0]
 
     @abstractmethod
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
