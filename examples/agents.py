@@ -1,13 +1,14 @@
 """DDPG, TD3, SAC and TQC for goal-conditioned tasks, from torchrl's losses."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule as Mod
 from tensordict.nn import TensorDictSequential as Seq
 from torch import Tensor, nn
@@ -367,6 +368,16 @@ def save_policy(path: Path, agent: Agent, env_id: str) -> None:
     replace(path, lambda temporary: torch.save(state, temporary))
 
 
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What `save_policy` wrote, on the CPU.
+
+    Raises:
+        ValueError: the file holds no policy.
+    """
+    keys = ("env_id", "hyperparameters", "policy")
+    return read(path, "a policy", keys, map_location="cpu")
+
+
 def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Seq:
     """The policy of a checkpoint that `save_policy` wrote.
 
@@ -391,3 +402,32 @@ def replace(path: Path, write: Callable[[Path], object]) -> None:
     temporary = path.with_name(path.name + ".new")
     write(temporary)
     os.replace(temporary, path)
+
+
+def read(
+    path: Path,
+    what: str,
+    keys: Iterable[NestedKey],
+    **options: Any,  # noqa: ANN401 (those of torch.load)
+) -> Any:  # noqa: ANN401 (what was saved)
+    """Read a file that torch.save wrote.
+
+    Args:
+        path: of the file.
+        what: it should hold, for the error.
+        keys: that this has.
+        options: of torch.load.
+
+    Raises:
+        ValueError: it is missing, empty or damaged, or holds something else.
+    """
+    if not path.exists():
+        raise ValueError(f"there is no file {path}")
+    try:
+        content = torch.load(path, **options)
+        itemgetter(*keys)(content)
+    except Exception as error:  # of almost any kind: it depends on the bytes
+        raise ValueError(
+            f"{path} does not hold {what}, or is damaged ({type(error).__name__})"
+        ) from None
+    return content

@@ -36,6 +36,7 @@ from tqdm import tqdm
 import torch_panda
 from agents import Agent, Hyperparameters, save_policy
 from evaluate import evaluate
+from limits import check_limits
 from torch_panda.transforms import HindsightRelabel
 from train import STORED_KEYS, StopSignal, crossed
 
@@ -266,10 +267,9 @@ def connect(args: Args) -> None:
 
 def main(args: Args) -> None:
     """Train, and say where the policy is."""
-    if min(args.num_workers, args.cpus_per_worker, args.batch_frames) < 1:
-        raise SystemExit("numbers of workers, CPUs, envs and steps must be positive")
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
+        check_limits(args)
         connect(args)
         learner = Learner(args)
         out.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
-from agents import load_policy
+from agents import load_policy, read_checkpoint
+from limits import check_limits
 from torch_panda import PhysicsName
 
 
@@ -94,11 +95,10 @@ def main(args: Args) -> None:
     path = args.run / "checkpoint.pt" if args.run.is_dir() else args.run
     if not path.exists():
         raise SystemExit(f"there is no checkpoint at {path}")
-    if args.episodes < 1:
-        raise SystemExit(f"episodes must be at least 1, got {args.episodes}")
-    checkpoint = torch.load(path)
-    env_id = args.env_id or checkpoint["env_id"]
     try:
+        check_limits(args)
+        checkpoint = read_checkpoint(path)
+        env_id = args.env_id or checkpoint["env_id"]
         env = torch_panda.make(
             env_id,
             num_envs=min(args.num_envs, args.episodes),

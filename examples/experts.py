@@ -8,6 +8,7 @@ so experts serve rollouts and collectors of any batch size. Positions are in the
 frame [m]; an action of 1 displaces the end-effector by 5 cm.
 """
 
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from tqdm import tqdm
 import torch_panda
 from evaluate import wilson_interval
 from flip_expert import flip
+from limits import check_limits
 from moves import CUBE, carry, go_over, go_to, is_held, norm, push_to, unit
 
 # (observation, achieved_goal, desired_goal), each (..., size), to the action.
@@ -183,19 +185,31 @@ def play(
     return [row[:length] for row, length in zip(rollout, lengths.tolist(), strict=True)]
 
 
+def prepare(path: Path) -> None:
+    """Make a file's folder, so that what takes long to make will not be lost.
+
+    Raises:
+        OSError: the file could not be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise OSError(f"cannot write to {path}")
+
+
 def main(args: Args) -> None:
     """Run the episodes, print the success rates, save the transitions."""
-    if args.episodes < 1:
-        raise SystemExit(f"episodes must be at least 1, got {args.episodes}")
     try:
+        check_limits(args)
         expert = make_expert(args.env_id)
+        if args.out is not None:
+            prepare(args.out)
         env = torch_panda.make(
             args.env_id,
             num_envs=args.num_envs,
             num_threads=args.num_threads,
             seed=args.seed,
         )
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
     episodes: list[TensorDictBase] = []
     with env, tqdm(total=args.episodes, unit="episode", desc=args.env_id) as progress:

@@ -29,8 +29,9 @@ from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 import torch_panda
-from agents import Agent, Hyperparameters, replace, save_policy
+from agents import Agent, Hyperparameters, read, replace, save_policy
 from evaluate import evaluate
+from limits import check_limits
 from plot import plot_curve
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 from watch import record
@@ -167,10 +168,10 @@ class Run:
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
             self.demos.extend(demos)
             self.num_demos = round(args.demo_ratio * args.batch_size)
-            if not 0 <= self.num_demos < args.batch_size:
+            if self.num_demos >= args.batch_size:
                 raise ValueError(
-                    f"demo_ratio must be from 0 to below 1, so that each batch has "
-                    f"transitions of one's own, got {args.demo_ratio}"
+                    f"a demo_ratio of {args.demo_ratio} leaves no room for transitions "
+                    f"of one's own in a batch of {args.batch_size}"
                 )
         self.curve: list[dict[str, float]] = []
         self.steps = 0
@@ -311,9 +312,9 @@ class Run:
         """Take what `save` wrote.
 
         Raises:
-            ValueError: it is the state of a run with other arguments.
+            ValueError: it is the state of a run with other arguments, or damaged.
         """
-        state = torch.load(path)
+        state = read(path, "the state of a run", ["args"])
         ours, theirs = fixed(self.args), state["args"]
         differing = [
             f"{key} was {theirs.get(key)!r}, is {value!r}"
@@ -362,9 +363,12 @@ def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
     """Transitions (n,) of whole episodes.
 
     Raises:
-        ValueError: they are not of such an environment.
+        ValueError: the file holds none, or none of such an environment.
     """
-    demos = torch.load(path, weights_only=False).select(*STORED_KEYS)
+    demos = read(path, "demonstrations", STORED_KEYS, weights_only=False)
+    demos = demos.select(*STORED_KEYS)
+    if not len(demos):
+        raise ValueError(f"{path} holds no transitions")
     for key in ("observation", "action", "desired_goal"):
         expected = env.full_observation_spec.get(key, None)
         size = (env.action_spec if expected is None else expected).shape[-1]
@@ -413,21 +417,42 @@ def fixed(args: Args) -> dict[str, Any]:
     return {key: value for key, value in every.items() if key not in FREE_ARGUMENTS}
 
 
+def check(args: Args, out: Path) -> None:
+    """Refuse options that would end the training later.
+
+    Raises:
+        ValueError: says which, and what is accepted.
+    """
+    check_limits(args)
+    if args.her == "augment" and not 1 / 3 < args.her_ratio < 1:
+        raise ValueError(
+            "with --her augment, which stores her_ratio / (1 - her_ratio) copies, "
+            f"her_ratio must be above 1/3 and below 1, got {args.her_ratio}"
+        )
+    if args.resume and not (out / "resume.pt").exists():
+        raise ValueError(f"there is no run to resume in {out}")
+    try:
+        torch.zeros(1, device=args.device).item()
+    except (RuntimeError, AssertionError, ImportError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            "device must be one that torch can use here, such as cpu, "
+            f"got {args.device!r}: {reason}"
+        ) from None
+
+
 def main(args: Args) -> None:
     """Train, and say where the results are."""
-    if args.total_steps < 1 or args.updates_per_step < 0:
-        raise SystemExit("total_steps must be positive, updates_per_step not negative")
     out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
     try:
+        check(args, out)
         run = Run(args, out)
         if args.resume:
             run.load(out / "resume.pt")
-    except FileNotFoundError:
-        raise SystemExit(f"there is no run to resume in {out}") from None
-    except ValueError as error:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
+    except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
     finished = run.train()
     run.close()
     if finished and args.video:

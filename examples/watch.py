@@ -25,8 +25,9 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_ty
 from tqdm import tqdm
 
 import torch_panda
-from agents import load_policy
+from agents import load_policy, read_checkpoint
 from experts import make_expert
+from limits import check_limits
 
 CELL = (240, 320)  # height and width [pixels]
 FPS = 25  # real time: the control frequency
@@ -46,16 +47,17 @@ def record(
 
     Raises:
         ValueError: the file's name ends otherwise.
+        OSError: its folder cannot be made.
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"a video's name must end in .mp4 or .gif, got {path.name!r}")
+    path.parent.mkdir(parents=True, exist_ok=True)
     frames = [
         draw(env, state, step)
         for step, state in enumerate(
             tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame")
         )
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
     options = (
         {"loop": 0, "duration": 1000 / FPS} if path.suffix == ".gif" else {"fps": FPS}
     )
@@ -138,18 +140,19 @@ class Args:
 
 def main(args: Args) -> None:
     """Record a policy, or show it."""
-    torch.manual_seed(args.seed)
-    checkpoint = None
-    if args.policy not in ("random", "expert"):
-        path = Path(args.policy)
-        path = path / "checkpoint.pt" if path.is_dir() else path
-        if not path.exists():
-            raise SystemExit(
-                f"a policy is random, expert or a run, got {args.policy!r}"
-            )
-        checkpoint = torch.load(path)
-    env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
     try:
+        check_limits(args)
+        torch.manual_seed(args.seed)
+        checkpoint = None
+        if args.policy not in ("random", "expert"):
+            path = Path(args.policy)
+            path = path / "checkpoint.pt" if path.is_dir() else path
+            if not path.exists():
+                raise ValueError(
+                    f"a policy is random, expert or a run, got {args.policy!r}"
+                )
+            checkpoint = read_checkpoint(path)
+        env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
         num_envs = 1 if args.human else args.num_envs
         with torch_panda.make(env_id, num_envs=num_envs, seed=args.seed) as env:
             policy: TensorDictModuleBase
@@ -164,7 +167,7 @@ def main(args: Args) -> None:
             else:
                 record(env, policy, args.out)
                 print(f"wrote {args.out}")
-    except (ValueError, torch_panda.BulletError) as error:
+    except (ValueError, OSError, torch_panda.BulletError) as error:
         raise SystemExit(str(error)) from None
     except KeyboardInterrupt:
         raise SystemExit("stopped") from None

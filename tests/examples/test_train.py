@@ -202,6 +202,7 @@ def test_interrupt_saves(tmp_path):
         (("--env-id", "PandaFly-v1"), "unknown environment id 'PandaFly-v1'"),
         (("--resume",), "there is no run to resume"),
         (("--total-steps", "0"), "total_steps must be positive"),
+        (("--demos", "nofile.pt"), "there is no file nofile.pt"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, arguments, message):

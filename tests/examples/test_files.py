@@ -1,0 +1,104 @@
+"""The files that the scripts are given: bad ones are one line, and nothing is lost."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import evaluate
+import experts
+import torch_panda
+import train
+import watch
+from tests.examples.test_train import run
+
+
+def save(path, content):
+    """Write bytes as they are, anything else as torch does; "half" is half a file."""
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+        return
+    torch.save({"env_id": "PandaReach-v1"} if content == "half" else content, path)
+    if content == "half":
+        data = path.read_bytes()
+        path.write_bytes(data[: len(data) // 2])
+
+
+BAD = pytest.mark.parametrize(
+    "content",
+    [b"", b"hello", b"\x80\x02]", "half", {"steps": 1}, [1, 2], TensorDict(x=1)],
+    ids=["empty", "text", "pickle", "half", "state", "list", "tensordict"],
+)
+
+
+@BAD
+@pytest.mark.parametrize("script", [evaluate, watch])
+def test_files_that_hold_no_policy(tmp_path, script, content):
+    path = tmp_path / "checkpoint.pt"
+    save(path, content)
+    given = {"run": path} if script is evaluate else {"policy": str(tmp_path)}
+    message = f"^{path} does not hold a policy, or is damaged \\(\\w+\\)$"
+    with pytest.raises(SystemExit, match=message):
+        script.main(script.Args(**given))
+
+
+@BAD
+def test_files_that_hold_no_demonstrations(tmp_path, content):
+    path = tmp_path / "demos.pt"
+    save(path, content)
+    message = f"^{path} does not hold demonstrations, or is damaged \\(\\w+\\)$"
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=1) as env,
+        pytest.raises(ValueError, match=message),
+    ):
+        train.read_demos(path, env)
+
+
+def test_demonstrations_without_a_transition(tmp_path):
+    path = tmp_path / "demos.pt"
+    experts.main(experts.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path))
+    with torch_panda.make("PandaReach-v1", num_envs=1) as env:
+        assert len(train.read_demos(path, env))
+        save(path, torch.load(path, weights_only=False)[:0])
+        with pytest.raises(ValueError, match=f"{path} holds no transitions"):
+            train.read_demos(path, env)
+
+
+def test_damaged_state_of_a_run(tmp_path):
+    save(tmp_path / "resume.pt", b"hello")
+    refused = run("train", "--resume", "--out", tmp_path, check=False)
+    assert refused.returncode == 1
+    assert "resume.pt does not hold the state of a run, or is damaged" in refused.stderr
+    assert "Traceback" not in refused.stderr
+    assert (tmp_path / "resume.pt").read_bytes() == b"hello"
+
+
+def test_demonstrations_go_into_a_new_folder(tmp_path):
+    path = tmp_path / "new" / "folder" / "demos.pt"
+    experts.main(experts.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path))
+    assert len(torch.load(path, weights_only=False)) > 2
+
+
+def must_not_play(*arguments):
+    raise AssertionError("the file should have been refused before")
+
+
+@pytest.mark.parametrize("script", [experts, watch])
+def test_outputs_below_a_file(tmp_path, monkeypatch, script):
+    monkeypatch.setattr(script, "play", must_not_play)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"^\[Errno .*file"):
+        script.main(script.Args(out=tmp_path / "file" / "out.gif"))
+
+
+def test_demonstrations_do_not_replace_a_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(experts, "play", must_not_play)
+    with pytest.raises(SystemExit, match=f"^cannot write to {tmp_path}$"):
+        experts.main(experts.Args(out=tmp_path))
+
+
+def test_training_below_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    refused = run("train", "--out", tmp_path / "file" / "run", check=False)
+    assert refused.returncode == 1
+    assert "Not a directory" in refused.stderr
+    assert "Traceback" not in refused.stderr
