@@ -33,7 +33,7 @@ def successes(env_id, episodes, seed):
         ("PandaSlide-v1", 32, 9),
         ("PandaPickAndPlace-v1", 16, 13),
         ("PandaStack-v1", 16, 12),
-        ("PandaFlip-v1", 32, 8),
+        ("PandaFlip-v1", 32, 14),
         ("PandaPush-v3", 16, 13),
     ],
 )
