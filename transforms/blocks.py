@@ -32,7 +32,8 @@ class GoalBlocks:
     def __init__(self) -> None:
         self.rows = 0
         self.table = np.zeros((0, 5), dtype=np.int32)
-        self.goals = torch.zeros(0)
+        self.goals = torch.zeros(0, device="cpu")
+        self._goal_size = 1  # numbers a goal
         self._used = 0  # entries up to the end of the last block
         self._typical = 16  # length of the trajectory that ended last
         self._free: list[int] = []  # unused trajectories
@@ -40,8 +41,9 @@ class GoalBlocks:
     def start(self, goals: Tensor) -> None:
         """Takes type, shape and device from the first goals, (n, *goal)."""
         self.goals = goals.new_zeros(1, *goals.shape[1:])
+        self._goal_size = max(1, self.goals.numel())
 
-    def find(self, trajectory: Integers | list[int]) -> tuple[Integers, ...]:
+    def find(self, trajectory: Integers) -> tuple[Integers, ...]:
         """Returns the table's columns for some trajectories, (n,) each."""
         return tuple(self.table.take(trajectory, 0).T)
 
@@ -80,7 +82,7 @@ class GoalBlocks:
         return new
 
     def append(
-        self, trajectory: list[int], length: Integers
+        self, trajectory: Integers, length: Integers
     ) -> tuple[Integers, Integers]:
         """Makes trajectories longer; returns their bases and old ends, (m,) each."""
         base, _, end, limit, _ = self.find(trajectory)
@@ -90,7 +92,7 @@ class GoalBlocks:
         self.table[trajectory, END] = longer
         return base, end
 
-    def close(self, trajectory: list[int]) -> None:
+    def close(self, trajectory: Integers) -> None:
         """Notes that trajectories have ended."""
         self.table[trajectory, OPEN] = 0
         self._typical = int(self.table[trajectory[-1], END])
@@ -112,7 +114,7 @@ class GoalBlocks:
 
     def compact(
         self,
-        trajectory: list[int] | None = None,
+        trajectory: Integers | None = None,
         room: Integers | None = None,
         extra: int = 0,
     ) -> None:
@@ -134,10 +136,10 @@ class GoalBlocks:
 
     def _spare(self) -> int:
         """Entries beyond one a row: 3 bytes a row, or a quarter more."""
-        goal_size = max(1, self.goals[:1].numel())
-        return max(1024, min(self.rows // 4, 3 * self.rows // (4 * goal_size)))
+        spare = 3 * self.rows // (4 * self._goal_size)
+        return max(1024, min(self.rows // 4, spare))
 
-    def _grow(self, trajectory: list[int], end: Integers) -> Integers:
+    def _grow(self, trajectory: Integers, end: Integers) -> Integers:
         """Makes room for the steps below `end` and returns the bases, (m,) each."""
         base, first, old_end, limit, _ = self.find(trajectory)
         # As much again, or room for a trajectory like the last one; all of it together
@@ -150,7 +152,7 @@ class GoalBlocks:
         if self._used + total > len(self.goals):
             self.compact(trajectory, room)
         else:
-            moved, held = np.asarray(trajectory)[short], (old_end - first)[short]
+            moved, held = trajectory[short], (old_end - first)[short]
             start = self._used + room[short].cumsum() - room[short]
             goals = self.read(_ranges((base + first)[short], held))
             self.write(_ranges(start, held), goals)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.envs import Compose, EnvBase, MultiStepTransform, Transform
+from torchrl.envs import EnvBase, MultiStepTransform, Transform
 
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
 from torch_panda.transforms.strategies import Strategy, check_strategy
@@ -36,7 +36,8 @@ class BufferTransform(Transform):
         )
         self._generator: torch.Generator | None = None
         if seed is not None:
-            self._generator = torch.Generator().manual_seed(seed)
+            self._generator = torch.Generator("cpu").manual_seed(seed)
+        self._is_chain_checked = False
 
     # Tells torchrl that a buffer shared between processes needs share_memory_(), which
     # is not there: every process would write to a memory of its own.
@@ -51,6 +52,12 @@ class BufferTransform(Transform):
         if isinstance(container, EnvBase) or container.parent is not None:
             raise ValueError(self._env_error())
         super().set_container(container)
+        self.empty_cache()
+
+    def empty_cache(self) -> None:
+        """Is called by a chain when it changes: n-step rewards are looked for again."""
+        super().empty_cache()
+        self._is_chain_checked = False
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise ValueError(self._env_error())
@@ -64,16 +71,18 @@ class BufferTransform(Transform):
 
     def _load_generator(self, state: torch.Tensor | None) -> None:
         if state is not None:
-            self._generator = self._generator or torch.Generator()
+            self._generator = self._generator or torch.Generator("cpu")
             self._generator.set_state(state)
 
     def _check_chain(self) -> None:
         """Raises a RuntimeError if the buffer makes rewards of n steps."""
-        chain = self.__dict__["_container"]
-        chain = chain() if chain is not None else None
-        if not isinstance(chain, Compose):
+        if self._is_chain_checked:
             return
-        for transform in chain.transforms:
+        chain: Transform | None = self
+        while chain is not None:  # chains may be nested
+            root, container = chain, chain.__dict__["_container"]
+            chain = container() if container is not None else None
+        for transform in root.modules():
             if isinstance(transform, MultiStepTransform):
                 raise RuntimeError(
                     f"{type(self).__name__} cannot be combined with "
@@ -81,3 +90,4 @@ class BufferTransform(Transform):
                     "from one transition. Sample slices with "
                     'HindsightRelabel(unit="slice") instead.'
                 )
+        self._is_chain_checked = True

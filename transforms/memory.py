@@ -18,7 +18,14 @@ from torch_panda.transforms.strategies import (
     choose_steps,
     uniform,
 )
-from torch_panda.transforms.trajectories import Integers, Runs, split_runs
+from torch_panda.transforms.trajectories import (
+    Integers,
+    Runs,
+    are_linked,
+    differ,
+    find_restarts,
+    split_runs,
+)
 
 # Transitions that may wait to be sorted into trajectories.
 MAX_WAITING = 4096
@@ -58,7 +65,11 @@ class GoalMemory:
         self._forgotten = 0  # floor that trajectories are cut at; lags behind
         self._unit = 1  # transitions written at one index of the storage
         self._origin = 0  # serial, in units, that index 0 is counted from
-        self._waiting: list[tuple[Tensor, Tensor, Tensor]] = []
+        # Arguments of `write`: streams, dones, goals and, if known, roots.
+        self._waiting: list[list[Tensor]] = []
+        self._rooted = False  # whether they are known
+        # Whether a row's root was ever what the row before it achieved.
+        self._linked = False
         self._ring = np.zeros((0, 2), dtype=np.int32)  # (rows, [trajectory, step])
         self._blocks = GoalBlocks()
         self._open: dict[int, int] = {}  # stream -> trajectory that may go on
@@ -70,19 +81,34 @@ class GoalMemory:
 
     # -- writing ----------------------------------------------------------------------
 
-    def write(self, stream: Tensor, done: Tensor, goals: Tensor, unit: int) -> Tensor:
+    def write(
+        self,
+        stream: Tensor,
+        done: Tensor,
+        goals: Tensor,
+        root: Tensor | None,
+        unit: int,
+    ) -> Tensor:
         """Takes the goals that transitions achieved and returns their serials, (n,).
 
         Args:
             stream: trajectory or environment of every transition, (n,).
             done: whether the transition ends its trajectory, (n,), bool.
             goals: what it achieved, (n, *goal).
+            root: what was achieved before it, (n, *goal), None if unknown. A stream
+                that does not begin there where it was left begins a new trajectory,
+                once roots have been seen to be what the row before achieved.
             unit: transitions that the buffer writes at one index.
         """
         self._unit = unit
+        if self._rooted != (root is not None):
+            self.end_trajectories()
+            self._rooted = root is not None
         # Copies, as collectors reuse their tensors.
-        self._waiting.append((stream.clone(), done.clone(), goals.clone()))
-        start, self.head = self.head, self.head + len(goals)
+        self._waiting.append([stream.clone(), done.clone(), goals.clone()])
+        if root is not None:
+            self._waiting[-1].append(root.clone())
+        start, self.head = self.head, self.head + goals.shape[0]
         if self.capacity is not None:
             self.floor = max(self.floor, self.head - self.capacity)
         if self.head - self._sorted >= MAX_WAITING:
@@ -93,25 +119,31 @@ class GoalMemory:
         """Sorts what waits into trajectories."""
         if not self._waiting:
             return
-        streams, dones, parts = zip(*self._waiting, strict=True)
+        streams, dones, parts, *roots = zip(*self._waiting, strict=True)
         self._waiting.clear()
-        goals = torch.cat(parts)
+        goals = _join(parts)
         self._make_room(goals)
-        stream, done = (torch.cat(x).cpu().numpy() for x in (streams, dones))
+        stream, done = (_join(x).cpu().numpy() for x in (streams, dones))
+        root = _join(roots[0]) if roots else None
+        order = stream.argsort(kind="stable")
+        stream, done = stream[order], done[order]
+        if root is not None and not self._linked:
+            self._linked = are_linked(order, stream, done, goals, root)
+        if root is not None and self._linked and len(parts) > 1:
+            part = np.arange(len(parts)).repeat([x.shape[0] for x in parts])
+            done[find_restarts(order, stream, part, goals, root)] = True
         runs = split_runs(stream, done)
-        trajectory = self._trajectories_of(runs)
+        trajectory = self._trajectories_of(runs, order[runs.start], root)
         base, begin = self._blocks.append(trajectory, runs.length)
-        over = [t for t, end in zip(trajectory, runs.ended, strict=True) if end]
-        if over:
-            self._blocks.close(over)
+        if runs.ended.any():
+            self._blocks.close(trajectory[runs.ended])
 
         # From one entry a run, (m,), to one a transition sorted by run, (n,).
-        run_start = runs.length.cumsum() - runs.length
-        step = (begin - run_start).repeat(runs.length) + np.arange(len(goals))
+        step = (begin - runs.start).repeat(runs.length) + np.arange(len(goals))
         entry = np.empty_like(step)
-        entry[runs.order] = base.repeat(runs.length) + step
+        entry[order] = base.repeat(runs.length) + step
         self._blocks.write(entry, goals)
-        row = (self._sorted + runs.order) % len(self._ring)
+        row = (self._sorted + order) % len(self._ring)
         self._ring[row, 0] = np.repeat(trajectory, runs.length)
         self._ring[row, 1] = step
         self._sorted = self.head
@@ -140,30 +172,45 @@ class GoalMemory:
         self._ring = ring
         self._blocks.rows = rows
 
-    def _trajectories_of(self, runs: Runs) -> list[int]:
-        """Returns the trajectory of every run, a known one or a new, m numbers.
+    def _trajectories_of(
+        self, runs: Runs, row: Integers, root: Tensor | None
+    ) -> Integers:
+        """Returns the trajectory of every run, a known one or a new, (m,).
 
         Runs of one stream follow each other: only the first of them may continue a
         trajectory, and only the last may be continued.
+
+        Args:
+            runs: the runs.
+            row: the first row of every run, (m,).
+            root: what was achieved before every row, (n, *goal), None if unknown.
         """
-        stream, ended = runs.stream, runs.ended
-        trajectory = [self._open.get(name, -1) for name in stream]
-        new = [
-            i
-            for i, number in enumerate(trajectory)
-            if number < 0 or (i > 0 and stream[i] == stream[i - 1])
-        ]
-        if new:
-            length = runs.length.tolist()
-            numbers = self._blocks.add(
-                [length[i] for i in new], [ended[i] for i in new]
+        trajectory = np.array([self._open.pop(name, -1) for name in runs.stream])
+        if root is not None:
+            self._end_restarted(trajectory, row, root)
+        new = (trajectory < 0).nonzero()[0]
+        if len(new):
+            trajectory[new] = self._blocks.add(
+                runs.length[new].tolist(), runs.ended[new].tolist()
             )
-            for i, number in zip(new, numbers, strict=True):
-                trajectory[i] = self._open[stream[i]] = number
-        for name, number, end in zip(stream, trajectory, ended, strict=True):
-            if end and self._open[name] == number:
-                del self._open[name]
+        for name, number, ended in zip(
+            runs.stream, trajectory.tolist(), runs.ended.tolist(), strict=True
+        ):
+            if not ended:
+                self._open[name] = number
         return trajectory
+
+    def _end_restarted(self, trajectory: Integers, row: Integers, root: Tensor) -> None:
+        """Ends trajectories, (m,), whose run begins elsewhere, and sets them to -1."""
+        old = (trajectory >= 0).nonzero()[0]
+        base, _, end, *_ = self._blocks.find(trajectory[old])
+        last = self._blocks.read(base + end - 1)
+        first = root.index_select(0, torch.from_numpy(row[old]).to(root.device))
+        over = old[differ(last, first)]
+        self._linked = self._linked or len(over) < len(old)
+        if self._linked and len(over):
+            self._blocks.close(trajectory[over])
+            trajectory[over] = -1
 
     def _forget(self) -> None:
         """Cuts the trajectories at the floor: what is below has been overwritten."""
@@ -178,6 +225,13 @@ class GoalMemory:
     def _written(self, start: int, stop: int) -> tuple[Integers, Integers]:
         """Returns trajectory and step of the serials from start up to stop."""
         return self.find(np.arange(start, stop))
+
+    def end_trajectories(self) -> None:
+        """Ends all trajectories; what is written next begins new ones."""
+        self._sort()
+        if self._open:
+            self._blocks.close(np.array(list(self._open.values())))
+            self._open.clear()
 
     # -- reading ----------------------------------------------------------------------
 
@@ -206,7 +260,8 @@ class GoalMemory:
                     "HindsightRelabel cannot follow this buffer: its rows are not "
                     "written one after the other. Use a round-robin writer, write "
                     "with extend() only, [*batch, time] data if the storage has "
-                    "several dimensions and flattened data if it has one."
+                    "several dimensions and flattened data if it has one, and put the "
+                    "transform into the buffer before the first extend()."
                 )
             self._origin = low
             self.capacity = (high - low) * self._unit
@@ -281,3 +336,10 @@ class GoalMemory:
         vars(self._blocks).update(state["blocks"])
         self._ring = state["memory"]["_ring"].numpy()
         self._blocks.table = state["blocks"]["table"].numpy()
+        if not self._linked:  # nothing would show that a stream's name is used again
+            self.end_trajectories()
+
+
+def _join(parts: tuple[Tensor, ...]) -> Tensor:
+    """Concatenates tensors; a single one, the most frequent case, is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -33,6 +33,11 @@ class HindsightRelabel(BufferTransform):
     and step every transition belongs and what it achieved; on `sample` it relabels a
     random `her_ratio` of the rows. The others come out as they were stored.
 
+    A trajectory goes on in a later `extend` where a row of its id begins at the goal
+    that was achieved last. If the data lack the root achieved goal, or it is never
+    what the step before achieved, the id alone decides: call `end_trajectories` before
+    data of a new collector, whose ids begin anew. Loading a saved buffer does so.
+
     =====================  ====  ====  ====  ====  ====
     k (goals a transition)    1     2     4     8    16
     her_ratio = k / (k+1)   0.5  0.67   0.8  0.89  0.94
@@ -51,7 +56,8 @@ class HindsightRelabel(BufferTransform):
             `(step, first, end, generator) -> goal step`, see `strategies`. It is what
             the step led to, ("next", achieved_goal), of what is stored of the episode.
         goal_key: the desired goal, rewritten in the root and under "next".
-        achieved_goal_key: the achieved goal, read under "next".
+        achieved_goal_key: the achieved goal, read under "next" and, if there, in the
+            root.
         reward_key: the reward.
         terminated_fn: maps as `reward_fn` does to (n, 1) bool, for tasks that end on
             success: also ("next", "terminated") and ("next", "done") are rewritten.
@@ -72,7 +78,8 @@ class HindsightRelabel(BufferTransform):
         ValueError: an argument is out of range; the data do not tell which trajectory a
             transition belongs to; a function returned the wrong shape; the transform
             is put into an environment.
-        KeyError: the data lack an entry that is needed.
+        KeyError: the data lack an entry that is needed; what is sampled was stored
+            before the transform was in the buffer.
         RuntimeError: the buffer cannot be followed: it is not written round-robin,
             shared between processes, or combined with `MultiStepTransform`.
 
@@ -129,38 +136,45 @@ class HindsightRelabel(BufferTransform):
         self._check_chain()
         shape = tensordict.batch_size
         with self._lock:
-            if self._memory.head == 0:
+            achieved = tensordict.get(self._rewriter.next_achieved_key, None)
+            done = tensordict.get(("next", "done"), None)
+            if self._memory.head == 0 or achieved is None or done is None:
                 self._rewriter.check(tensordict)
-            achieved = tensordict.get(self._rewriter.next_achieved_key)
+            root = tensordict.get(self._rewriter.achieved_goal_key, None)
             serial = self._memory.write(
                 streams_of(tensordict, self.trajectory_key, self.single_env),
-                time_first(tensordict.get(("next", "done")).reshape(shape), len(shape)),
+                time_first(done.reshape(shape), len(shape)),
                 time_first(achieved, len(shape)),
+                None if root is None else time_first(root, len(shape)),
                 unit=shape[:-1].numel(),
             )
         return tensordict.set(SERIAL_KEY, time_last(serial, shape))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled."""
-        tag = tensordict.get(SERIAL_KEY).reshape(-1)
-        tensordict = tensordict.exclude(SERIAL_KEY)
-        serial = tag.cpu().numpy()
+        tag = tensordict.get(SERIAL_KEY, None)
+        if tag is None:
+            raise KeyError(
+                "the sampled rows were not noted by HindsightRelabel, which does so on "
+                "extend: it must be in the buffer before the first one."
+            )
+        serial = tag.cpu().numpy().reshape(-1)
         with self._lock:
             floor = self._floor(serial, tensordict)
             choose = self._choose_rows if self.unit == "row" else self._choose_slices
             rows, last, share, place = choose(serial)
             if not len(rows):
-                return tensordict
+                return tensordict.exclude(SERIAL_KEY)
             goals = self._memory.draw(
                 last, self.strategy, share, floor, self._generator
             )
         if place is not None:
             goals = goals[place]
         device = tag.device
-        self._rewriter.rewrite(
+        relabelled = self._rewriter.rewrite(
             tensordict, torch.from_numpy(rows).to(device), goals.to(device)
         )
-        return tensordict
+        return relabelled.del_(SERIAL_KEY)
 
     def _floor(self, serial: Integers, tensordict: TensorDictBase) -> int:
         """Returns the serial from which on goals may be drawn."""
@@ -180,7 +194,9 @@ class HindsightRelabel(BufferTransform):
     def _choose(self, number: int) -> tuple[NDArray[np.bool_], Shares]:
         """Chooses a random `her_ratio` of so many, and numbers to draw goals with."""
         # The generator is the CPU's, so that a seed means the same on every device.
-        drawn = torch.rand(number, generator=self._generator, dtype=torch.float64)
+        drawn = torch.rand(
+            number, generator=self._generator, dtype=torch.float64, device="cpu"
+        )
         share = drawn.numpy()
         # Those below the ratio are uniform up to it: no second draw is needed.
         return share < self.her_ratio, share / (self.her_ratio or 1)
@@ -214,6 +230,11 @@ class HindsightRelabel(BufferTransform):
         rows = chosen[slices].nonzero()[0]
         place = (chosen.cumsum() - 1)[slices[rows]]
         return rows, serial[ends[chosen]], share[chosen], place
+
+    def end_trajectories(self) -> None:
+        """Ends all trajectories; what is written next begins new ones."""
+        with self._lock:
+            self._memory.end_trajectories()
 
     def empty(self) -> None:
         """Forgets all transitions, as after the buffer's own `empty`.

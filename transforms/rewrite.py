@@ -23,7 +23,7 @@ class Rewriter:
         reward_fn: maps (achieved_goal, desired_goal), (n, *goal) each, to (n, 1).
         terminated_fn: the same for `terminated`, bool; None leaves the flags alone.
         goal_key: the desired goal, in the root and under "next".
-        achieved_goal_key: the achieved goal, read under "next".
+        achieved_goal_key: the achieved goal, of which that under "next" is read here.
         reward_key: the reward, from the root, e.g. ("next", "reward").
     """
 
@@ -39,14 +39,6 @@ class Rewriter:
         self.reward_key = unravel_key(self.reward_key)
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
-        written = (self.goal_key, self.next_goal_key, self.reward_key, _DONE)
-        # The tensordicts written into besides the root, outer ones first, each with the
-        # name of an entry that is replaced in it.
-        self._nested = {
-            path[:n]: path[n]
-            for path in sorted(key for key in written if isinstance(key, tuple))
-            for n in range(1, len(path))
-        }
 
     def check(self, batch: TensorDictBase) -> None:
         """Raises a KeyError that names the entries that are missing in the batch."""
@@ -66,11 +58,13 @@ class Rewriter:
                 f"{sorted(map(str, batch.keys(True, True)))}."
             )
 
-    def rewrite(self, batch: TensorDictBase, rows: Tensor, goals: Tensor) -> None:
-        """Sets the goals of some rows of the batch and recomputes the rest.
+    def rewrite(
+        self, batch: TensorDictBase, rows: Tensor, goals: Tensor
+    ) -> TensorDictBase:
+        """Returns a batch in which some rows have other goals, and what follows.
 
-        Tensors and nested tensordicts are replaced, not written into: they may be the
-        storage's own.
+        The batch itself, which may be the storage's own, is left as it is; what is the
+        same in both is shared.
 
         Args:
             batch: transitions, any batch shape.
@@ -78,43 +72,52 @@ class Rewriter:
             goals: their new goals, (n, *goal).
 
         Raises:
-            ValueError: `reward_fn` or `terminated_fn` returned another shape.
+            ValueError: `reward_fn` or `terminated_fn` returned another shape, or
+                something else than a tensor.
         """
         flat = batch if batch.ndim == 1 else batch.reshape(-1)
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
+        old = flat.get(self.goal_key)
+        if goals.dtype != old.dtype:
+            goals = goals.to(old.dtype)
+        next_old = flat.get(self.next_goal_key)
         new = {
-            key: flat.get(key).index_copy(0, rows, goals)
-            for key in (self.goal_key, self.next_goal_key)
+            self.goal_key: old.index_copy(0, rows, goals),
+            self.next_goal_key: next_old.index_copy(0, rows, goals),
         }
+        n = rows.shape[0]
         reward = flat.get(self.reward_key)
-        values = self.reward_fn(achieved, goals)
-        _check_shape("reward_fn", values, len(rows), reward)
-        new[self.reward_key] = reward.index_copy(0, rows, values.to(reward.dtype))
+        values = _check("reward_fn", self.reward_fn(achieved, goals), n, reward)
+        new[self.reward_key] = reward.index_copy(0, rows, values)
         if self.terminated_fn is not None:
             done, terminated = flat.get(_DONE), flat.get(_TERMINATED)
             truncated = flat.get(_TRUNCATED, None)
             if truncated is None:  # what ended without terminating
                 truncated = done & ~terminated
             values = self.terminated_fn(achieved, goals)
-            _check_shape("terminated_fn", values, len(rows), terminated)
+            values = _check("terminated_fn", values, n, terminated)
             new[_TERMINATED] = terminated.index_copy(0, rows, values)
             values = values | truncated.index_select(0, rows)
             new[_DONE] = done.index_copy(0, rows, values)
-        parents: dict[tuple[str, ...], TensorDictBase] = {(): batch}
-        for path, replaced in self._nested.items():
-            parents[path] = batch.get(path).exclude(replaced)  # a shallow copy
+        result = batch.exclude(*new)  # a copy also of the tensordicts that hold these
         for key, value in new.items():
-            path = (key,) if isinstance(key, str) else key
-            value = value if flat is batch else value.unflatten(0, batch.shape)
-            parents[path[:-1]].set(path[-1], value)
-        for path in self._nested:
-            parents[path[:-1]].set(path[-1], parents[path])
+            if flat is not batch:
+                value = value.reshape(*batch.shape, *value.shape[1:])
+            result.set(key, value)
+        return result
 
 
-def _check_shape(function: str, values: Tensor, n: int, old: Tensor) -> None:
+def _check(function: str, values: Tensor, n: int, old: Tensor) -> Tensor:
+    """Returns what a function gave for n rows, in the type of the old values."""
     expected = (n, *old.shape[1:])
+    if not isinstance(values, Tensor):
+        raise ValueError(
+            f"{function} must return a tensor of shape {expected}, got "
+            f"{type(values).__name__}."
+        )
     if values.shape != expected:
         raise ValueError(
             f"{function} must map (achieved_goal, desired_goal) of {n} transitions to "
             f"shape {expected}, got {tuple(values.shape)}."
         )
+    return values if values.dtype == old.dtype else values.to(old.dtype)

@@ -57,8 +57,8 @@ STRATEGIES: dict[str, _BuiltIn] = {
 
 
 def check_strategy(strategy: str | Strategy) -> None:
-    """Raises a ValueError if there is no strategy of that name."""
-    if isinstance(strategy, str) and strategy not in (*STRATEGIES, RANDOM):
+    """Raises a ValueError if it is neither a strategy's name nor a function."""
+    if not callable(strategy) and strategy not in (*STRATEGIES, RANDOM):
         raise ValueError(
             f"strategy must be one of {[*STRATEGIES, RANDOM]} or a callable, "
             f"got {strategy!r}."
@@ -84,6 +84,10 @@ def choose_steps(
         torch.from_numpy(x.astype(np.int32)) for x in (step, first, end)
     )
     goal_step = strategy(steps, firsts, ends, generator)
+    if not isinstance(goal_step, Tensor):
+        raise ValueError(
+            f"the strategy must return a tensor, got {type(goal_step).__name__}."
+        )
     if goal_step.shape != step.shape or goal_step.is_floating_point():
         raise ValueError(
             f"the strategy must return integer steps of shape {tuple(step.shape)}, "

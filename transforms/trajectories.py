@@ -16,38 +16,89 @@ TRAJECTORY_KEY = ("collector", "traj_ids")
 
 
 class Runs(NamedTuple):
-    """Consecutive steps of one trajectory each, found in a batch of n transitions.
+    """Consecutive steps of one trajectory each, found in a batch sorted by stream.
 
     Attributes:
-        order: the batch's rows sorted by stream, time order kept, shape (n,), int64.
-        length: number of sorted rows of every run, shape (m,), int64.
+        start: first row of every run, shape (m,), int64.
+        length: number of rows of every run, shape (m,), int64.
         stream: the stream of every run, m numbers.
-        ended: whether the run's last row ends its trajectory, m flags.
+        ended: whether the run's last row ends its trajectory, shape (m,), bool.
     """
 
-    order: Integers
+    start: Integers
     length: Integers
     stream: list[int]
-    ended: list[bool]
+    ended: NDArray[np.bool_]
 
 
 def split_runs(stream: Integers, done: NDArray[np.bool_]) -> Runs:
-    """Cuts a batch into runs: where the stream changes, and after every done.
+    """Cuts a sorted batch into runs: where the stream changes, and after every done.
 
     Args:
         stream: what the transition comes from (a trajectory's or an environment's
-            number), shape (n,). Rows of one stream are in time order.
+            number), shape (n,), sorted. Rows of one stream are in time order.
         done: whether the transition ends its trajectory, shape (n,).
     """
-    order = stream.argsort(kind="stable")
-    stream, done = stream[order], done[order]
     last = done.copy()
     last[-1] = True
     last[:-1] |= stream[1:] != stream[:-1]
     ends = last.nonzero()[0]
-    length = ends + 1
-    length[1:] -= length[:-1]  # numpy takes care of the overlap
-    return Runs(order, length, stream[ends].tolist(), done[ends].tolist())
+    start = np.zeros_like(ends)
+    start[1:] = ends[:-1] + 1
+    return Runs(start, ends + 1 - start, stream[ends].tolist(), done[ends])
+
+
+def find_restarts(
+    order: Integers, stream: Integers, part: Integers, achieved: Tensor, root: Tensor
+) -> Integers:
+    """Finds where a stream's rows in a later part of a batch begin a new trajectory.
+
+    Args:
+        order: the batch's rows sorted by stream, time order kept, shape (n,).
+        stream: the stream of every sorted row, shape (n,).
+        part: the part of the batch that every row is in, shape (n,).
+        achieved: what every row achieved, (n, *goal).
+        root: what was achieved before it, (n, *goal).
+
+    Returns:
+        The places in `order` of the rows right before, (m,).
+    """
+    part = part[order]
+    seam = ((part[1:] != part[:-1]) & (stream[1:] == stream[:-1])).nonzero()[0]
+    before, after = (
+        torch.from_numpy(order[x]).to(root.device) for x in (seam, seam + 1)
+    )
+    return seam[differ(achieved[before], root[after])]
+
+
+def are_linked(
+    order: Integers,
+    stream: Integers,
+    done: NDArray[np.bool_],
+    goals: Tensor,
+    root: Tensor,
+) -> bool:
+    """Tells whether a root is what the row before it achieved.
+
+    Args:
+        order: rows sorted by stream and time, (n,).
+        stream: their streams, in that order, (n,).
+        done: whether they end a trajectory, in that order, (n,).
+        goals: what every row achieved, (n, *goal).
+        root: what was achieved before it, (n, *goal).
+    """
+    pairs = ((stream[1:] == stream[:-1]) & ~done[:-1]).nonzero()[0]
+    before, after = (
+        torch.from_numpy(order[x]).to(root.device) for x in (pairs, pairs + 1)
+    )
+    return len(differ(goals[before], root[after])) < len(pairs)
+
+
+def differ(a: Tensor, b: Tensor) -> Integers:
+    """Returns the places, (m,), where goals, (n, *goal) each, are not the same."""
+    if torch.equal(a, b):  # as a rule, and much faster
+        return np.zeros(0, dtype=np.int64)
+    return (a != b).reshape(len(a), -1).any(1).cpu().numpy().nonzero()[0]
 
 
 def time_first(value: Tensor, batch_dims: int) -> Tensor:
@@ -105,4 +156,4 @@ def streams_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tenso
         )
     envs = batch.shape[:-1].numel()
     steps = batch.shape[-1] if batch.ndim else 1
-    return torch.arange(envs, device=batch.device).repeat(steps)
+    return torch.arange(envs, device="cpu").repeat(steps)

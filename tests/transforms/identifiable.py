@@ -23,11 +23,13 @@ class Envs:
     Steps count from 1, as what is achieved at step 0 is under the root only.
     """
 
-    def __init__(self, num_envs: int, lengths: list[int], seed: int = 0) -> None:
+    def __init__(
+        self, num_envs: int, lengths: list[int], seed: int = 0, first_env: int = 0
+    ) -> None:
         self.rng = torch.Generator().manual_seed(seed)
         self.num_envs = num_envs
         self.lengths = torch.tensor(lengths)
-        self.env = torch.arange(num_envs)
+        self.env = torch.arange(num_envs) + first_env
         self.episode = torch.zeros(num_envs, dtype=torch.int64)
         self.step = torch.zeros(num_envs, dtype=torch.int64)
         self.length = self._draw()

@@ -112,6 +112,71 @@ def test_empty_drops_what_is_held():
     assert set(rb.storage[:]["next", "achieved_goal"][:, 2].tolist()) == {4, 5, 6}
 
 
+@pytest.mark.parametrize("layout", ["rows", "no_ids"])
+@pytest.mark.parametrize("rooted", [True, False])
+def test_ids_that_begin_anew(layout, rooted):
+    """Collectors in turn, each of which leaves episodes unfinished."""
+    rb, written = make_buffer(k=2, strategy="episode"), []
+    for i in range(4):
+        envs = Envs(3, [7], first_env=10 * i)
+        for _ in range(5):
+            data = envs.chunk(2)
+            written += data["next", "achieved_goal"].reshape(-1, 3).tolist()
+            data = data.exclude("collector") if layout == "no_ids" else data.reshape(-1)
+            rb.extend(data if rooted else data.exclude("achieved_goal"))
+        if not rooted:
+            rb.transform[0].end_trajectories()
+    stored = rb.storage[:]
+    check_batch(stored, stored, "episode")
+    kept = stored["next", "achieved_goal"][~relabelled(stored)].tolist()
+    unfinished = [row for row in written if row[0] >= 30 and row[1] == 1]
+    assert sorted(kept + unfinished) == sorted(written)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_root_goals_that_tell_nothing(steps):
+    rb, envs = make_buffer(k=1, strategy="final"), Envs(3, [7])
+    for _ in range(14 // steps):
+        data = envs.chunk(steps)
+        data["achieved_goal"] = torch.randn(data["achieved_goal"].shape)
+        rb.extend(data.reshape(-1))
+    stored = rb.storage[:]
+    assert len(stored) == 2 * 3 * 14
+    assert (stored["desired_goal"][relabelled(stored)][:, 2] == 7).all()
+
+
+@pytest.mark.parametrize("rooted", [True, False])
+def test_new_collector_after_a_reload(rooted):
+    def chunk(envs):
+        data = envs.chunk(8).reshape(-1)
+        return data if rooted else data.exclude("achieved_goal")
+
+    rb, new = make_buffer(k=2), make_buffer(k=2)
+    for buffer in (rb, new):  # a storage is made lazily
+        buffer.extend(chunk(Envs(3, [5])))
+    new.load_state_dict(rb.state_dict())
+    new.extend(chunk(Envs(3, [5], first_env=10)))
+    stored = new.storage[:]
+    assert len(stored) == 3 * 3 * (5 + 3 + 5)
+    check_batch(stored, stored, "future")
+
+
+def test_adding_one_by_one_raises():
+    rb, data = make_buffer(k=2), Envs(1, [4]).chunk(4)[0]
+    with pytest.raises(ValueError, match="use `extend`"):
+        rb.add(data[0])
+    for step in range(4):
+        rb.extend(data[step : step + 1])
+    assert len(rb) == 3 * 4
+
+
+def test_default_device():
+    data = Envs(3, [5]).chunk(10)
+    with torch.device("meta"):
+        stored = HindsightAugment(reward_fn, seed=0)._inv_call(data)
+    check_batch(stored, stored, "future")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [({"k": 0}, "k must be"), ({"strategy": "random"}, "one episode at a time")],

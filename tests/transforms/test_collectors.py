@@ -49,6 +49,18 @@ def test_single_process(flat, reset_at_each_iter, steps):
     check(SINGLE, 3 * steps, 3 * steps * 40, **options)
 
 
+@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
+def test_collectors_in_turn(hindsight):
+    """Each numbers its trajectories from 0 and leaves some unfinished."""
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(5000), transform=hindsight(reward_fn), batch_size=256
+    )
+    for make in (toy.make_first, toy.make_second, toy.make_env):
+        for data in collect(functools.partial(Collector, make), 3 * 5, 3 * 5 * 4):
+            rb.extend(data.reshape(-1))
+    check_batch(rb.sample(), rb.storage[:], "future")
+
+
 @pytest.mark.slow
 def test_parallel_env():
     check(PARALLEL, 6 * 4, 6 * 4 * 20)

@@ -32,6 +32,7 @@ class Source:
         self.time = torch.arange(num_envs) * 7 % EPISODE
         self.num_envs = num_envs
         self.episode = torch.zeros(num_envs, dtype=torch.int64)
+        self.achieved = torch.zeros(num_envs, 3)
 
     def chunk(self, steps):
         time = self.time[:, None] + torch.arange(steps)
@@ -40,23 +41,33 @@ class Source:
         shape = (self.num_envs, steps)
         done = (time % EPISODE == EPISODE - 1)[..., None]
 
-        def observation():
+        def observation(achieved):
             values = {key: torch.randn(*shape, n) for key, n in OBSERVATION.items()}
+            values["achieved_goal"] = achieved.clone()
             return values | {"success": torch.zeros_like(done)}
 
         def flags(done):
             terminated = torch.zeros_like(done)
             return {"done": done, "terminated": terminated, "truncated": done.clone()}
 
+        # A step begins at the goal that the one before has achieved.
+        achieved = torch.randn(self.num_envs, steps + 1, 3)
+        achieved[:, 0] = self.achieved
+        self.achieved = achieved[:, -1]
+
         ids = episode * self.num_envs + torch.arange(self.num_envs)[:, None]
         reward = torch.zeros(*shape, 1)
         return TensorDict(
             {
-                **observation(),
+                **observation(achieved[:, :-1]),
                 **flags(torch.zeros_like(done)),
                 "action": torch.randn(*shape, ACTION),
                 "collector": {"traj_ids": ids},
-                "next": {**observation(), **flags(done), "reward": reward},
+                "next": {
+                    **observation(achieved[:, 1:]),
+                    **flags(done),
+                    "reward": reward,
+                },
             },
             shape,
         ).reshape(-1)

@@ -16,7 +16,13 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.data.replay_buffers import HERReplayBuffer
-from torchrl.envs import Compose, GymEnv, MultiStepTransform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    DoubleToFloat,
+    GymEnv,
+    MultiStepTransform,
+    TransformedEnv,
+)
 
 from tests.transforms.identifiable import (
     Envs,
@@ -68,14 +74,24 @@ def is_mixed(batch):
     strategy=st.sampled_from(STRATEGIES),
     batch_size=st.sampled_from([1, 7, 64]),
     every=st.integers(1, 5),
+    restart=st.sampled_from([None, 1, 2, 7]),
 )
 def test_no_goal_is_wrong(
-    num_envs, lengths, steps, capacity, layout, sampler, strategy, batch_size, every
+    num_envs,
+    lengths,
+    steps,
+    capacity,
+    layout,
+    sampler,
+    strategy,
+    batch_size,
+    every,
+    restart,
 ):
     ndim = 2 if layout in ("none", "no_ids") else 1
     if ndim == 2:  # TensorDictReplayBuffer cannot write a single step there
         steps = [max(2, s) for s in steps]
-    capacity = max(capacity, num_envs * max(steps))
+    capacity = max(capacity, num_envs * max(2, *steps))
     envs = Envs(num_envs, lengths)
     rb = make_buffer(
         capacity,
@@ -84,7 +100,14 @@ def test_no_goal_is_wrong(
         strategy=strategy,
         batch_size=batch_size,
     )
+    # Shows that roots are what the step before achieved.
+    first = Envs(num_envs, [3], first_env=1000).chunk(2)
+    if layout == "no_ids":
+        del first["collector"]
+    rb.extend(flatten(first, layout if ndim == 1 else "none"))
     for i in range(60):
+        if restart and i % restart == 0:  # a new collector, whose ids begin anew
+            envs = Envs(num_envs, lengths, seed=i, first_env=10 * i)
         data = envs.chunk(steps[i % len(steps)])
         if layout == "no_ids":
             del data["collector"]
@@ -212,6 +235,7 @@ def test_strategy_of_the_user():
         (lambda step, first, end, rng: end, "from first up to end"),
         (lambda step, first, end, rng: step.float(), "integer steps"),
         (lambda step, first, end, rng: step[:-1], "integer steps"),
+        (lambda step, first, end, rng: step.numpy(), "a tensor, got ndarray"),
     ],
 )
 def test_bad_strategy_of_the_user_raises(strategy, message):
@@ -221,9 +245,10 @@ def test_bad_strategy_of_the_user_raises(strategy, message):
         rb.sample()
 
 
-def test_unknown_strategy_raises():
-    with pytest.raises(ValueError, match=r"must be one of.*'past'"):
-        HindsightRelabel(reward_fn, strategy="past")
+@pytest.mark.parametrize("strategy", ["past", None, 3])
+def test_unknown_strategy_raises(strategy):
+    with pytest.raises(ValueError, match=rf"must be one of.*{strategy!r}"):
+        HindsightRelabel(reward_fn, strategy=strategy)
 
 
 def test_terminated_and_done_are_rewritten():
@@ -251,6 +276,37 @@ def test_wrong_shape_raises(which):
     rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
     with pytest.raises(ValueError, match=rf"{which}.*\(8, 1\), got \(8,\)"):
         rb.sample()
+
+
+@pytest.mark.parametrize("which", ["reward_fn", "terminated_fn"])
+def test_function_that_returns_no_tensor_raises(which):
+    functions = {"reward_fn": reward_fn, "terminated_fn": terminated_fn}
+    functions[which] = lambda achieved, desired: 0.0
+    transform = HindsightRelabel(**functions, her_ratio=1.0)
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100), transform=transform, batch_size=8
+    )
+    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    with pytest.raises(ValueError, match=rf"{which}.*tensor.*\(8, 1\), got float"):
+        rb.sample()
+
+
+def test_other_types_are_cast():
+    transform = HindsightRelabel(
+        lambda achieved, desired: reward_fn(achieved, desired).double(),
+        terminated_fn=lambda achieved, desired: terminated_fn(achieved, desired).int(),
+    )
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100), transform=transform, batch_size=64
+    )
+    data = Envs(2, [5]).chunk(5).reshape(-1)
+    data["next", "achieved_goal"] = data["next", "achieved_goal"].double()
+    rb.extend(data)
+    batch = rb.sample()
+    check_batch(batch, rb.storage[:], "future")
+    assert batch["desired_goal"].dtype == torch.float32
+    assert batch["next", "reward"].dtype == torch.float32
+    assert batch["next", "terminated"].dtype == torch.bool
 
 
 def test_reward_fn_sees_the_relabelled_rows_once():
@@ -284,6 +340,86 @@ def test_missing_entries_raise():
     rb = make_buffer()
     with pytest.raises(KeyError, match="desired_goal"):
         rb.extend(Envs(2, [5]).chunk(5).exclude("desired_goal").reshape(-1))
+
+
+@pytest.mark.parametrize("key", ["achieved_goal", "done"])
+def test_missing_entries_of_later_data_raise(key):
+    rb, envs = make_buffer(), Envs(2, [5])
+    rb.extend(envs.chunk(5).reshape(-1))
+    with pytest.raises(KeyError, match=rf"needs .*{key}"):
+        rb.extend(envs.chunk(5).exclude(("next", key)).reshape(-1))
+
+
+def test_rows_stored_without_the_transform_raise(tmp_path):
+    plain = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=64)
+    plain.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    plain.dumps(tmp_path)
+    loaded = make_buffer(100)
+    loaded.loads(tmp_path)
+    plain.append_transform(HindsightRelabel(reward_fn))
+    for rb in (plain, loaded):
+        with pytest.raises(KeyError, match="before the first"):
+            rb.sample()
+    plain.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    with pytest.raises(RuntimeError, match="before the first"):
+        plain.sample()
+
+
+@pytest.mark.parametrize("layout", ["env_first", "time_first", "no_ids"])
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+@pytest.mark.parametrize("sample_between", [True, False])
+@pytest.mark.parametrize("rooted", [True, False])
+def test_ids_that_begin_anew(layout, strategy, sample_between, rooted):
+    """Collectors in turn, each of which leaves episodes unfinished."""
+    rb = make_buffer(ndim=2 if layout == "no_ids" else 1, strategy=strategy)
+    for i in range(4):
+        envs = Envs(3, [7], first_env=10 * i)
+        for _ in range(5):
+            data = envs.chunk(2)
+            if layout == "no_ids":
+                data, how = data.exclude("collector"), "none"
+            else:
+                how = layout
+            data = flatten(data, how)
+            rb.extend(data if rooted else data.exclude("achieved_goal"))
+            if sample_between:
+                rb.sample()
+        if not rooted:
+            rb.transform[0].end_trajectories()
+    for _ in range(5):
+        batch = rb.sample()
+        check_batch(batch, rb.storage[:], strategy)
+        assert relabelled(batch).any()
+
+
+@pytest.mark.parametrize(
+    ("layout", "steps"), [("env_first", 1), ("env_first", 2), ("no_ids", 2)]
+)
+@pytest.mark.parametrize("sample_between", [True, False])
+def test_root_goals_that_tell_nothing(layout, steps, sample_between):
+    """As in made-up data: then the ids alone decide."""
+    rb = make_buffer(
+        ndim=2 if layout == "no_ids" else 1, strategy="final", her_ratio=1.0
+    )
+    envs = Envs(3, [7])
+    for _ in range(14 // steps):
+        data = envs.chunk(steps)
+        data["achieved_goal"] = torch.randn(data["achieved_goal"].shape)
+        if layout == "no_ids":
+            data = data.exclude("collector")
+        rb.extend(flatten(data, "none" if layout == "no_ids" else layout))
+        if sample_between:
+            rb.sample()
+    batch = rb.sample()
+    assert (batch["desired_goal"][:, 2] == 7).all()  # the last step of the episode
+
+
+def test_root_goals_that_come_and_go():
+    rb = make_buffer()
+    for i, rooted in enumerate([True, False, True]):
+        data = Envs(3, [7], first_env=10 * i).chunk(5).reshape(-1)
+        rb.extend(data if rooted else data.exclude("achieved_goal").clone())
+    check_batch(rb.sample(), rb.storage[:], "future")
 
 
 @pytest.mark.parametrize("one_by_one", [True, False])
@@ -367,6 +503,17 @@ def test_memmap_storage_and_reading_it_all(tmp_path):
         check_batch(rb.sample(), before, "future")
         check_batch(rb[:], before, "future")
         assert (rb.storage[:] == before).all(), "the storage was written into"
+
+
+def test_reading_one_row():
+    rb = make_buffer(her_ratio=1.0, strategy="final")
+    rb.extend(Envs(3, [5]).chunk(5).reshape(-1))
+    before = rb.storage[:].clone()
+    row = rb[7]
+    assert row.shape == ()
+    assert row["next", "reward"].shape == (1,)
+    assert row["desired_goal"].tolist() == [1, 0, 5]
+    assert (rb.storage[:] == before).all(), "the storage was written into"
 
 
 def test_two_dimensional_storage_read_whole():
@@ -577,6 +724,25 @@ def test_reloaded_buffer_draws_the_same_goals(how, seed, strategy, tmp_path):
     check_batch(new.sample(), new.storage[:], strategy)
 
 
+@pytest.mark.parametrize("how", ["state_dict", "dumps"])
+@pytest.mark.parametrize("rooted", [True, False])
+def test_new_collector_after_a_reload(how, rooted, tmp_path):
+    def chunk(envs):
+        data = envs.chunk(5).reshape(-1)
+        return data if rooted else data.exclude("achieved_goal")
+
+    rb, new = make_buffer(), make_buffer()
+    rb.extend(chunk(Envs(3, [7])))
+    if how == "dumps":
+        rb.dumps(tmp_path)
+        new.loads(tmp_path)
+    else:
+        new.extend(chunk(Envs(3, [7])))  # a storage is made lazily
+        new.load_state_dict(rb.state_dict())
+    new.extend(chunk(Envs(3, [7], first_env=10)))
+    check_batch(new.sample(), new.storage[:], "future")
+
+
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("before", [7, 33, 60, 75])  # the last: 9 x capacity
 def test_emptied_buffer(strategy, before):
@@ -626,11 +792,26 @@ def test_random_numbers_are_reproducible():
 # -- what it cannot be combined with --------------------------------------------------
 
 
-def test_multi_step_raises():
-    rb = make_buffer(100)
-    rb.append_transform(MultiStepTransform(n_steps=3, gamma=0.9))
+@pytest.mark.parametrize("nested", ["neither", "relabel", "multi_step", "both"])
+@pytest.mark.parametrize("late", [False, True])
+def test_multi_step_raises(nested, late):
+    relabel = HindsightRelabel(reward_fn)
+    multi_step = MultiStepTransform(n_steps=3, gamma=0.9)
+    if nested in ("relabel", "both"):
+        relabel = Compose(relabel)
+    if nested in ("multi_step", "both"):
+        multi_step = Compose(DoubleToFloat(), Compose(multi_step))
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100, ndim=2),
+        transform=Compose(relabel) if late else Compose(relabel, multi_step),
+        batch_size=8,
+    )
+    envs = Envs(3, [5])
+    if late:
+        rb.extend(envs.chunk(5))
+        rb.append_transform(multi_step)
     with pytest.raises(RuntimeError, match="MultiStepTransform"):
-        rb.extend(Envs(3, [5]).chunk(20))
+        rb.extend(envs.chunk(20))
 
 
 @pytest.mark.parametrize("nested", [False, True])
@@ -643,6 +824,23 @@ def test_environment_raises(nested):
     env = TransformedEnv(GymEnv("Pendulum-v1"))
     with pytest.raises(ValueError, match="replay buffers"):
         env.append_transform(HindsightRelabel(reward_fn))
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+@pytest.mark.parametrize("layout", ["env_first", "no_ids"])
+def test_default_device(seed, layout):
+    """torchrl's buffers themselves do without one."""
+    transform = HindsightRelabel(reward_fn, seed=seed, strategy="episode")
+    data = Envs(3, [5]).chunk(10)
+    data["index"] = torch.arange(10).repeat(3, 1)
+    if layout == "no_ids":
+        data = data.exclude("collector")
+    else:
+        data = flatten(data, layout).set("index", torch.arange(30))
+    with torch.device("meta"):
+        batch = transform.forward(transform._inv_call(data))
+    assert relabelled(batch).any()
+    assert not is_mixed(batch).any()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
