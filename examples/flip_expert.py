@@ -45,9 +45,8 @@ def yaw_of(cube: Tensor) -> Tensor:
     return torch.remainder(yaw + math.pi / 4, math.pi / 2) - math.pi / 4
 
 
-def without_yaw(cube: Tensor) -> Tensor:
-    """A cube's quaternion once a grasp has turned its sides along x and y, (..., 4)."""
-    yaw = yaw_of(cube)
+def without(yaw: Tensor, cube: Tensor) -> Tensor:
+    """A cube's quaternion turned back by a yaw [rad], as a grasp does, (..., 4)."""
     zero = torch.zeros_like(yaw)
     turn = torch.cat((zero, zero, (-yaw / 2).sin(), (yaw / 2).cos()), -1)
     return compose(turn, cube)
@@ -122,7 +121,8 @@ def flip(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Te
     still = (speed < 0.05) & (turning < 0.5)
 
     # Plan: a swing, or at most two strokes before it, not out of reach.
-    flat = without_yaw(achieved_goal)
+    yaw = yaw_of(achieved_goal)
+    flat = without(yaw, achieved_goal)
     _, pitch = best_pitch(flat, goal)
     plan = costs(achieved_goal, flat, goal, strokes=2)[..., 1:]
     ways = goal.new_tensor(WAYS)
@@ -140,8 +140,8 @@ def flip(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Te
         ((GAP_Y, HEIGHT_Y, SPEED_Y, LIFT_Y), (GAP_X, HEIGHT_X, SPEED_X, LIFT_X))
     )
     gap, height, pace, lift = numbers[way[..., 0].long()].split(1, -1)
-    yaw = yaw_of(achieved_goal).abs()
-    gap = gap + CUBE / 2 * (yaw.cos() + yaw.sin() - 1)  # a corner sticks out
+    # A corner sticks out.
+    gap = gap + CUBE / 2 * (yaw.abs().cos() + yaw.abs().sin() - 1)
     ready = torch.cat((rest[..., :2] - gap * way, height), -1)
     closed = width < 0.02
     set_up = (norm(ready - ee) < 0.003) & (norm(ee_velocity) < 0.2) & still & closed

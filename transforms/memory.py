@@ -21,9 +21,8 @@ from torch_panda.transforms.strategies import (
 from torch_panda.transforms.trajectories import (
     Integers,
     Runs,
-    are_linked,
     differ,
-    find_restarts,
+    find_strays,
     split_runs,
 )
 
@@ -128,10 +127,13 @@ class GoalMemory:
         order = stream.argsort(kind="stable")
         stream, done = stream[order], done[order]
         if root is not None and not self._linked:
-            self._linked = are_linked(order, stream, done, goals, root)
+            pairs = ((stream[1:] == stream[:-1]) & ~done[:-1]).nonzero()[0]
+            strays = find_strays(order, pairs, goals, root)
+            self._linked = len(strays) < len(pairs)
         if root is not None and self._linked and len(parts) > 1:
-            part = np.arange(len(parts)).repeat([x.shape[0] for x in parts])
-            done[find_restarts(order, stream, part, goals, root)] = True
+            part = np.arange(len(parts)).repeat([x.shape[0] for x in parts])[order]
+            seam = (stream[1:] == stream[:-1]) & (part[1:] != part[:-1])
+            done[find_strays(order, seam.nonzero()[0], goals, root)] = True
         runs = split_runs(stream, done)
         trajectory = self._trajectories_of(runs, order[runs.start], root)
         base, begin = self._blocks.append(trajectory, runs.length)

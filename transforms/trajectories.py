@@ -48,50 +48,24 @@ def split_runs(stream: Integers, done: NDArray[np.bool_]) -> Runs:
     return Runs(start, ends + 1 - start, stream[ends].tolist(), done[ends])
 
 
-def find_restarts(
-    order: Integers, stream: Integers, part: Integers, achieved: Tensor, root: Tensor
+def find_strays(
+    order: Integers, before: Integers, achieved: Tensor, root: Tensor
 ) -> Integers:
-    """Finds where a stream's rows in a later part of a batch begin a new trajectory.
+    """Finds the rows after which the next one begins elsewhere than they got to.
 
     Args:
-        order: the batch's rows sorted by stream, time order kept, shape (n,).
-        stream: the stream of every sorted row, shape (n,).
-        part: the part of the batch that every row is in, shape (n,).
+        order: a batch's rows, sorted, (n,).
+        before: places in `order` of the rows to look at, (m,).
         achieved: what every row achieved, (n, *goal).
         root: what was achieved before it, (n, *goal).
 
     Returns:
-        The places in `order` of the rows right before, (m,).
+        Those of the places `before`, (k,).
     """
-    part = part[order]
-    seam = ((part[1:] != part[:-1]) & (stream[1:] == stream[:-1])).nonzero()[0]
-    before, after = (
-        torch.from_numpy(order[x]).to(root.device) for x in (seam, seam + 1)
+    rows, following = (
+        torch.from_numpy(order[x]).to(root.device) for x in (before, before + 1)
     )
-    return seam[differ(achieved[before], root[after])]
-
-
-def are_linked(
-    order: Integers,
-    stream: Integers,
-    done: NDArray[np.bool_],
-    goals: Tensor,
-    root: Tensor,
-) -> bool:
-    """Tells whether a root is what the row before it achieved.
-
-    Args:
-        order: rows sorted by stream and time, (n,).
-        stream: their streams, in that order, (n,).
-        done: whether they end a trajectory, in that order, (n,).
-        goals: what every row achieved, (n, *goal).
-        root: what was achieved before it, (n, *goal).
-    """
-    pairs = ((stream[1:] == stream[:-1]) & ~done[:-1]).nonzero()[0]
-    before, after = (
-        torch.from_numpy(order[x]).to(root.device) for x in (pairs, pairs + 1)
-    )
-    return len(differ(goals[before], root[after])) < len(pairs)
+    return before[differ(achieved[rows], root[following])]
 
 
 def differ(a: Tensor, b: Tensor) -> Integers:

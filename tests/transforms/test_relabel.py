@@ -264,31 +264,33 @@ def test_terminated_and_done_are_rewritten():
     assert batch["next", "terminated"].any()
 
 
-@pytest.mark.parametrize("which", ["reward_fn", "terminated_fn"])
+FUNCTIONS = {"reward_fn": reward_fn, "terminated_fn": terminated_fn}
+
+
+def sample_with(**function):
+    """Samples relabelled rows with another reward or termination."""
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100),
+        transform=HindsightRelabel(**(FUNCTIONS | function), her_ratio=1.0),
+        batch_size=8,
+    )
+    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    return rb.sample()
+
+
+@pytest.mark.parametrize("which", FUNCTIONS)
 def test_wrong_shape_raises(which):
-    functions = {"reward_fn": reward_fn, "terminated_fn": terminated_fn}
-    right = functions[which]
-    functions[which] = lambda achieved, desired: right(achieved, desired).squeeze(-1)
-    transform = HindsightRelabel(**functions, her_ratio=1.0)
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100), transform=transform, batch_size=8
-    )
-    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
+    def flat(achieved, desired):
+        return FUNCTIONS[which](achieved, desired).squeeze(-1)
+
     with pytest.raises(ValueError, match=rf"{which}.*\(8, 1\), got \(8,\)"):
-        rb.sample()
+        sample_with(**{which: flat})
 
 
-@pytest.mark.parametrize("which", ["reward_fn", "terminated_fn"])
+@pytest.mark.parametrize("which", FUNCTIONS)
 def test_function_that_returns_no_tensor_raises(which):
-    functions = {"reward_fn": reward_fn, "terminated_fn": terminated_fn}
-    functions[which] = lambda achieved, desired: 0.0
-    transform = HindsightRelabel(**functions, her_ratio=1.0)
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100), transform=transform, batch_size=8
-    )
-    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
     with pytest.raises(ValueError, match=rf"{which}.*tensor.*\(8, 1\), got float"):
-        rb.sample()
+        sample_with(**{which: lambda achieved, desired: 0.0})
 
 
 def test_other_types_are_cast():

@@ -207,8 +207,8 @@ class RobotTaskEnv(EnvBase, Closing):
         Raises:
             BulletError: the environment is closed or was never reset.
         """
-        self._check_was_reset()
         state = self._current_state()
+        self._check_was_reset()
         values = {key: self._emit(value.clone()) for key, value in state.items()}
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
 
