@@ -21,17 +21,41 @@ def test_memory_is_read():
 
 
 def test_what_does_not_fit_into_memory_is_left_out(monkeypatch):
-    # Two environments of ours, and two of the fast ones, but not two processes more.
+    # Two environments of ours, and two of the fast ones, but not two processes.
     monkeypatch.setattr(comparison, "available_memory", lambda: 250.0)
     results, absences = run(["fast", "async"])
     assert [result.contender for result in results] == ["torch_panda", "fast"]
     assert [absence.contender for absence in absences] == ["async"]
-    assert (
-        absences[0].reason == "2 environments need about 0.2 GB more, 0.0 GB are free"
-    )
+    assert absences[0].reason == "2 environments need about 0.2 GB, 0.2 GB are free"
+
+
+@pytest.mark.parametrize(("free", "most"), [(250.0, 2), (150.0, 1)])
+def test_what_does_not_fit_at_once_is_made_anew_for_each_round(monkeypatch, free, most):
+    """Two environments take 90 MB: of 150 MB, enough for one contender at a time."""
+    living, largest = set(), 0
+
+    class CountedRunner(comparison.Runner):
+        def __init__(self, *args):
+            nonlocal largest
+            super().__init__(*args)
+            living.add(self)
+            largest = max(largest, len(living))
+
+        def close(self):
+            super().close()
+            living.discard(self)
+
+    monkeypatch.setattr(comparison, "available_memory", lambda: free)
+    monkeypatch.setattr(comparison, "Runner", CountedRunner)
+    results, absences = run(["fast"])
+    assert not absences
+    assert [result.contender for result in results] == ["torch_panda", "fast"]
+    assert all(len(result.speeds) == len(result.ratios) == 1 for result in results)
+    assert all(result.footprint is not None for result in results)
+    assert largest == most
 
 
 def test_our_own_must_fit(monkeypatch):
     monkeypatch.setattr(comparison, "available_memory", lambda: 80.0)
-    with pytest.raises(ContenderError, match=r"2 environments need about 0\.1 GB more"):
+    with pytest.raises(ContenderError, match=r"2 environments need about 0\.1 GB, "):
         run([])

@@ -56,7 +56,8 @@ def compare(
 ) -> tuple[list[Result], list[Absence]]:
     """Measure contenders in turns: A B C, A B C, and so on.
 
-    The first round warms up and is not counted.
+    The first round warms up and is not counted. Where the memory is enough for each of
+    them, but not for all at once, they are made anew for every round.
 
     Args:
         setting: what to measure.
@@ -73,30 +74,44 @@ def compare(
             one failed while it ran.
     """
     absences: list[Absence] = []
-    # All live at the same time, and a system without memory ends any process.
+    # A system without memory ends any process.
     memory = 0.9 * available_memory()
+    fitting: list[str] = []
+    for name in [OURS, *(name for name in contenders if name != OURS)]:
+        reason = CONTENDERS[name].why_not(setting, memory)
+        if reason is None:
+            fitting.append(name)
+        elif name == OURS:
+            raise ContenderError(reason)
+        else:
+            absences.append(Absence(setting, name, reason))
+    needed = sum(CONTENDERS[name].memory for name in fitting) * setting.num_envs
+    footprints: dict[str, Footprint | None] = {}
     with ExitStack() as stack:
-        runners: dict[str, Runner] = {}
-        for name in [OURS, *(name for name in contenders if name != OURS)]:
+        living: dict[str, Runner] = {}
+        for name in fitting:
             progress(f"start {name}")
-            entry = CONTENDERS[name]
-            reason = entry.why_not(setting, memory)
-            if reason is None:
-                try:
-                    runners[name] = stack.enter_context(Runner(name, setting))
-                    memory -= entry.memory * setting.num_envs
-                except ContenderError as error:
-                    reason = str(error)
-            if reason is not None:
+            try:
+                runner = stack.enter_context(Runner(name, setting))
+            except ContenderError as error:
                 if name == OURS:
-                    raise ContenderError(reason)
-                absences.append(Absence(setting, name, reason))
-        speeds: dict[str, list[Speed]] = {name: [] for name in runners}
+                    raise
+                absences.append(Absence(setting, name, str(error)))
+                continue
+            footprints[name] = runner.footprint
+            if needed <= memory:
+                living[name] = runner
+            else:
+                runner.close()
+        speeds: dict[str, list[Speed]] = {name: [] for name in footprints}
         for _ in range(1 + rounds):
-            for name, runner in runners.items():
+            for name in footprints:
                 progress(f"{setting.env_id} x {setting.num_envs}: {name}")
-                speeds[name].append(runner.measure(steps))
-        footprints = {name: runner.footprint for name, runner in runners.items()}
+                speeds[name].append(
+                    living[name].measure(steps)
+                    if name in living
+                    else _measure_alone(name, setting, steps)
+                )
     ours = speeds[OURS][1:]
     results = [
         Result(
@@ -109,6 +124,12 @@ def compare(
             ),
             footprint=footprints[name],
         )
-        for name in runners
+        for name in footprints
     ]
     return results, absences
+
+
+def _measure_alone(name: str, setting: Setting, steps: int) -> Speed:
+    with Runner(name, setting) as runner:
+        runner.measure(steps)  # warms up
+        return runner.measure(steps)

@@ -238,8 +238,8 @@ class Entry:
         needed = self.memory * setting.num_envs
         if needed > memory:
             return (
-                f"{setting.num_envs} environments need about {needed / 1000:.1f} GB "
-                f"more, {memory / 1000:.1f} GB are free"
+                f"{setting.num_envs} environments need about {needed / 1000:.1f} GB, "
+                f"{memory / 1000:.1f} GB are free"
             )
         return None
 
