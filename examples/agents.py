@@ -66,6 +66,9 @@ class Hyperparameters:
     """TD3: standard deviation of the noise on target actions, clipped at 0.5"""
     relative_inputs: bool = False
     """give the networks objects from the end-effector and goals from objects, too"""
+    fine_inputs: float = 0.0
+    """give them these differences once more, clipped at so much [m], if positive: they
+    resolve millimetres where hand and object are close"""
     mirror: bool = False
     """mirror half of each batch in the plane in which robot and table are symmetric"""
     shift: float = 0.0
@@ -89,6 +92,7 @@ class Normalizer(nn.Module):
     Args:
         size: of observation and goal together.
         geometry: whose differences the networks see, too.
+        fine: where they are clipped when given once more [m]; 0: they are not.
     """
 
     count: Tensor
@@ -97,10 +101,14 @@ class Normalizer(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, size: int, geometry: Geometry | None = None) -> None:
+    def __init__(
+        self, size: int, geometry: Geometry | None = None, fine: float = 0.0
+    ) -> None:
         super().__init__()
         self.geometry = geometry
-        size += 0 if geometry is None else len(geometry.later)
+        self.fine = fine
+        if geometry is not None:
+            size += len(geometry.later) * (2 if fine else 1)
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
@@ -126,7 +134,10 @@ class Normalizer(nn.Module):
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
         inputs = [observation, goal]
         if self.geometry is not None:
-            inputs.append(self.geometry.differences(observation, goal))
+            differences = self.geometry.differences(observation, goal)
+            inputs.append(differences)
+            if self.fine:
+                inputs.append(differences.clamp(-self.fine, self.fine))
         return torch.cat(inputs, -1).clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
 
 
@@ -170,6 +181,8 @@ class Agent(nn.Module):
         num_q = 2 if hp.double_q and hp.algo != "ddpg" else 1
 
         self.geometry = read_geometry(env)
+        if hp.fine_inputs and not hp.relative_inputs:
+            raise ValueError("fine_inputs needs relative_inputs")
         if (hp.mirror or hp.shift) and self.geometry.action is None:
             raise ValueError(
                 "mirror and shift are for end-effector control: with joint control "
@@ -334,7 +347,8 @@ class Agent(nn.Module):
 def _make_policy(env: RobotTaskEnv, hp: Hyperparameters) -> tuple[Normalizer, Mod, Mod]:
     """The normaliser, the actor from ``normalized``, and the module between them."""
     size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
-    normalizer = Normalizer(size, read_geometry(env) if hp.relative_inputs else None)
+    geometry = read_geometry(env) if hp.relative_inputs else None
+    normalizer = Normalizer(size, geometry, hp.fine_inputs)
     normalize = Mod(normalizer, STATE_KEYS, ["normalized"])
     stochastic = hp.algo in STOCHASTIC
     net = MLP(

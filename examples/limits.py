@@ -22,12 +22,15 @@ LIMITS: dict[str, tuple[Callable[[float], bool], tuple[str, ...]]] = {
         lambda x: 0 <= x < inf,
         (
             *("updates_per_step", "action_l2", "bc_weight"),
-            *("noise_eps", "policy_noise", "shift"),
+            *("noise_eps", "policy_noise", "shift", "fine_inputs"),
         ),
     ),
     "from 0 to 1": (
         lambda x: 0 <= x <= 1,
-        ("her_ratio", "keep_unmoved", "random_eps", "max_random_eps"),
+        (
+            *("her_ratio", "demo_her_ratio", "keep_unmoved"),
+            *("random_eps", "max_random_eps"),
+        ),
     ),
     "from 0 to below 1": (lambda x: 0 <= x < 1, ("demo_ratio",)),
     "above 0 and at most 1": (lambda x: 0 < x <= 1, ("gamma", "tau")),

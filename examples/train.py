@@ -72,6 +72,11 @@ class Args(Hyperparameters):
     """transitions to learn from beside one's own, as examples/experts.py writes them"""
     demo_ratio: float = 0.25
     """share of each batch that is drawn from them"""
+    demo_her_ratio: float = 0.0
+    """share of those that get what their episode achieved at its end for a goal, as if
+    the expert had never missed"""
+    anneal_lr: bool = False
+    """let the learning rate fall to 0, linearly, until the last step"""
     keep_unmoved: float = 1.0
     """share of the episodes in which nothing moved that are stored (filtered HER, see
     arXiv 2012.08850): every goal that they could be given is reached without acting"""
@@ -163,7 +168,13 @@ class Run:
         if args.demos is not None:
             demos = read_demos(args.demos, self.env)
             self.demos = TensorDictReplayBuffer(
-                storage=LazyTensorStorage(len(demos), device=args.device)
+                storage=LazyTensorStorage(len(demos), device=args.device),
+                transform=HindsightRelabel(
+                    self.env.compute_reward,
+                    her_ratio=args.demo_her_ratio,
+                    strategy="final",
+                    seed=args.seed,
+                ),
             )
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
             self.demos.extend(demos)
@@ -251,9 +262,18 @@ class Run:
         due = int(self.steps * self.args.updates_per_step) - self.agent.updates
         losses: dict[str, list[Tensor]] = {}
         for _ in range(due):
+            if self.args.anneal_lr:
+                self.anneal()
             for key, loss in self.agent.update(*self.sample()).items():
                 losses.setdefault(key, []).append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
+
+    def anneal(self) -> None:
+        """Set the learning rate of the next gradient step."""
+        args = self.args
+        left = 1 - self.agent.updates / (args.updates_per_step * args.total_steps)
+        for group in self.agent.optimizer.param_groups:
+            group["lr"] = left * args.learning_rate
 
     def sample(self) -> list[TensorDictBase]:
         """A batch of the run's own transitions, and one of demonstrations if any."""

@@ -4,9 +4,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+import experts
 import torch_panda
 from agents import Agent, Hyperparameters
 from tests.examples.test_train import run
+from train import Args, Run
 
 
 @pytest.fixture
@@ -66,6 +68,35 @@ def test_policy_comes_closer_to_demonstrations(env, algo):
     batch, demos = transitions(env, 64), transitions(env, 32)
     losses = [agent.update(batch.clone(), demos.clone()) for _ in range(19)]
     assert 0 < losses[-1]["loss_bc"] < 0.9 * losses[0]["loss_bc"]
+
+
+@pytest.mark.parametrize("her_ratio", [0.0, 0.6, 1.0])
+def test_demonstrations_are_given_the_goal_they_achieved(tmp_path, her_ratio):
+    path = tmp_path / "demos.pt"
+    experts.main(experts.Args("PandaSlide-v1", episodes=4, num_envs=4, out=path))
+    demos = torch.load(path, weights_only=False).reshape(4, -1)
+    final = demos["next", "achieved_goal"][:, -1]
+    assert (final - demos["desired_goal"][:, -1]).norm(dim=-1).max() > 0.05  # a miss
+    args = Args(
+        env_id="PandaSlide-v1",
+        demos=path,
+        demo_ratio=0.5,
+        demo_her_ratio=her_ratio,
+        batch_size=2000,
+    )
+    training = Run(args, tmp_path)
+    batch = training.demos.sample(training.num_demos)
+    episode = batch["collector", "traj_ids"]
+    given = (batch["desired_goal"] == final[episode]).all(-1)
+    assert abs(given.double().mean() - her_ratio) < 0.1
+    kept = demos["desired_goal"][:, 0][episode]
+    assert (batch["desired_goal"] == kept).all(-1)[~given].all()
+    assert (batch["next", "desired_goal"] == batch["desired_goal"]).all()
+    reward = training.env.compute_reward(
+        batch["next", "achieved_goal"], batch["desired_goal"]
+    )
+    torch.testing.assert_close(batch["next", "reward"], reward)
+    training.close()
 
 
 def test_training_stores_demonstrations_apart(tmp_path):

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import torch_panda
+from agents import Normalizer
 from geometry import read_geometry
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
@@ -58,6 +59,20 @@ def test_differences(task):
         from_hand = objects - td["observation"][:, None, :3]
         expected = torch.cat((from_hand, goals - objects), 1).flatten(1)
         torch.testing.assert_close(found, expected)
+
+
+def test_fine_inputs():
+    with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as env:
+        td = env.reset()
+        geometry = read_geometry(env)
+    state = td["observation"], td["desired_goal"]
+    size = sum(x.shape[-1] for x in state)
+    coarse = Normalizer(size, geometry)(*state)
+    found = Normalizer(size, geometry, fine=0.03)(*state)
+    differences = geometry.differences(*state)
+    clipped = differences.clamp(-0.03, 0.03)
+    assert 0 < (clipped != differences).sum() < differences.numel()
+    torch.testing.assert_close(found, torch.cat((coarse, clipped), -1))
 
 
 def test_shift():

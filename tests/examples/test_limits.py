@@ -47,6 +47,7 @@ def refused(script, message, **options):
         *(("learning_rate", inf), ("alpha", 0.0), ("updates_per_step", -0.5)),
         *(("updates_per_step", inf), ("action_l2", nan), ("bc_weight", -1.0)),
         *(("noise_eps", -0.1), ("policy_noise", -0.1), ("shift", -0.1)),
+        *(("fine_inputs", -0.01), ("demo_her_ratio", 1.5)),
         *(("her_ratio", -0.1), ("her_ratio", 1.1), ("keep_unmoved", 2.0)),
         *(("random_eps", 1.5), ("max_random_eps", nan), ("demo_ratio", 1.0)),
         *(("gamma", 0.0), ("gamma", 1.01), ("tau", 0.0), ("tau", 1.5)),

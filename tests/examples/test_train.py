@@ -12,6 +12,8 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from train import Args, Run
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 QUICK = [
     "--no-video",
@@ -184,6 +186,22 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path):
     assert "tau was 0.05, is 0.1" in refused.stderr
 
 
+def test_learning_rate_falls_to_0(tmp_path):
+    args = Args(total_steps=200, anneal_lr=True, num_envs=2, updates_per_step=0.1)
+    training = Run(args, tmp_path)
+    (group,) = training.agent.optimizer.param_groups
+    rates = []
+    update = training.agent.update
+    training.agent.update = lambda *batch: rates.append(group["lr"]) or update(*batch)
+    for data in training.collector:
+        training.steps += data.numel()
+        training.learn(data)
+        if training.steps == args.total_steps:
+            break
+    training.close()
+    assert rates == pytest.approx([1e-3 * k / 20 for k in range(20, 0, -1)])
+
+
 def test_interrupt_saves(tmp_path):
     arguments = ["--total-steps", "100000", "--out", str(tmp_path), *QUICK]
     process = start_until(tmp_path / "curve.csv", *arguments)
@@ -203,6 +221,7 @@ def test_interrupt_saves(tmp_path):
         (("--resume",), "there is no run to resume"),
         (("--total-steps", "0"), "total_steps must be positive"),
         (("--demos", "nofile.pt"), "there is no file nofile.pt"),
+        (("--fine-inputs", "0.03"), "fine_inputs needs relative_inputs"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, arguments, message):
