@@ -12,6 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule as Mod
 from tensordict.nn import TensorDictSequential as Seq
 from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     MLP,
     AdditiveGaussianModule,
@@ -23,7 +24,7 @@ from torchrl.modules import (
 from torchrl.objectives import DDPGLoss, SACLoss, SoftUpdate, TD3Loss, TQCLoss
 from torchrl.objectives.value import TD0Estimator
 
-from geometry import Geometry, read_geometry
+from geometry import read_geometry
 from torch_panda import RobotTaskEnv
 
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
@@ -69,6 +70,9 @@ class Hyperparameters:
     fine_inputs: float = 0.0
     """give them these differences once more, clipped at so much [m], if positive: they
     resolve millimetres where hand and object are close"""
+    goal_height: float | None = None
+    """show the networks all goals at this height [m]. Slide draws goals 1.5 cm above
+    where its puck can be, by which they would be told from hindsight goals"""
     mirror: bool = False
     """mirror half of each batch in the plane in which robot and table are symmetric"""
     shift: float = 0.0
@@ -90,9 +94,8 @@ class Normalizer(nn.Module):
     """Running standardisation of what the networks see, as in OpenAI Baselines.
 
     Args:
-        size: of observation and goal together.
-        geometry: whose differences the networks see, too.
-        fine: where they are clipped when given once more [m]; 0: they are not.
+        env: the environment.
+        hp: what the networks see.
     """
 
     count: Tensor
@@ -101,14 +104,14 @@ class Normalizer(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(
-        self, size: int, geometry: Geometry | None = None, fine: float = 0.0
-    ) -> None:
+    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
         super().__init__()
-        self.geometry = geometry
-        self.fine = fine
-        if geometry is not None:
-            size += len(geometry.later) * (2 if fine else 1)
+        self.hyperparameters = hp
+        self.geometry = geometry = read_geometry(env)
+        self.heights = [start + 2 for start in geometry.goal_positions]
+        size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
+        if hp.relative_inputs:
+            size += len(geometry.later) * (2 if hp.fine_inputs else 1)
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
@@ -132,12 +135,16 @@ class Normalizer(nn.Module):
         return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
+        hp = self.hyperparameters
+        if hp.goal_height is not None:
+            goal = goal.clone()
+            goal[..., self.heights] = hp.goal_height
         inputs = [observation, goal]
-        if self.geometry is not None:
+        if hp.relative_inputs:
             differences = self.geometry.differences(observation, goal)
             inputs.append(differences)
-            if self.fine:
-                inputs.append(differences.clamp(-self.fine, self.fine))
+            if hp.fine_inputs:
+                inputs.append(differences.clamp(-hp.fine_inputs, hp.fine_inputs))
         return torch.cat(inputs, -1).clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)
 
 
@@ -217,6 +224,8 @@ class Agent(nn.Module):
                     hp.drop_quantiles if hp.double_q else 0
                 )
             self.loss = loss_class(actor, critic, **options)
+            # A buffer, but only once it was asked for: in the states that runs save.
+            _ = self.loss.target_entropy
         else:
             sigma = {"sigma_init": hp.noise_eps, "sigma_end": hp.noise_eps}
             eps = {"eps_init": hp.random_eps, "eps_end": hp.random_eps}
@@ -269,10 +278,7 @@ class Agent(nn.Module):
             the losses, scalars.
         """
         for part in (batch,) if demos is None else (batch, demos):
-            if self.hyperparameters.mirror:
-                self.geometry.mirror(part)
-            if self.hyperparameters.shift:
-                self.geometry.shift(part, self.hyperparameters.shift)
+            self._transform(part)
         num_demos = 0 if demos is None else len(demos)
         if demos is not None:
             batch = torch.cat((batch, demos))
@@ -285,6 +291,22 @@ class Agent(nn.Module):
         self.soft_update.step()
         self.updates += 1
         return {key: value.detach() for key, value in losses.items()}
+
+    def imitate(self, demos: TensorDictBase) -> Tensor:
+        """One gradient step of the policy alone, towards actions of demonstrations.
+
+        Returns:
+            the mean squared difference, a scalar.
+        """
+        self._transform(demos)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = self.policy(demos.clone())["action"]
+        loss = nn.functional.mse_loss(action, demos["action"])
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.soft_update.step()
+        return loss.detach()
 
     def _losses(self, batch: TensorDictBase, num_demos: int) -> dict[str, Tensor]:
         """Losses whose gradients touch only the network that each one trains.
@@ -316,6 +338,13 @@ class Agent(nn.Module):
                 losses["loss_bc"] = self.hyperparameters.bc_weight * error.mean()
         return losses
 
+    def _transform(self, batch: TensorDictBase) -> None:
+        """Mirror some of a batch's rows and move some over the table, if asked to."""
+        if self.hyperparameters.mirror:
+            self.geometry.mirror(batch)
+        if self.hyperparameters.shift:
+            self.geometry.shift(batch, self.hyperparameters.shift)
+
     def _remember_action(self, module: nn.Module, inputs: object, out: Tensor) -> None:
         """Keep the actions that gradients flow through: torchrl's losses do not."""
         if out.requires_grad:
@@ -346,9 +375,7 @@ class Agent(nn.Module):
 
 def _make_policy(env: RobotTaskEnv, hp: Hyperparameters) -> tuple[Normalizer, Mod, Mod]:
     """The normaliser, the actor from ``normalized``, and the module between them."""
-    size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
-    geometry = read_geometry(env) if hp.relative_inputs else None
-    normalizer = Normalizer(size, geometry, hp.fine_inputs)
+    normalizer = Normalizer(env, hp)
     normalize = Mod(normalizer, STATE_KEYS, ["normalized"])
     stochastic = hp.algo in STOCHASTIC
     net = MLP(

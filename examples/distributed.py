@@ -270,6 +270,8 @@ def main(args: Args) -> None:
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
+        if not args.total_steps:
+            raise ValueError("total_steps must be positive, got 0")
         connect(args)
         learner = Learner(args)
         out.mkdir(parents=True, exist_ok=True)

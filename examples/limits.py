@@ -11,17 +11,19 @@ LIMITS: dict[str, tuple[Callable[[float], bool], tuple[str, ...]]] = {
         lambda x: x > 0,
         (
             *("episodes", "eval_episodes", "eval_interval", "save_interval"),
-            *("total_steps", "steps_per_batch", "batch_size", "buffer_size"),
+            *("steps_per_batch", "batch_size", "buffer_size"),
             *("num_envs", "num_threads", "torch_threads", "hidden_size"),
             *("num_workers", "cpus_per_worker"),
         ),
     ),
     "from 0 to 2**64 - 1": (lambda x: 0 <= x < 2**64, ("seed",)),
     "above 0 and finite": (lambda x: 0 < x < inf, ("learning_rate", "alpha")),
+    "finite": (lambda x: -inf < x < inf, ("goal_height",)),
     "at least 0 and finite": (
         lambda x: 0 <= x < inf,
         (
-            *("updates_per_step", "action_l2", "bc_weight"),
+            *("total_steps", "pretrain_updates", "updates_per_step"),
+            *("action_l2", "bc_weight"),
             *("noise_eps", "policy_noise", "shift", "fine_inputs"),
         ),
     ),

@@ -63,7 +63,7 @@ class Args(Hyperparameters):
     device: str = "cpu"
     """of the networks and the replay buffer"""
     total_steps: int = 10_000
-    """environment steps, over all environments"""
+    """environment steps, over all environments; 0 after `pretrain_updates` only"""
     updates_per_step: float = 0.5
     """gradient steps per environment step"""
     batch_size: int = 256
@@ -75,6 +75,9 @@ class Args(Hyperparameters):
     demo_her_ratio: float = 0.0
     """share of those that get what their episode achieved at its end for a goal, as if
     the expert had never missed"""
+    pretrain_updates: int = 0
+    """gradient steps that only imitate them, before the first step of the environments;
+    the learning rate falls to 0 in them"""
     anneal_lr: bool = False
     """let the learning rate fall to 0, linearly, until the last step"""
     keep_unmoved: float = 1.0
@@ -184,6 +187,7 @@ class Run:
                     f"a demo_ratio of {args.demo_ratio} leaves no room for transitions "
                     f"of one's own in a batch of {args.batch_size}"
                 )
+        self.pretrained = 0  # gradient steps
         self.curve: list[dict[str, float]] = []
         self.steps = 0
         self.seconds = 0.0
@@ -202,6 +206,10 @@ class Run:
             loggers.append(TensorboardLogger("tensorboard", log_dir=str(out)))
         started = time.perf_counter() - self.seconds
         stop = StopSignal()
+        if not self.pretrain(stop):
+            return False
+        if not args.total_steps:
+            return True
         progress = tqdm(
             initial=self.steps,
             total=args.total_steps,
@@ -229,6 +237,35 @@ class Run:
             self.reseed(self.env)
         progress.close()
         return self.steps >= args.total_steps
+
+    def pretrain(self, stop: "StopSignal") -> bool:
+        """Imitate the demonstrations, if asked to, and evaluate.
+
+        Returns:
+            whether this is done.
+        """
+        count, batch_size = self.args.pretrain_updates, self.args.batch_size
+        if self.pretrained == count:
+            return True
+        assert self.demos is not None
+        started = time.perf_counter() - self.seconds
+        progress = tqdm(
+            initial=self.pretrained, total=count, unit="update", desc="imitation"
+        )
+        while self.pretrained < count and not stop:
+            self.set_learning_rate(1 - self.pretrained / count)
+            loss = self.agent.imitate(self.demos.sample(batch_size))
+            self.pretrained += 1
+            progress.update()
+            if self.pretrained % 1000 == 0:
+                progress.set_postfix(loss=f"{loss:.2g}")
+        progress.close()
+        self.set_learning_rate(1.0)
+        self.seconds = time.perf_counter() - started
+        if self.pretrained == count:
+            self.evaluate()
+        replace(self.out / "resume.pt", self.save)
+        return self.pretrained == count
 
     def make_collector(self) -> Collector:
         """Whole episodes of all environments, one batch [num_envs, steps] each time."""
@@ -263,17 +300,16 @@ class Run:
         losses: dict[str, list[Tensor]] = {}
         for _ in range(due):
             if self.args.anneal_lr:
-                self.anneal()
+                last = self.args.updates_per_step * self.args.total_steps
+                self.set_learning_rate(1 - self.agent.updates / last)
             for key, loss in self.agent.update(*self.sample()).items():
                 losses.setdefault(key, []).append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
 
-    def anneal(self) -> None:
-        """Set the learning rate of the next gradient step."""
-        args = self.args
-        left = 1 - self.agent.updates / (args.updates_per_step * args.total_steps)
+    def set_learning_rate(self, share: float) -> None:
+        """Let the next gradient steps have so much of the learning rate."""
         for group in self.agent.optimizer.param_groups:
-            group["lr"] = left * args.learning_rate
+            group["lr"] = share * self.args.learning_rate
 
     def sample(self) -> list[TensorDictBase]:
         """A batch of the run's own transitions, and one of demonstrations if any."""
@@ -318,6 +354,7 @@ class Run:
             "agent": self.agent.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
             "updates": self.agent.updates,
+            "pretrained": self.pretrained,
             "buffer": self.buffer.state_dict(),
             "demos": None if self.demos is None else self.demos.state_dict(),
             "random": torch.get_rng_state(),
@@ -346,6 +383,7 @@ class Run:
         self.agent.load_state_dict(state["agent"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]
+        self.pretrained = state["pretrained"]
         self.buffer.load_state_dict(state["buffer"])
         if self.demos is not None:
             self.demos.load_state_dict(state["demos"])
@@ -444,6 +482,10 @@ def check(args: Args, out: Path) -> None:
         ValueError: says which, and what is accepted.
     """
     check_limits(args)
+    if args.pretrain_updates and args.demos is None:
+        raise ValueError("pretrain_updates needs demos to imitate")
+    if not args.total_steps and not args.pretrain_updates:
+        raise ValueError("total_steps must be positive without pretrain_updates, got 0")
     if args.her == "augment" and not 1 / 3 < args.her_ratio < 1:
         raise ValueError(
             "with --her augment, which stores her_ratio / (1 - her_ratio) copies, "

@@ -99,6 +99,53 @@ def test_demonstrations_are_given_the_goal_they_achieved(tmp_path, her_ratio):
     training.close()
 
 
+class StopAfter:
+    """True from the n-th question on."""
+
+    def __init__(self, number):
+        self.left = number
+
+    def __bool__(self):
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.mark.parametrize("algo", ["td3", "sac"])
+def test_imitation_goes_on_where_it_was_stopped(tmp_path, algo):
+    path = tmp_path / "demos.pt"
+    experts.main(experts.Args(episodes=4, num_envs=4, out=path))
+    options = {"mirror": True, "eval_episodes": 2}
+    options |= {"total_steps": 0, "pretrain_updates": 40}
+    args = Args(algo=algo, env_id="PandaPush-v1", demos=path, **options)
+
+    def weights(training):
+        return {k: v.clone() for k, v in training.agent.state_dict().items()}
+
+    whole = Run(args, tmp_path)
+    before = weights(whole)
+    assert whole.train()
+    after = weights(whole)
+    whole.close()
+    changed = {key for key in after if not torch.equal(before[key], after[key])}
+    actor = {key for key in after if "actor_network" in key}
+    assert actor
+    assert actor <= changed
+    assert not any("value" in key or "normalizer" in key for key in changed)
+    assert [row["step"] for row in whole.curve] == [0]
+
+    stopped = Run(args, tmp_path)
+    assert not stopped.pretrain(StopAfter(15))
+    stopped.close()
+    assert not stopped.curve
+    resumed = Run(args, tmp_path)
+    resumed.load(tmp_path / "resume.pt")
+    assert resumed.pretrained == 15
+    assert resumed.pretrain(StopAfter(100))
+    resumed.close()
+    torch.testing.assert_close(weights(resumed), after, rtol=0, atol=0)
+    assert resumed.curve[0]["success"] == whole.curve[0]["success"]
+
+
 def test_training_stores_demonstrations_apart(tmp_path):
     demos = tmp_path / "demos.pt"
     run("experts", "--env-id", "PandaPush-v1", "--episodes", 4, "--out", demos)

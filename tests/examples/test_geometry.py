@@ -1,10 +1,12 @@
 """What the agents assume about the tasks holds in their physics."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 import torch_panda
-from agents import Normalizer
+from agents import Hyperparameters, Normalizer
 from geometry import read_geometry
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
@@ -61,18 +63,25 @@ def test_differences(task):
         torch.testing.assert_close(found, expected)
 
 
-def test_fine_inputs():
-    with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as env:
+def test_inputs_of_the_networks():
+    hp = Hyperparameters(goal_height=0.5)
+    relative = replace(hp, relative_inputs=True)
+    with torch_panda.make("PandaStack-v1", num_envs=3, seed=0) as env:
         td = env.reset()
         geometry = read_geometry(env)
-    state = td["observation"], td["desired_goal"]
-    size = sum(x.shape[-1] for x in state)
-    coarse = Normalizer(size, geometry)(*state)
-    found = Normalizer(size, geometry, fine=0.03)(*state)
-    differences = geometry.differences(*state)
+        kinds = [hp, relative, replace(relative, fine_inputs=0.03)]
+        plain, coarse, fine = (
+            Normalizer(env, kind)(td["observation"], td["desired_goal"])
+            for kind in kinds
+        )
+    goal = td["desired_goal"].clone()
+    goal[:, [2, 5]] = 0.5
+    torch.testing.assert_close(plain, torch.cat((td["observation"], goal), -1))
+    differences = geometry.differences(td["observation"], goal)
+    torch.testing.assert_close(coarse, torch.cat((plain, differences), -1))
     clipped = differences.clamp(-0.03, 0.03)
     assert 0 < (clipped != differences).sum() < differences.numel()
-    torch.testing.assert_close(found, torch.cat((coarse, clipped), -1))
+    torch.testing.assert_close(fine, torch.cat((coarse, clipped), -1))
 
 
 def test_shift():

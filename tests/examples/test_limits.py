@@ -40,7 +40,7 @@ def refused(script, message, **options):
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        *(("seed", -1), ("seed", 2**64), ("total_steps", 0), ("eval_interval", 0)),
+        *(("seed", -1), ("seed", 2**64), ("total_steps", -1), ("eval_interval", 0)),
         *(("save_interval", 0), ("eval_episodes", 0), ("num_envs", 0)),
         *(("num_threads", 0), ("torch_threads", 0), ("batch_size", 0)),
         *(("buffer_size", 0), ("hidden_size", 0), ("learning_rate", 0.0)),
@@ -48,6 +48,7 @@ def refused(script, message, **options):
         *(("updates_per_step", inf), ("action_l2", nan), ("bc_weight", -1.0)),
         *(("noise_eps", -0.1), ("policy_noise", -0.1), ("shift", -0.1)),
         *(("fine_inputs", -0.01), ("demo_her_ratio", 1.5)),
+        *(("pretrain_updates", -1), ("goal_height", inf)),
         *(("her_ratio", -0.1), ("her_ratio", 1.1), ("keep_unmoved", 2.0)),
         *(("random_eps", 1.5), ("max_random_eps", nan), ("demo_ratio", 1.0)),
         *(("gamma", 0.0), ("gamma", 1.01), ("tau", 0.0), ("tau", 1.5)),

@@ -186,6 +186,32 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path):
     assert "tau was 0.05, is 0.1" in refused.stderr
 
 
+@pytest.mark.parametrize("algo", ["td3", "sac", "tqc"])
+def test_every_algorithm_goes_on_from_its_state(tmp_path, algo):
+    args = Args(algo=algo, num_envs=2, total_steps=200, updates_per_step=0.1)
+
+    def iterate(training):
+        training.reseed(training.env)
+        data = next(iter(training.collector))
+        training.steps += data.numel()
+        training.learn(data)
+
+    whole = Run(args, tmp_path)
+    iterate(whole)
+    whole.save(tmp_path / "resume.pt")
+    resumed = Run(args, tmp_path)
+    resumed.load(tmp_path / "resume.pt")
+    iterate(resumed)
+    torch.set_rng_state(torch.load(tmp_path / "resume.pt")["random"])
+    iterate(whole)
+    for training in (whole, resumed):
+        assert training.agent.updates == 20
+        training.close()
+    torch.testing.assert_close(
+        resumed.agent.state_dict(), whole.agent.state_dict(), rtol=0, atol=0
+    )
+
+
 def test_learning_rate_falls_to_0(tmp_path):
     args = Args(total_steps=200, anneal_lr=True, num_envs=2, updates_per_step=0.1)
     training = Run(args, tmp_path)
@@ -221,6 +247,7 @@ def test_interrupt_saves(tmp_path):
         (("--resume",), "there is no run to resume"),
         (("--total-steps", "0"), "total_steps must be positive"),
         (("--demos", "nofile.pt"), "there is no file nofile.pt"),
+        (("--pretrain-updates", "9"), "pretrain_updates needs demos to imitate"),
         (("--fine-inputs", "0.03"), "fine_inputs needs relative_inputs"),
     ],
 )
