@@ -68,7 +68,8 @@ def plot_panels(
             values = np.array([[r[metric] for r in c[:length]] for c in curves])
             low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
             name = f"{label} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
-            axes.plot(steps, median, color=colors[label], label=name)
+            marker = "o" if length == 1 else None
+            axes.plot(steps, median, marker=marker, color=colors[label], label=name)
             axes.fill_between(steps, low, high, color=colors[label], alpha=0.2, lw=0)
         _label(axes, task)
         axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
@@ -111,9 +112,13 @@ def line_label(args: dict[str, object]) -> str:
         parts.append("one Q")
     if args.get("demos"):
         parts.append("demonstrations")
+    if args.get("pretrain_updates"):
+        parts.append("imitation first")
     if args["preset"] == "tuned":
         wanted = {"mirror": "mirror", "relative_inputs": "relative", "shift": "shift"}
         parts += [f"no {name}" for key, name in wanted.items() if not args.get(key)]
+    if args.get("fine_inputs"):
+        parts.append("fine inputs")
     return ", ".join(parts)
 
 
