@@ -187,7 +187,8 @@ class Agent(nn.Module):
         hp = self.hyperparameters = hyperparameters
         num_q = 2 if hp.double_q and hp.algo != "ddpg" else 1
 
-        self.geometry = read_geometry(env)
+        self.normalizer, actor, normalize = _make_policy(env, hp)
+        self.geometry = self.normalizer.geometry
         if hp.fine_inputs and not hp.relative_inputs:
             raise ValueError("fine_inputs needs relative_inputs")
         if (hp.mirror or hp.shift) and self.geometry.action is None:
@@ -195,7 +196,6 @@ class Agent(nn.Module):
                 "mirror and shift are for end-effector control: with joint control "
                 "pass --no-mirror --shift 0"
             )
-        self.normalizer, actor, normalize = _make_policy(env, hp)
         critic = Mod(
             MLP(
                 in_features=len(self.normalizer.mean) + env.action_spec.shape[-1],
@@ -285,10 +285,7 @@ class Agent(nn.Module):
         batch = batch.set("normalized", self._normalize(batch))
         batch.set(("next", "normalized"), self._normalize(batch["next"]))
         losses = self._losses(batch, num_demos)
-        self.optimizer.zero_grad()
-        torch.stack(tuple(losses.values())).sum().backward()
-        self.optimizer.step()
-        self.soft_update.step()
+        self._descend(torch.stack(tuple(losses.values())).sum())
         self.updates += 1
         return {key: value.detach() for key, value in losses.items()}
 
@@ -300,12 +297,9 @@ class Agent(nn.Module):
         """
         self._transform(demos)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            action = self.policy(demos.clone())["action"]
+            action = self.policy(demos.select(*STATE_KEYS))["action"]
         loss = nn.functional.mse_loss(action, demos["action"])
-        self.optimizer.zero_grad()
-        loss.backward()
-        self.optimizer.step()
-        self.soft_update.step()
+        self._descend(loss)
         return loss.detach()
 
     def _losses(self, batch: TensorDictBase, num_demos: int) -> dict[str, Tensor]:
@@ -337,6 +331,13 @@ class Agent(nn.Module):
                     error = error * (stored_value[demos] > self._value[demos])
                 losses["loss_bc"] = self.hyperparameters.bc_weight * error.mean()
         return losses
+
+    def _descend(self, loss: Tensor) -> None:
+        """Take a gradient step, and let the target networks follow."""
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.soft_update.step()
 
     def _transform(self, batch: TensorDictBase) -> None:
         """Mirror some of a batch's rows and move some over the table, if asked to."""

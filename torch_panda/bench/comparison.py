@@ -43,7 +43,7 @@ class Absence:
 
 def work_of(settings: int, contenders: int, rounds: int) -> int:
     """How often `compare` calls its ``progress`` at most."""
-    return settings * contenders * (1 + 1 + rounds)
+    return settings * contenders * (1 + rounds)
 
 
 def compare(
@@ -56,7 +56,7 @@ def compare(
 ) -> tuple[list[Result], list[Absence]]:
     """Measure contenders in turns: A B C, A B C, and so on.
 
-    The first round warms up and is not counted. Where the memory is enough for each of
+    Each warms up by a round that is not counted. Where the memory is enough for each of
     them, but not for all at once, they are made anew for every round.
 
     Args:
@@ -100,11 +100,12 @@ def compare(
                 continue
             footprints[name] = runner.footprint
             if needed <= memory:
+                runner.measure(steps)  # warms up
                 living[name] = runner
             else:
                 runner.close()
         speeds: dict[str, list[Speed]] = {name: [] for name in footprints}
-        for _ in range(1 + rounds):
+        for _ in range(rounds):
             for name in footprints:
                 progress(f"{setting.env_id} x {setting.num_envs}: {name}")
                 speeds[name].append(
@@ -112,15 +113,15 @@ def compare(
                     if name in living
                     else _measure_alone(name, setting, steps)
                 )
-    ours = speeds[OURS][1:]
+    ours = speeds[OURS]
     results = [
         Result(
             setting=setting,
             contender=name,
-            speeds=tuple(speeds[name][1:]),
+            speeds=tuple(speeds[name]),
             ratios=tuple(
                 Speed(a.per_second / b.per_second, a.per_cpu_second / b.per_cpu_second)
-                for a, b in zip(ours, speeds[name][1:], strict=True)
+                for a, b in zip(ours, speeds[name], strict=True)
             ),
             footprint=footprints[name],
         )
