@@ -191,6 +191,8 @@ class Agent(nn.Module):
         self.geometry = self.normalizer.geometry
         if hp.fine_inputs and not hp.relative_inputs:
             raise ValueError("fine_inputs needs relative_inputs")
+        if hp.goal_height is not None and not self.geometry.goal_positions:
+            raise ValueError("goal_height is for goals that are positions")
         if (hp.mirror or hp.shift) and self.geometry.action is None:
             raise ValueError(
                 "mirror and shift are for end-effector control: with joint control "
@@ -424,9 +426,16 @@ def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Seq:
     """The policy of a checkpoint that `save_policy` wrote.
 
     Raises:
-        ValueError: the environment's spaces are not those it was trained on.
+        ValueError: the environment's spaces are not those it was trained on, or
+            another version wrote the checkpoint.
     """
-    hp = Hyperparameters(**checkpoint["hyperparameters"])
+    options = checkpoint["hyperparameters"]
+    if unknown := options.keys() - {field.name for field in fields(Hyperparameters)}:
+        raise ValueError(
+            f"the policy was saved by another version, with options that this one does "
+            f"not have: {', '.join(sorted(unknown))}"
+        )
+    hp = Hyperparameters(**options)
     _, actor, normalize = _make_policy(env, hp)
     policy = Seq(normalize, actor)
     try:

@@ -41,6 +41,16 @@ def test_files_that_hold_no_policy(tmp_path, script, content):
         script.main(script.Args(**given))
 
 
+@pytest.mark.parametrize("script", [evaluate, watch])
+def test_policies_of_other_versions(tmp_path, script):
+    path = tmp_path / "checkpoint.pt"
+    options = {"algo": "ddpg", "relative": True, "depth": 3}
+    save(path, {"env_id": "PandaReach-v1", "hyperparameters": options, "policy": {}})
+    given = {"run": path} if script is evaluate else {"policy": str(tmp_path)}
+    with pytest.raises(SystemExit, match=r"another version, .*: depth, relative$"):
+        script.main(script.Args(**given))
+
+
 @BAD
 def test_files_that_hold_no_demonstrations(tmp_path, content):
     path = tmp_path / "demos.pt"

@@ -71,6 +71,11 @@ def test_ratios_without_stored_copies(tmp_path, her_ratio):
     refused(train, message, **options, out=tmp_path / "run")
 
 
+def test_goals_without_height(tmp_path):
+    out, message = tmp_path / "run", "goal_height is for goals that are positions"
+    refused(train, message, env_id="PandaFlip-v1", goal_height=0.03, out=out)
+
+
 @pytest.mark.parametrize("device", ["", "nothing", "meta", "cuda:99"])
 def test_devices_that_do_not_work(tmp_path, device):
     message = f"device must be one that torch can use here, .* got '{device}': .+"
