@@ -30,7 +30,7 @@ LIMITS: dict[str, tuple[Callable[[float], bool], tuple[str, ...]]] = {
     "from 0 to 1": (
         lambda x: 0 <= x <= 1,
         (
-            *("her_ratio", "demo_her_ratio", "keep_unmoved"),
+            *("her_ratio", "demo_her_ratio", "keep_unmoved", "start_at_object"),
             *("random_eps", "max_random_eps"),
         ),
     ),

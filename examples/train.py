@@ -23,6 +23,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.record import CSVLogger, TensorboardLogger
 from torchrl.record.loggers.common import Logger
@@ -33,6 +34,7 @@ from agents import Agent, Hyperparameters, read, replace, save_policy
 from evaluate import evaluate
 from limits import check_limits
 from plot import plot_curve
+from starts import StartFrom, states_at_objects
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 from watch import record
 
@@ -83,6 +85,9 @@ class Args(Hyperparameters):
     keep_unmoved: float = 1.0
     """share of the episodes in which nothing moved that are stored (filtered HER, see
     arXiv 2012.08850): every goal that they could be given is reached without acting"""
+    start_at_object: float = 0.0
+    """share of the training episodes that begin with the hand at an object: holding it,
+    or beside it if the gripper is blocked (see examples/starts.py)"""
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
     eval_interval: int = 1_000
@@ -269,8 +274,13 @@ class Run:
 
     def make_collector(self) -> Collector:
         """Whole episodes of all environments, one batch [num_envs, steps] each time."""
+        env: EnvBase = self.env
+        if self.args.start_at_object:
+            states = states_at_objects(self.args.env_id, seed=self.args.seed)
+            start = StartFrom(states, self.args.start_at_object)
+            env = TransformedEnv(env, start)
         return Collector(
-            self.env,
+            env,
             self.agent.explore,
             frames_per_batch=self.args.num_envs * self.env.max_episode_steps,
             total_frames=-1,

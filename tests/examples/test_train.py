@@ -186,9 +186,17 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path):
     assert "tau was 0.05, is 0.1" in refused.stderr
 
 
-@pytest.mark.parametrize("algo", ["td3", "sac", "tqc"])
-def test_every_algorithm_goes_on_from_its_state(tmp_path, algo):
-    args = Args(algo=algo, num_envs=2, total_steps=200, updates_per_step=0.1)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"algo": "td3"},
+        {"algo": "sac"},
+        {"algo": "tqc"},
+        {"env_id": "PandaPush-v1", "start_at_object": 0.5},
+    ],
+)
+def test_every_kind_of_run_goes_on_from_its_state(tmp_path, options):
+    args = Args(**options, num_envs=2, total_steps=200, updates_per_step=0.1)
 
     def iterate(training):
         training.reseed(training.env)

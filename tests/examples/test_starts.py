@@ -1,0 +1,98 @@
+"""Training episodes that begin with the hand at an object."""
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+
+import torch_panda
+from starts import PHYSICAL, StartFrom, states_at_objects
+
+NUM_ENVS = 8
+
+
+@pytest.fixture(scope="module")
+def states():
+    return states_at_objects("PandaPush-v1", seed=3)
+
+
+def place(env, states):
+    """Let the first environments start from these states."""
+    return env.reset(states[: env.num_envs].clone(), set_state=True)
+
+
+@pytest.mark.parametrize("task", ["Push", "Slide"])
+def test_hand_beside_an_object_at_rest(task):
+    states = states_at_objects(f"Panda{task}-v1", seed=0)
+    assert len(states) >= 24
+    with torch_panda.make(f"Panda{task}-v1", num_envs=24) as env:
+        td = place(env, states)
+        offset = td["observation"][:, :3] - td["achieved_goal"]
+        still = env.step(td.set("action", torch.zeros(24, 3)))["next", "achieved_goal"]
+    distance = offset[:, :2].norm(dim=-1)
+    assert ((distance > 0.045) & (distance < 0.09)).all()
+    assert (offset[:, 2].abs() < 0.01).all()
+    quadrants = {(x > 0, y > 0) for x, y in offset[:, :2].tolist()}
+    assert len(quadrants) == 4
+    torch.testing.assert_close(still, td["achieved_goal"], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("task", "number"), [("PickAndPlace", 1), ("Stack", 2)])
+def test_hand_holds_an_object(task, number):
+    states = states_at_objects(f"Panda{task}-v1", seed=0)
+    assert len(states) >= 20
+    with torch_panda.make(f"Panda{task}-v1", num_envs=20) as env:
+        td = place(env, states)
+        before = td["achieved_goal"].unflatten(-1, (number, 3))
+        for _ in range(6):
+            up = torch.tensor([0.0, 0.0, 0.5, -1.0]).repeat(20, 1)
+            td = env.step(td.set("action", up))["next"]
+        lifted = td["achieved_goal"].unflatten(-1, (number, 3)) - before
+    assert ((lifted[..., 2] > 0.05).sum(1) == 1).all()
+    assert (lifted[..., 2] > 0.05).any(0).all()  # each object in some states
+
+
+def test_share_of_the_episodes(states):
+    # Hands that start in the neutral position are 20 cm high.
+    with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartFrom(states, 0.3))
+        torch.manual_seed(0)
+        starts = torch.stack([env.reset() for _ in range(50)])
+        low = starts["observation"][..., 2] < 0.1
+        assert 0.2 < low.float().mean() < 0.4
+        assert low.any(0).all()
+        assert not low.all(1).any()
+        goals = starts["desired_goal"].flatten(0, 1)
+        assert len(goals.unique(dim=0)) == len(goals)
+        # They are not the goals that the states were saved with.
+        assert (goals[low.flatten()].std(0)[:2] > 0.07).all()
+        reached = starts["achieved_goal"][low]
+        known = states["object_pose"][:, 0, :3].float()
+        torch.testing.assert_close(
+            torch.cdist(reached, known).amin(1), torch.zeros(len(reached))
+        )
+        td = env.rollout(3)
+        assert td.batch_size == (NUM_ENVS, 3)
+        assert not set(PHYSICAL) & set(td.keys())
+
+
+def test_partial_reset_leaves_the_others_alone(states):
+    with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartFrom(states, 1.0))
+        td = env.rollout(3)[:, -1]["next"]
+        before = base.get_state()
+        td["_reset"] = torch.zeros(NUM_ENVS, 1, dtype=torch.bool)
+        td["_reset"][2] = True
+        after = env.reset(td)
+        state = base.get_state()
+        others = torch.arange(NUM_ENVS) != 2
+        assert (state[others] == before[others]).all()
+        assert (after["observation"][others] == td["observation"][others]).all()
+        known = states["joint_position"]
+        assert (state["joint_position"][2] == known).all(1).any()
+        assert state["step_count"].flatten().tolist() == [3, 3, 0, 3, 3, 3, 3, 3]
+
+
+@pytest.mark.parametrize("env_id", ["PandaReach-v1", "PandaPushJoints-v1"])
+def test_tasks_that_cannot_start_so(env_id):
+    with pytest.raises(ValueError, match=f"end-effector .* got {env_id}"):
+        states_at_objects(env_id, seed=0)
