@@ -112,6 +112,8 @@ def line_label(args: dict[str, object]) -> str:
         parts.append("one Q")
     if args.get("demos"):
         parts.append("demonstrations")
+    if args["updates_per_step"] != 0.5:  # the presets'
+        parts.append(f"{args['updates_per_step']} updates a step")
     if args.get("start_at_object"):
         parts.append("starts at objects")
     if args.get("pretrain_updates"):
