@@ -64,8 +64,8 @@ EXACT = PhysicsParams()
 # 12 substeps for 20. The solver needs all its iterations where fingers hold a cube, and
 # few elsewhere: a larger residual saves as much as a limit of 10 iterations does, but
 # not where they matter. A motor leaves 1 - gain of the error a substep; this gain,
-# somewhat more than 1 - 0.9 ** (20 / 12) = 0.161, makes a struck puck slide as far as
-# it does in exact physics, to about 1 %.
+# somewhat more than 1 - 0.9 ** (20 / 12) = 0.161, makes a puck that the scripted expert
+# strikes slide as far as it does in exact physics, to about 1 %; other strikes, not.
 FAST = PhysicsParams(
     timestep=1 / 300, n_substeps=12, residual_threshold=1e-3, position_gain=0.1725
 )
