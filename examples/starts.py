@@ -2,7 +2,7 @@
 
 As long as nothing moves an object, hindsight goals teach nothing about it. The authors
 of HER began half of the episodes of pick-and-place in one state in which the box is
-grasped (arXiv 1707.01495, appendix A). Here a scripted hand makes such states.
+grasped (arXiv 1707.01495, section 4.1). Here a scripted hand makes such states.
 """
 
 from math import pi
