@@ -210,6 +210,24 @@ def test_partial_state_leaves_the_rest_neutral_or_sampled(env):
     assert len(td["desired_goal"].unique(dim=0)) == 3
 
 
+def test_state_serves_again(env):
+    run(env, 20)
+    state = env.get_state()
+    before = state.clone()
+    first = env.reset(state, set_state=True)
+    assert set(state.keys()) == set(before.keys())
+    assert (state == before).all()
+    run(env, 5)
+    again = env.reset(state, set_state=True)
+    assert (first == again).all()
+
+
+@pytest.mark.parametrize("state", [None, TensorDict({}, [3])])
+def test_start_from_no_state(env, state):
+    with pytest.raises(ValueError, match="needs a state with some of joint_position"):
+        env.reset(state, set_state=True)
+
+
 @pytest.mark.parametrize(
     ("key", "change", "message"),
     [

@@ -47,6 +47,17 @@ def test_transforms():
     torch.testing.assert_close(rollout["next", "episode_reward"][:, 49], total)
 
 
+def test_transformed_environments_do_not_lose_a_state_silently():
+    with make_env(seed=0) as env:
+        env.rollout(5)
+        state = env.get_state()
+        transformed = TransformedEnv(env, StepCounter())
+        with pytest.raises(ValueError, match="do not pass states on"):
+            transformed.reset(state, set_state=True)
+        start = transformed.base_env.reset(state, set_state=True)
+        assert (start.select(*state.keys()) == state).exclude("desired_goal").all()
+
+
 @pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
 def test_batched_environments(kind):
     arguments = {"mp_start_method": "spawn"} if kind is ParallelEnv else {}

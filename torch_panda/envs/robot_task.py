@@ -288,6 +288,34 @@ class RobotTaskEnv(EnvBase, Closing):
         )
         return build, ()
 
+    def reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        set_state: bool | None = None,
+        **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
+    ) -> TensorDictBase:
+        """Start new episodes, as in torchrl.
+
+        Args:
+            tensordict: which environments, under ``_reset``; with ``set_state``, what
+                `get_state` returned, or some of its entries. It is left as it is.
+            set_state: start from that state. What is left out is neutral (joints), zero
+                (velocities) or sampled (objects, goal).
+            **kwargs: torchrl's other options.
+
+        Returns:
+            What the environments observe, and the state that was given.
+
+        Raises:
+            ValueError: there is no state, or it cannot be one. torchrl's
+                `TransformedEnv` and `ParallelEnv` do not pass states on.
+        """
+        if set_state and tensordict is not None:
+            # torchrl writes what is observed into it, the goal as float32.
+            tensordict = tensordict.copy()
+        return super().reset(tensordict, set_state=set_state, **kwargs)
+
     # ---- what torchrl calls ------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -324,10 +352,7 @@ class RobotTaskEnv(EnvBase, Closing):
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = list(range(len(self._goal))) if mask is None else _indices(mask)
         envs = sorted({*envs, *self._never_reset})
-        if set_state and tensordict is not None:
-            given = read_state(tensordict, like=state, envs=envs)
-        else:
-            given = {}
+        given = read_state(tensordict, like=state, envs=envs) if set_state else {}
         for env in envs:
             self._start_episode(env)
         for key, value in given.items():

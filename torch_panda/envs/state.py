@@ -10,7 +10,7 @@ _LARGEST = 1e6  # [m], [rad], [m/s], [rad/s]
 
 
 def read_state(
-    tensordict: TensorDictBase, *, like: dict[str, Tensor], envs: list[int]
+    tensordict: TensorDictBase | None, *, like: dict[str, Tensor], envs: list[int]
 ) -> dict[str, Tensor]:
     """Check the state entries of a tensordict, and return those that are there.
 
@@ -24,8 +24,16 @@ def read_state(
 
     Raises:
         ValueError: an entry has a wrong shape, is not finite or above 1e6, or holds no
-            rotation.
+            rotation; or there is none beside ``step_count``, which torchrl's
+            `StepCounter` has, too.
     """
+    keys = set() if tensordict is None else {*tensordict.keys()}
+    if tensordict is None or not keys & (like.keys() - {"step_count"}):
+        raise ValueError(
+            f"set_state=True needs a state with some of {', '.join(like)}; none came. "
+            "torchrl's TransformedEnv and ParallelEnv do not pass states on: reset "
+            "env.base_env, or use SerialEnv"
+        )
     state = {}
     for key, own in like.items():
         value = tensordict.get(key, None)

@@ -74,7 +74,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         if seed is not None:
             self.torch_env.set_env_seed(0, seed)
-        start = self.torch_env._reset(state, set_state=True)
+        start = self.torch_env._reset(state, set_state=not state.is_empty())
         return arrays.observation(start), {"is_success": start["success"].item()}
 
     def step(

@@ -169,7 +169,8 @@ class GoalVectorEnv(
         torchrl's own `reset` would have to be given what the others observed.
         """
         start = TensorDict() if state is None else state
-        return self.torch_env._reset(start.set("_reset", mask), set_state=True)
+        given = not start.is_empty()
+        return self.torch_env._reset(start.set("_reset", mask), set_state=given)
 
     def _infos(self, after: TensorDict, mask: Tensor) -> dict[str, Any]:
         success = after["success"].squeeze(1) & mask
