@@ -440,10 +440,10 @@ def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Seq:
     policy = Seq(normalize, actor)
     try:
         policy.load_state_dict(checkpoint["policy"])
-    except RuntimeError as error:
+    except RuntimeError:
         raise ValueError(
             f"the policy was trained on {checkpoint['env_id']}, whose spaces are not "
-            f"those of this environment: {error}"
+            "those of this environment"
         ) from None
     return policy
 

@@ -22,10 +22,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import ray
 import torch
 import tyro
-from ray.exceptions import RayActorError
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
@@ -39,6 +37,12 @@ from evaluate import evaluate
 from limits import check_limits
 from torch_panda.transforms import HindsightRelabel
 from train import STORED_KEYS, StopSignal, crossed
+
+try:
+    import ray
+    from ray.exceptions import RayActorError
+except ModuleNotFoundError:
+    raise SystemExit("this needs Ray: pip install -e '.[ray]'") from None
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
 

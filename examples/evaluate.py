@@ -124,8 +124,11 @@ def main(args: Args) -> None:
         share = flags.float().mean()
         print(f"{name:20s} {share:6.1%}  [{low:.1%}, {high:.1%}]")
     mean = result.episode_return.mean()
-    half = 1.96 * result.episode_return.std() / sqrt(args.episodes)
-    print(f"{'return':20s} {mean:6.2f}  [{mean - half:.2f}, {mean + half:.2f}]")
+    interval = ""
+    if args.episodes > 1:
+        half = 1.96 * result.episode_return.std() / sqrt(args.episodes)
+        interval = f"  [{mean - half:.2f}, {mean + half:.2f}]"
+    print(f"{'return':20s} {mean:6.2f}{interval}")
 
 
 if __name__ == "__main__":

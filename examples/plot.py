@@ -11,7 +11,7 @@ import json
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import matplotlib
 
@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 
 Curve = list[dict[str, float]]
+Metric = Literal["success", "ever_success", "return"]
 COLUMNS = 3  # of panels
 
 
@@ -29,13 +30,13 @@ def plot_curve(curve: Curve, title: str, path: Path) -> None:
     """Draw one run's success over environment steps."""
     figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
     axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
-    _label(axes, title)
+    _label(axes, title, "success")
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
 def plot_panels(
-    runs: dict[str, dict[str, list[Curve]]], metric: str, path: Path
+    runs: dict[str, dict[str, list[Curve]]], metric: Metric, path: Path
 ) -> None:
     """Draw median and interquartile range over seeds.
 
@@ -71,7 +72,7 @@ def plot_panels(
             marker = "o" if length == 1 else None
             axes.plot(steps, median, marker=marker, color=colors[label], label=name)
             axes.fill_between(steps, low, high, color=colors[label], alpha=0.2, lw=0)
-        _label(axes, task)
+        _label(axes, task, metric)
         axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
     figure.savefig(path, dpi=120)
     plt.close(figure)
@@ -81,20 +82,25 @@ def read_runs(folders: list[Path]) -> dict[str, dict[str, list[Curve]]]:
     """Read the curves below some folders: by task, then by line.
 
     Raises:
-        ValueError: there is no run.
+        ValueError: there is no run, or what one of them holds cannot be read.
     """
     runs: dict[str, dict[str, list[Curve]]] = defaultdict(lambda: defaultdict(list))
     for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
-        args = json.loads((path.parent / "args.json").read_text())
-        with path.open() as file:
-            curve = [
-                {key: float(value) for key, value in row.items()}
-                for row in csv.DictReader(file)
-            ]
+        try:
+            args = json.loads((path.parent / "args.json").read_text())
+            task, line = args["env_id"], line_label(args)
+            with path.open() as file:
+                curve = [
+                    {key: float(value) for key, value in row.items()}
+                    for row in csv.DictReader(file)
+                ]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path.parent} holds no run: {error!r}") from None
         if curve:
-            runs[args["env_id"]][line_label(args)].append(curve)
+            runs[task][line].append(curve)
     if not runs:
-        raise ValueError(f"no run (args.json, curve.csv) below {folders}")
+        names = ", ".join(map(str, folders))
+        raise ValueError(f"no run (args.json, curve.csv) below {names}")
     return runs
 
 
@@ -126,13 +132,11 @@ def line_label(args: dict[str, object]) -> str:
     return ", ".join(parts)
 
 
-def _label(axes: plt.Axes, title: str) -> None:
-    axes.set(
-        xlabel="environment steps",
-        ylabel="success rate",
-        ylim=(-0.05, 1.05),
-        title=title,
-    )
+def _label(axes: plt.Axes, title: str, metric: Metric) -> None:
+    names = {"success": "success rate", "ever_success": "success rate at any step"}
+    axes.set(xlabel="environment steps", ylabel=names.get(metric, metric), title=title)
+    if metric in names:
+        axes.set_ylim(-0.05, 1.05)
     axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 0))
     axes.grid(alpha=0.3)
 
@@ -143,19 +147,21 @@ class Args:
 
     runs: Annotated[list[Path], tyro.conf.Positional]
     """folders that hold runs, at any depth"""
-    metric: str = "success"
-    """column of the curves: success, ever_success or return"""
+    metric: Metric = "success"
+    """column of the curves"""
     out: Path = Path("curves.png")
     """picture to write"""
 
 
 def main(args: Args) -> None:
     """Draw the runs."""
+    out = args.out if args.out.suffix else args.out.with_suffix(".png")
     try:
-        plot_panels(read_runs(args.runs), args.metric, args.out)
-    except (ValueError, KeyError) as error:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        plot_panels(read_runs(args.runs), args.metric, out)
+    except (ValueError, OSError) as error:
         raise SystemExit(f"cannot draw: {error}") from None
-    print(f"wrote {args.out}")
+    print(f"wrote {out}")
 
 
 if __name__ == "__main__":

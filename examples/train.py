@@ -14,6 +14,7 @@ import json
 import signal
 import time
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -95,7 +96,8 @@ class Args(Hyperparameters):
     eval_episodes: int = 80
     """fresh episodes per evaluation"""
     save_interval: int = 20_000
-    """environment steps between the states that --resume starts from"""
+    """environment steps, or imitating gradient steps, between the states that --resume
+    starts from; Ctrl-C saves one, too"""
     out: Path | None = None
     """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
     resume: bool = False
@@ -128,7 +130,12 @@ FREE_ARGUMENTS = {
     "save_interval",
     "video",
 }
+RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
 SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
+SAVED_KEYS = [
+    *("args", "agent", "optimizer", "updates", "pretrained", "buffer", "demos"),
+    *("random", "cuda_random", "curve", "steps", "seconds"),
+]
 STORED_KEYS = [
     "observation",
     "desired_goal",
@@ -199,8 +206,8 @@ class Run:
         # Made before `load`, because making it draws random numbers.
         self.collector = self.make_collector()
 
-    def train(self) -> bool:
-        """Collect, learn and evaluate until the last step or Ctrl-C.
+    def train(self, stop: "StopSignal | None" = None) -> bool:
+        """Collect, learn and evaluate until the last step, or until told to stop.
 
         Returns:
             whether the last step was reached.
@@ -210,10 +217,9 @@ class Run:
         if args.tensorboard:
             loggers.append(TensorboardLogger("tensorboard", log_dir=str(out)))
         started = time.perf_counter() - self.seconds
-        stop = StopSignal()
         if not self.pretrain(stop):
             return False
-        if not args.total_steps:
+        if self.steps >= args.total_steps:  # none wanted, or resumed at the end
             return True
         progress = tqdm(
             initial=self.steps,
@@ -243,7 +249,7 @@ class Run:
         progress.close()
         return self.steps >= args.total_steps
 
-    def pretrain(self, stop: "StopSignal") -> bool:
+    def pretrain(self, stop: "StopSignal | None") -> bool:
         """Imitate the demonstrations, if asked to, and evaluate.
 
         Returns:
@@ -264,6 +270,9 @@ class Run:
             progress.update()
             if self.pretrained % 1000 == 0:
                 progress.set_postfix(loss=f"{loss:.2g}")
+            if self.pretrained % self.args.save_interval == 0:
+                self.seconds = time.perf_counter() - started
+                replace(self.out / "resume.pt", self.save)
         progress.close()
         self.set_learning_rate(1.0)
         self.seconds = time.perf_counter() - started
@@ -311,7 +320,8 @@ class Run:
         for _ in range(due):
             if self.args.anneal_lr:
                 last = self.args.updates_per_step * self.args.total_steps
-                self.set_learning_rate(1 - self.agent.updates / last)
+                # The last iteration may go beyond the last step.
+                self.set_learning_rate(max(0.0, 1 - self.agent.updates / last))
             for key, loss in self.agent.update(*self.sample()).items():
                 losses.setdefault(key, []).append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
@@ -381,7 +391,7 @@ class Run:
         Raises:
             ValueError: it is the state of a run with other arguments, or damaged.
         """
-        state = read(path, "the state of a run", ["args"])
+        state = read(path, "the state of a run", SAVED_KEYS)
         ours, theirs = fixed(self.args), state["args"]
         differing = [
             f"{key} was {theirs.get(key)!r}, is {value!r}"
@@ -419,9 +429,13 @@ class StopSignal:
 
     def _receive(self, number: int, frame: object) -> None:
         self.received = True
+        self.release()
+        tqdm.write("stopping after this iteration; again to stop at once")
+
+    def release(self) -> None:
+        """Let the signals act as usual."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        tqdm.write("stopping after this iteration; again to stop at once")
 
     def __bool__(self) -> bool:
         return self.received
@@ -503,6 +517,15 @@ def check(args: Args, out: Path) -> None:
         )
     if args.resume and not (out / "resume.pt").exists():
         raise ValueError(f"there is no run to resume in {out}")
+    if not args.resume and any((out / name).exists() for name in RESULTS):
+        raise ValueError(
+            f"{out} holds a run: continue it with --resume, remove it, or choose "
+            "another folder with --out"
+        )
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"out must be a folder, got the file {out}")
+    if args.tensorboard and find_spec("tensorboard") is None:
+        raise ValueError("--tensorboard needs another package: pip install tensorboard")
     try:
         torch.zeros(1, device=args.device).item()
     except (RuntimeError, AssertionError, ImportError) as error:
@@ -525,16 +548,23 @@ def main(args: Args) -> None:
         (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
-    finished = run.train()
+    stop = StopSignal()
+    finished = run.train(stop)
+    stop.release()
     run.close()
     if finished and args.video:
         with torch_panda.make(
             args.env_id, num_envs=6, seed=args.seed, device=args.device
         ) as env:
-            record(env, run.agent.policy, out / "video.mp4")
+            try:
+                record(env, run.agent.policy, out / "video.mp4")
+            except KeyboardInterrupt:
+                print("no video")
     if run.curve:
         success = run.curve[-1]["success"]
         print(f"success {success:.0%} after {run.steps} steps; see {out}")
+    if not finished:
+        print(f"stopped and saved in {out}: the same command with --resume goes on")
 
 
 if __name__ == "__main__":

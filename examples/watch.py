@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import load_policy, read_checkpoint
-from experts import make_expert
+from experts import make_expert, prepare
 from limits import check_limits
 
 CELL = (240, 320)  # height and width [pixels]
@@ -47,11 +47,11 @@ def record(
 
     Raises:
         ValueError: the file's name ends otherwise.
-        OSError: its folder cannot be made.
+        OSError: the file could not be written.
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"a video's name must end in .mp4 or .gif, got {path.name!r}")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    prepare(path)
     frames = [
         draw(env, state, step)
         for step, state in enumerate(

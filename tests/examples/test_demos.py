@@ -110,6 +110,19 @@ class StopAfter:
         return self.left < 0
 
 
+def test_imitation_saves_in_between(tmp_path):
+    path = tmp_path / "demos.pt"
+    experts.main(experts.Args(episodes=4, num_envs=4, out=path))
+    options = {"total_steps": 0, "pretrain_updates": 40, "eval_episodes": 2}
+    args = Args(env_id="PandaPush-v1", demos=path, save_interval=12, **options)
+    training = Run(args, tmp_path)
+    saved = []
+    training.save = lambda file: saved.append(training.pretrained) or file.touch()
+    assert training.pretrain(None)
+    training.close()
+    assert saved == [12, 24, 36, 40]
+
+
 @pytest.mark.parametrize("algo", ["td3", "sac"])
 def test_imitation_goes_on_where_it_was_stopped(tmp_path, algo):
     path = tmp_path / "demos.pt"
@@ -159,7 +172,7 @@ def test_training_stores_demonstrations_apart(tmp_path):
     assert state["buffer"]["_storage"]["_len"] == 200
     assert state["agent"]["normalizer.count"] == 400
 
-    wrong = [*arguments, "--env-id", "PandaPickAndPlace-v1", "--out", out]
+    wrong = [*arguments, "--env-id", "PandaPickAndPlace-v1", "--out", tmp_path / "no"]
     refused = run("train", *wrong, check=False)
     assert refused.returncode == 1
     assert "observation has size 18, the task's has 19" in refused.stderr

@@ -100,10 +100,13 @@ def test_outputs_below_a_file(tmp_path, monkeypatch, script):
         script.main(script.Args(out=tmp_path / "file" / "out.gif"))
 
 
-def test_demonstrations_do_not_replace_a_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(experts, "play", must_not_play)
-    with pytest.raises(SystemExit, match=f"^cannot write to {tmp_path}$"):
-        experts.main(experts.Args(out=tmp_path))
+@pytest.mark.parametrize("script", [experts, watch])
+def test_outputs_do_not_replace_a_folder(tmp_path, monkeypatch, script):
+    monkeypatch.setattr(script, "play", must_not_play)
+    folder = tmp_path / "folder.gif"
+    folder.mkdir()
+    with pytest.raises(SystemExit, match=f"^cannot write to {folder}$"):
+        script.main(script.Args(out=folder))
 
 
 def test_training_below_a_file(tmp_path):

@@ -179,11 +179,18 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path):
             )
             assert equal, key
 
-    refused = run(
-        "train", *arguments, "--out", killed, "--resume", "--tau", 0.1, check=False
-    )
-    assert refused.returncode == 1
-    assert "tau was 0.05, is 0.1" in refused.stderr
+    for options, message in (
+        (("--resume", "--tau", 0.1), "tau was 0.05, is 0.1"),
+        ((), "holds a run: continue it with --resume"),
+    ):
+        refused = run("train", *arguments, "--out", killed, *options, check=False)
+        assert refused.returncode == 1
+        assert message in refused.stderr
+        assert "Traceback" not in refused.stderr
+    # It is over: nothing is left to do.
+    again = run("train", *arguments, "--out", killed, "--resume")
+    assert "after 600 steps" in again.stdout
+    assert read_curve(killed)[-1]["step"] == "600"
 
 
 @pytest.mark.parametrize(
@@ -220,8 +227,11 @@ def test_every_kind_of_run_goes_on_from_its_state(tmp_path, options):
     )
 
 
-def test_learning_rate_falls_to_0(tmp_path):
-    args = Args(total_steps=200, anneal_lr=True, num_envs=2, updates_per_step=0.1)
+# 150 steps end within an iteration, which is finished.
+@pytest.mark.parametrize(("total_steps", "falling"), [(200, 20), (150, 15)])
+def test_learning_rate_falls_to_0(tmp_path, total_steps, falling):
+    options = {"num_envs": 2, "updates_per_step": 0.1}
+    args = Args(total_steps=total_steps, anneal_lr=True, **options)
     training = Run(args, tmp_path)
     (group,) = training.agent.optimizer.param_groups
     rates = []
@@ -230,10 +240,11 @@ def test_learning_rate_falls_to_0(tmp_path):
     for data in training.collector:
         training.steps += data.numel()
         training.learn(data)
-        if training.steps == args.total_steps:
+        if training.steps >= args.total_steps:
             break
     training.close()
-    assert rates == pytest.approx([1e-3 * k / 20 for k in range(20, 0, -1)])
+    expected = [1e-3 * max(0, 1 - k / falling) for k in range(20)]
+    assert rates == pytest.approx(expected)
 
 
 def test_interrupt_saves(tmp_path):
@@ -243,6 +254,7 @@ def test_interrupt_saves(tmp_path):
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     assert "stopping after this iteration" in output
+    assert "with --resume goes on" in output
     steps = int(read_curve(tmp_path)[-1]["step"])
     assert torch.load(tmp_path / "resume.pt")["steps"] >= steps
     assert (tmp_path / "checkpoint.pt").exists()
@@ -257,6 +269,7 @@ def test_interrupt_saves(tmp_path):
         (("--demos", "nofile.pt"), "there is no file nofile.pt"),
         (("--pretrain-updates", "9"), "pretrain_updates needs demos to imitate"),
         (("--fine-inputs", "0.03"), "fine_inputs needs relative_inputs"),
+        (("--out", "/dev/null"), "out must be a folder, got the file /dev/null"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, arguments, message):
