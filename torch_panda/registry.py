@@ -96,7 +96,7 @@ def max_episode_steps(env_id: str) -> int:
 
 def _parts(env_id: str) -> tuple[str, str, str, str]:
     """Task, control, reward and version of an id."""
-    if env_id not in _ENVS:
+    if not isinstance(env_id, str) or env_id not in _ENVS:
         close = difflib.get_close_matches(str(env_id), ENV_IDS, n=3)
         hint = f"did you mean {' or '.join(close)}? " if close else ""
         raise ValueError(

@@ -86,8 +86,8 @@ class HindsightAugment(BufferTransform):
             single_env=single_env,
             seed=seed,
         )
-        if k < 1:
-            raise ValueError(f"k must be at least 1, got {k}.")
+        if k < 1 or not float(k).is_integer():
+            raise ValueError(f"k must be an integer of at least 1, got {k}.")
         if strategy == RANDOM:
             raise ValueError(
                 "HindsightAugment sees one episode at a time and cannot draw "

@@ -28,6 +28,8 @@ class BufferTransform(Transform):
     ) -> None:
         super().__init__()
         check_strategy(strategy)
+        if not callable(reward_fn):
+            raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
         self.strategy = strategy
         self.trajectory_key = trajectory_key
         self.single_env = single_env

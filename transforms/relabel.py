@@ -122,8 +122,10 @@ class HindsightRelabel(BufferTransform):
             raise ValueError(f"her_ratio must be within [0, 1], got {her_ratio}.")
         if unit not in ("row", "slice"):
             raise ValueError(f'unit must be "row" or "slice", got {unit!r}.')
-        if capacity is not None and capacity < 1:
-            raise ValueError(f"capacity must be positive, got {capacity}.")
+        if capacity is not None and not (
+            capacity >= 1 and float(capacity).is_integer()
+        ):
+            raise ValueError(f"capacity must be a positive integer, got {capacity}.")
         self.her_ratio = her_ratio
         self.unit = unit
         self._memory = GoalMemory(capacity)

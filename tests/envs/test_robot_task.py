@@ -308,6 +308,7 @@ def test_large_actions_are_clipped(env):
     [
         ({"num_envs": 0}, ValueError),
         ({"num_envs": "a"}, TypeError),
+        ({"num_envs": True}, TypeError),
         ({"num_threads": -1}, ValueError),
         ({"num_threads": 2.5}, TypeError),
         ({"seed": -1}, ValueError),
@@ -326,6 +327,12 @@ def test_bad_arguments(arguments, error):
 def test_bad_render_size(size):
     with pytest.raises(ValueError, match=r"size|width"):
         torch_panda.make("PandaReach-v1", from_pixels=True, render_size=size)
+
+
+@pytest.mark.parametrize("env_id", [None, 3, ["PandaPush-v1"]])
+def test_ids_are_text(env_id):
+    with pytest.raises(ValueError, match="unknown environment id"):
+        torch_panda.make(env_id)
 
 
 def test_unknown_id_suggests():

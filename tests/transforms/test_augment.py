@@ -179,7 +179,11 @@ def test_default_device():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"k": 0}, "k must be"), ({"strategy": "random"}, "one episode at a time")],
+    [
+        ({"k": 0}, "k must be"),
+        ({"k": 1.5}, "k must be an integer"),
+        ({"strategy": "random"}, "one episode at a time"),
+    ],
 )
 def test_bad_options_raise(options, message):
     with pytest.raises(ValueError, match=message):

@@ -32,7 +32,7 @@ from tests.transforms.identifiable import (
     reward_fn,
     terminated_fn,
 )
-from torch_panda.transforms import HindsightRelabel
+from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 STRATEGIES = ["future", "final", "episode", "random"]
 
@@ -171,6 +171,18 @@ def test_share_and_position_of_relabelled_rows(her_ratio):
     assert abs(mask.mean() - her_ratio) <= 4 * error / mask.numel() ** 0.5
     position = (mask.mean(0) - her_ratio).abs()
     assert (position <= 5 * error / len(mask) ** 0.5).all()
+
+
+@pytest.mark.parametrize("capacity", [0, 1.5, float("inf")])
+def test_capacity_is_a_number_of_rows(capacity):
+    with pytest.raises(ValueError, match="capacity must be a positive integer"):
+        HindsightRelabel(reward_fn, capacity=capacity)
+
+
+@pytest.mark.parametrize("transform", [HindsightRelabel, HindsightAugment])
+def test_reward_is_a_function(transform):
+    with pytest.raises(ValueError, match="reward_fn must be a function, got None"):
+        transform(None)
 
 
 @pytest.mark.parametrize("her_ratio", [-0.1, 1.1])

@@ -5,6 +5,7 @@ import operator
 import secrets
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -612,10 +613,10 @@ def _check_seed(seed: int) -> int:
 
 
 def _integer(name: str, value: int) -> int:
-    try:
-        return operator.index(value)
-    except TypeError:
-        raise TypeError(f"{name} must be an integer, got {value!r}") from None
+    if not isinstance(value, bool):  # torch takes these for no numbers of things
+        with suppress(TypeError):
+            return operator.index(value)
+    raise TypeError(f"{name} must be an integer, got {value!r}")
 
 
 def _check_device(device: torch.device | str | int | None) -> torch.device:
