@@ -270,7 +270,8 @@ class Run:
             progress.update()
             if self.pretrained % 1000 == 0:
                 progress.set_postfix(loss=f"{loss:.2g}")
-            if self.pretrained % self.args.save_interval == 0:
+            due = self.pretrained % self.args.save_interval == 0
+            if due and self.pretrained < count:  # the end is saved below
                 self.seconds = time.perf_counter() - started
                 replace(self.out / "resume.pt", self.save)
         progress.close()

@@ -73,13 +73,15 @@ def test_demonstrations_without_a_transition(tmp_path):
             train.read_demos(path, env)
 
 
-def test_damaged_state_of_a_run(tmp_path):
-    save(tmp_path / "resume.pt", b"hello")
+@pytest.mark.parametrize("content", [b"hello", {"args": {}}])
+def test_damaged_state_of_a_run(tmp_path, content):
+    save(tmp_path / "resume.pt", content)
+    before = (tmp_path / "resume.pt").read_bytes()
     refused = run("train", "--resume", "--out", tmp_path, check=False)
     assert refused.returncode == 1
     assert "resume.pt does not hold the state of a run, or is damaged" in refused.stderr
     assert "Traceback" not in refused.stderr
-    assert (tmp_path / "resume.pt").read_bytes() == b"hello"
+    assert (tmp_path / "resume.pt").read_bytes() == before
 
 
 def test_demonstrations_go_into_a_new_folder(tmp_path):

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
@@ -63,7 +64,7 @@ def test_a_folder_that_holds_no_run_is_named(runs, tmp_path, spoil):
 
 def test_no_run_and_no_place(runs, tmp_path):
     with pytest.raises(SystemExit, match=r"no run .* below nowhere$"):
-        plot.main(plot.Args(runs=[plot.Path("nowhere")], out=tmp_path / "curves.png"))
+        plot.main(plot.Args(runs=[Path("nowhere")], out=tmp_path / "curves.png"))
     (tmp_path / "file").touch()
     with pytest.raises(SystemExit, match=r"^cannot draw: \[Errno"):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "file" / "curves.png"))

@@ -613,7 +613,7 @@ def _check_seed(seed: int) -> int:
 
 
 def _integer(name: str, value: int) -> int:
-    if not isinstance(value, bool):  # torch takes these for no numbers of things
+    if not isinstance(value, bool):  # torch accepts none of these as a size
         with suppress(TypeError):
             return operator.index(value)
     raise TypeError(f"{name} must be an integer, got {value!r}")

@@ -27,8 +27,8 @@ def read_state(
             rotation; or there is none beside ``step_count``, which torchrl's
             `StepCounter` has, too.
     """
-    keys = set() if tensordict is None else {*tensordict.keys()}
-    if tensordict is None or not keys & (like.keys() - {"step_count"}):
+    physical = like.keys() - {"step_count"}
+    if tensordict is None or physical.isdisjoint(tensordict.keys()):
         raise ValueError(
             f"set_state=True needs a state with some of {', '.join(like)}; none came. "
             "torchrl's TransformedEnv and ParallelEnv do not pass states on: reset "
