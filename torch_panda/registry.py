@@ -7,7 +7,6 @@ from typing import Any
 import torch
 
 from torch_panda.bullet import ControlType
-from torch_panda.bullet.shapes import BLUE
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.robots import Panda
 from torch_panda.tasks import (
@@ -19,6 +18,12 @@ from torch_panda.tasks import (
     Slide,
     Stack,
     Task,
+)
+from torch_panda.versions import (
+    ROBOT_ARGUMENTS,
+    TASK_ARGUMENTS,
+    VERSIONS,
+    arguments_of,
 )
 
 _TASKS: dict[str, type[Task]] = {
@@ -33,21 +38,10 @@ _TASKS: dict[str, type[Task]] = {
 _BLOCKED_GRIPPER = ("Reach", "Push", "Slide")
 _CONTROL: dict[str, ControlType] = {"": "ee", "Joints": "joints"}
 _REWARD: dict[str, RewardType] = {"": "sparse", "Dense": "dense"}
-# The tasks' defaults are the paper's (-v1); this is where panda-gym 3.0.7 differs.
-_V3_ARGUMENTS: dict[str, dict[str, Any]] = {
-    "Slide": {
-        "goal_xy_range": 0.3,
-        "goal_x_offset": 0.4,
-        "table_length": 1.4,
-        "table_x_offset": -0.1,
-    },
-    "Stack": {"distance_threshold": 0.1, "per_object": False, "lower_color": BLUE},
-}
-_VERSIONS = ("v1", "v3")
 
 _ENVS = {
     f"Panda{task}{control}{reward}-{version}": (task, control, reward, version)
-    for task, control, reward, version in product(_TASKS, _CONTROL, _REWARD, _VERSIONS)
+    for task, control, reward, version in product(_TASKS, _CONTROL, _REWARD, VERSIONS)
 }
 
 ENV_IDS: tuple[str, ...] = tuple(_ENVS)
@@ -65,18 +59,23 @@ def make(
 ) -> RobotTaskEnv:
     """Make the environments of an id; see `RobotTaskEnv` for arguments and options.
 
-    ``-v1`` follows the paper (arXiv 2106.13687), ``-v3`` equals panda-gym 3.0.7.
+    ``-v1`` follows the paper (arXiv 2106.13687) with the physical constants of
+    panda-gym 1.1.0, ``-v3`` equals panda-gym 3.0.7; see `torch_panda.versions`.
 
     Raises:
         ValueError: the id is unknown, or an argument is out of range.
     """
     task, control, reward, version = _parts(env_id)
-    arguments = _V3_ARGUMENTS.get(task, {}) if version == "v3" else {}
     return RobotTaskEnv(
         robot=Panda(
-            control_type=_CONTROL[control], block_gripper=task in _BLOCKED_GRIPPER
+            control_type=_CONTROL[control],
+            block_gripper=task in _BLOCKED_GRIPPER,
+            **arguments_of(ROBOT_ARGUMENTS[task], version),
         ),
-        task=_TASKS[task](reward_type=_REWARD[reward], **arguments),
+        task=_TASKS[task](
+            reward_type=_REWARD[reward],
+            **arguments_of(TASK_ARGUMENTS[task], version),
+        ),
         num_envs=num_envs,
         num_threads=num_threads,
         seed=seed,

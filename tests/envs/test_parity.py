@@ -1,4 +1,4 @@
-"""Every -v3 id against panda-gym 3.0.7, bit for bit."""
+"""-v1 against panda-gym 1.1.0 and every -v3 id against 3.0.7, bit for bit."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,9 @@ import torch
 from tensordict import TensorDict
 
 import torch_panda
+from tests.envs import record_panda_gym_1_1_0 as old
 from tests.panda_gym_reference import make_reference, start
+from torch_panda.bullet.built_world import BuiltWorld
 
 V3_IDS = [env_id for env_id in torch_panda.ENV_IDS if env_id.endswith("-v3")]
 STEPS = 60
@@ -47,12 +49,88 @@ def had_contact(reference):
     return any(sim.physics_client.getContactPoints(robot, body) for body in bodies)
 
 
-@pytest.mark.parametrize("env_id", [with_known_difference(i) for i in V3_IDS])
+def make_v1(task, **options):
+    """The -v1 id; Slide, of which the paper has other goals, with those of 1.1.0."""
+    if task != "Slide":
+        return torch_panda.make(f"Panda{task}-v1", **options)
+    return torch_panda.RobotTaskEnv(
+        robot=torch_panda.Panda(block_gripper=True),
+        task=torch_panda.Slide(
+            goal_xy_range=0.3,
+            goal_x_offset=0.4,
+            table_length=1.4,
+            table_x_offset=-0.1,
+        ),
+        **options,
+    )
+
+
+# One of Stack's recorded episodes differs, for the reason above: without the way back
+# to the built world, as a fresh client's first episode, it does not.
+DIFFERENT_AFTER_A_RESET = {"Stack": {3}}
+
+
+@pytest.mark.parametrize("is_fresh", [True, False], ids=["fresh", "reset"])
+@pytest.mark.parametrize("task", old.TASKS)
+def test_v1_equals_panda_gym_1_1_0(task, is_fresh, monkeypatch):
+    if is_fresh:
+        monkeypatch.setattr(BuiltWorld, "restore", lambda world: None)
+    with np.load(old.FILE) as file:
+        recorded = {
+            key.removeprefix(f"{task}/"): torch.from_numpy(file[key])
+            for key in file.files
+            if key.startswith(f"{task}/")
+        }
+    episodes, steps, _ = recorded["action"].shape
+    assert episodes >= 4
+    touched, grasped = (recorded[key].sum(1) for key in ("touched", "grasped"))
+    if task != "Reach":  # its episodes press on the table at most
+        assert touched.min() >= 9
+    if task in ("PickAndPlace", "Stack"):
+        assert grasped.min() >= 4
+    keys = ["observation", "achieved_goal"]
+    if task != "Stack":  # whose success is the paper's
+        keys += ["reward", "success"]
+    differing = set()
+    with make_v1(task, num_envs=episodes, seed=3) as env:
+        state = {
+            "object_pose": recorded["object_pose"],
+            "desired_goal": recorded["goal"],
+        }
+        td = env.reset(TensorDict(state, [episodes]), set_state=True)
+        assert torch.equal(td["observation"], recorded["start"])
+        for step in range(steps):
+            td = env.step(td.set("action", recorded["action"][:, step]))["next"]
+            for key in keys:
+                expected = recorded[key][:, step].reshape(td[key].shape)
+                unequal = (td[key].double() != expected.double()).any(-1)
+                differing.update(unequal.nonzero().flatten().tolist())
+    assert differing == (
+        set() if is_fresh else DIFFERENT_AFTER_A_RESET.get(task, set())
+    )
+
+
+def set_table_friction(reference, friction):
+    sim = reference.sim
+    table = sim._bodies_idx["table"]
+    sim.physics_client.changeDynamics(table, -1, lateralFriction=friction)
+
+
+# Flip came after 1.1.0: its -v1 has the cube of 3.0.7 on the table of 1.1.0.
+@pytest.mark.parametrize(
+    "env_id",
+    [*map(with_known_difference, V3_IDS), "PandaFlip-v1", "PandaFlipJoints-v1"],
+)
 def test_equals_panda_gym(env_id):
     episodes = 4
     contacts = 0
     with torch_panda.make(env_id, num_envs=episodes, seed=3) as env:
-        references = [make_reference(env_id) for _ in range(episodes)]
+        references = [
+            make_reference(env_id.replace("-v1", "-v3")) for _ in range(episodes)
+        ]
+        if env_id.endswith("-v1"):
+            for reference in references:
+                set_table_friction(reference, 0.1)
         rngs = [np.random.default_rng(k) for k in range(episodes)]
         starts = [start(references[k], seed=k) for k in range(episodes)]
         theirs = [observation for observation, _, _ in starts]
@@ -87,7 +165,8 @@ def test_equals_panda_gym(env_id):
                 ours["reward"], rewards, rtol=0.0, atol=tolerance
             )
             terminated = torch.tensor([[result[2]] for result in results])
-            assert torch.equal(ours["terminated"], terminated)
+            if env_id.endswith("-v3"):
+                assert torch.equal(ours["terminated"], terminated)
             assert torch.equal(ours["success"], terminated)
             contacts += sum(had_contact(reference) for reference in references)
         for reference in references:

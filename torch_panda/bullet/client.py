@@ -1,6 +1,7 @@
 """One DIRECT physics client of Bullet."""
 
 import importlib.util
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from ctypes import Array, byref, c_double, c_int, c_size_t, c_void_p
@@ -121,6 +122,12 @@ def find_urdf(path: str | Path) -> str:
         if candidate.is_file():
             return str(candidate)
     raise FileNotFoundError(f"no URDF file at {path}, nor at {shipped / path}")
+
+
+def _check_not_negative(**values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None and not 0 <= value < math.inf:
+            raise ValueError(f"{name} must be finite and at least 0, got {value}")
 
 
 def _check_collision_filters(file: str) -> None:
@@ -308,7 +315,12 @@ class PhysicsClient(Closing):
         lateral: float | None = None,
         spinning: float | None = None,
     ) -> None:
-        """Set friction coefficients of a link (-1 is the base); None leaves one."""
+        """Set friction coefficients of a link (-1 is the base); None leaves one.
+
+        Raises:
+            ValueError: one is negative or not finite.
+        """
+        _check_not_negative(lateral_friction=lateral, spinning_friction=spinning)
         command = _capi.dynamics_init(self._open())
         if lateral is not None:
             _capi.dynamics_set_lateral_friction(command, body, link, lateral)
@@ -586,6 +598,7 @@ class PhysicsClient(Closing):
         *,
         is_marker: bool = False,
     ) -> int:
+        _check_not_negative(mass=mass)
         collision = visual = -1
         if shape is not None:
             visual = self._create_visual_shape(shape, look, is_marker=is_marker)

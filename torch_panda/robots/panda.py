@@ -8,15 +8,13 @@ from torch import Tensor
 from torch_panda.bullet import ControlType, PhysicsClient, VectorSimulation
 from torch_panda.robots.base import Robot
 
-# All numbers from panda-gym 3.0.7.
+# The same in panda-gym 1.1.0 and 3.0.7.
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 JOINT_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 EE_LINK = 11
 # The hand's mount, where the real arm carries a force and torque sensor.
 WRIST_JOINT = 8
 FINGER_LINKS = (9, 10)
-FINGER_LATERAL_FRICTION = 1.0
-FINGER_SPINNING_FRICTION = 0.001
 # An action of 1 opens the fingers by this much [m].
 GRIPPER_SCALE = 0.2
 
@@ -33,6 +31,8 @@ class Panda(Robot):
         control_type: "ee" or "joints".
         block_gripper: keep the gripper closed.
         base_position: of the base, world frame [m].
+        finger_friction: lateral friction of the fingers.
+        finger_spinning_friction: of the fingers; None leaves what the URDF has, 0.1.
     """
 
     def __init__(
@@ -41,6 +41,8 @@ class Panda(Robot):
         control_type: ControlType = "ee",
         block_gripper: bool = False,
         base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+        finger_friction: float = 1.0,
+        finger_spinning_friction: float | None = None,
     ) -> None:
         super().__init__(
             urdf="franka_panda/panda.urdf",
@@ -54,6 +56,8 @@ class Panda(Robot):
             finger_links=FINGER_LINKS,
         )
         self.block_gripper = block_gripper
+        self.finger_friction = finger_friction
+        self.finger_spinning_friction = finger_spinning_friction
 
     @property
     def action_dim(self) -> int:
@@ -72,8 +76,8 @@ class Panda(Robot):
             client.set_friction(
                 body,
                 link,
-                lateral=FINGER_LATERAL_FRICTION,
-                spinning=FINGER_SPINNING_FRICTION,
+                lateral=self.finger_friction,
+                spinning=self.finger_spinning_friction,
             )
         return body
 

@@ -23,6 +23,7 @@ TABLE_LENGTH = 1.1  # [m], along x
 TABLE_X_OFFSET = -0.3  # [m], of its centre
 TABLE_WIDTH = 0.7  # [m]
 TABLE_HEIGHT = 0.4  # [m]
+TABLE_FRICTION = 0.1  # lateral, panda-gym 1.1.0's
 
 
 class Bodies(NamedTuple):
@@ -45,7 +46,8 @@ class Task(ABC):
     the state tensors of the simulation. Lengths are in metres, in the world frame.
 
     A task sets ``goal_dim``, ``observation_dim`` and, unless it is 50,
-    ``max_episode_steps``.
+    ``max_episode_steps``. Its numbers are by default those of the ids -v1;
+    `torch_panda.versions` has them beside those of -v3.
 
     Args:
         reward_type: "sparse": 0 on success and -1 otherwise; "dense": -distance.
@@ -151,20 +153,29 @@ def create_table(
     *,
     length: float = TABLE_LENGTH,
     x_offset: float = TABLE_X_OFFSET,
+    friction: float = TABLE_FRICTION,
 ) -> None:
-    """Create the ground, and a table centred at x = ``x_offset`` [m]."""
+    """Create the ground, and a table whose top is the plane z = 0.
+
+    Args:
+        client: where to.
+        length: of the table along x [m].
+        x_offset: x of its centre [m].
+        friction: its lateral friction. Bullet multiplies that of both bodies.
+    """
     client.create_box(
         (3.0, 3.0, 0.01),
         mass=0.0,
         position=(0.0, 0.0, -TABLE_HEIGHT - 0.01),
         look=Look(DARK_GREY, name="ground"),
     )
-    client.create_box(
+    table = client.create_box(
         (length / 2, TABLE_WIDTH / 2, TABLE_HEIGHT / 2),
         mass=0.0,
         position=(x_offset, 0.0, -TABLE_HEIGHT / 2),
         look=Look(LIGHT_GREY, name="table"),
     )
+    client.set_friction(table, lateral=friction)
 
 
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:

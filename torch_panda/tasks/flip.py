@@ -8,7 +8,14 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
-from torch_panda.tasks.base import NO_ROTATION, Bodies, RewardType, Task, create_table
+from torch_panda.tasks.base import (
+    NO_ROTATION,
+    TABLE_FRICTION,
+    Bodies,
+    RewardType,
+    Task,
+    create_table,
+)
 from torch_panda.tasks.push import CUBE, CUBE_SIZE, create_cube, sample_on_table
 
 # Where the target turns, out of the cube's way.
@@ -27,6 +34,9 @@ class Flip(Task):
         reward_type: "sparse" or "dense".
         distance_threshold: success is a distance below it.
         obj_xy_range: edge length of the square of start positions [m].
+        object_mass: of the cube [kg].
+        object_friction: lateral friction of the cube.
+        table_friction: lateral friction of the table.
     """
 
     goal_dim = 4
@@ -38,15 +48,24 @@ class Flip(Task):
         reward_type: RewardType = "sparse",
         distance_threshold: float = 0.2,
         obj_xy_range: float = 0.3,
+        object_mass: float = 1.0,
+        object_friction: float = 0.5,
+        table_friction: float = TABLE_FRICTION,
     ) -> None:
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.obj_xy_range = obj_xy_range
+        self.object_mass = object_mass
+        self.object_friction = object_friction
+        self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cube and the target."""
-        create_table(client)
+        create_table(client, friction=self.table_friction)
+        cube = create_cube(
+            client, mass=self.object_mass, friction=self.object_friction, look=LOOK
+        )
         return Bodies(
-            objects=(create_cube(client, look=LOOK),),
+            objects=(cube,),
             targets=(client.create_marker(TARGET_POSITION, CUBE, look=LOOK),),
         )
 

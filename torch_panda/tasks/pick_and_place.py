@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torch_panda.tasks.base import RewardType
+from torch_panda.tasks.base import TABLE_FRICTION, RewardType
 from torch_panda.tasks.push import CUBE_SIZE, Push, sample_on_table
 
-# Share of the goals that lie on the table, in the authors' code.
+# Fraction of the goals that lie on the table, in the authors' code.
 GOALS_ON_TABLE = 0.3
 
 
@@ -20,6 +20,9 @@ class PickAndPlace(Push):
         goal_xy_range: edge length of the goals' box along x and y [m].
         goal_z_range: height of the goals' box [m].
         obj_xy_range: edge length of the square of start positions [m].
+        object_mass: of the cube [kg].
+        object_friction: lateral friction of the cube.
+        table_friction: lateral friction of the table.
     """
 
     marker_height = 0.05
@@ -32,12 +35,18 @@ class PickAndPlace(Push):
         goal_xy_range: float = 0.3,
         goal_z_range: float = 0.2,
         obj_xy_range: float = 0.3,
+        object_mass: float = 2.0,
+        object_friction: float = 5.0,
+        table_friction: float = TABLE_FRICTION,
     ) -> None:
         super().__init__(
             reward_type=reward_type,
             distance_threshold=distance_threshold,
             goal_xy_range=goal_xy_range,
             obj_xy_range=obj_xy_range,
+            object_mass=object_mass,
+            object_friction=object_friction,
+            table_friction=table_friction,
         )
         self.goal_z_range = goal_z_range
 

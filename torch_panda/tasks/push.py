@@ -9,6 +9,7 @@ from torch_panda.bullet import Box, Look, PhysicsClient, VectorSimulation
 from torch_panda.bullet.shapes import GREEN
 from torch_panda.tasks.base import (
     NO_ROTATION,
+    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
@@ -17,7 +18,6 @@ from torch_panda.tasks.base import (
 )
 
 CUBE_SIZE = 0.04  # [m]
-CUBE_MASS = 1.0  # [kg]
 CUBE = Box((CUBE_SIZE / 2,) * 3)
 
 
@@ -29,6 +29,9 @@ class Push(Task):
         distance_threshold: success is a distance below it [m].
         goal_xy_range: edge length of the square of goals [m].
         obj_xy_range: edge length of the square of start positions [m].
+        object_mass: of the cube [kg].
+        object_friction: lateral friction of the cube.
+        table_friction: lateral friction of the table.
     """
 
     goal_dim = 3
@@ -43,16 +46,23 @@ class Push(Task):
         distance_threshold: float = 0.05,
         goal_xy_range: float = 0.3,
         obj_xy_range: float = 0.3,
+        object_mass: float = 2.0,
+        object_friction: float = 0.5,
+        table_friction: float = TABLE_FRICTION,
     ) -> None:
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.goal_xy_range = goal_xy_range
         self.obj_xy_range = obj_xy_range
+        self.object_mass = object_mass
+        self.object_friction = object_friction
+        self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cube and the target."""
-        create_table(client)
+        create_table(client, friction=self.table_friction)
+        cube = create_cube(client, mass=self.object_mass, friction=self.object_friction)
         return Bodies(
-            objects=(create_cube(client),),
+            objects=(cube,),
             targets=(client.create_marker((0.0, 0.0, self.marker_height), CUBE),),
         )
 
@@ -77,13 +87,25 @@ class Push(Task):
 def create_cube(
     client: PhysicsClient,
     *,
-    mass: float = CUBE_MASS,
+    mass: float,
+    friction: float,
     x: float = 0.0,
     look: Look = Look(GREEN),  # noqa: B008 (frozen)
 ) -> int:
-    """Create a cube on the table and return its body id."""
-    position = (x, 0.0, CUBE_SIZE / 2)
-    return client.create_box(CUBE.half_extents, mass=mass, position=position, look=look)
+    """Create a cube on the table and return its body id.
+
+    Args:
+        client: where to.
+        mass: [kg].
+        friction: its lateral friction.
+        x: of its centre [m].
+        look: how it is drawn.
+    """
+    cube = client.create_box(
+        CUBE.half_extents, mass=mass, position=(x, 0.0, CUBE_SIZE / 2), look=look
+    )
+    client.set_friction(cube, lateral=friction)
+    return cube
 
 
 def sample_on_table(

@@ -6,7 +6,13 @@ import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation
-from torch_panda.tasks.base import Bodies, RewardType, Task, create_table
+from torch_panda.tasks.base import (
+    TABLE_FRICTION,
+    Bodies,
+    RewardType,
+    Task,
+    create_table,
+)
 
 MARKER = Sphere(0.02)
 
@@ -18,6 +24,7 @@ class Reach(Task):
         reward_type: "sparse" or "dense".
         distance_threshold: success is a distance below it [m].
         goal_range: edge length of the cube [m].
+        table_friction: lateral friction of the table.
     """
 
     goal_dim = 3
@@ -29,13 +36,15 @@ class Reach(Task):
         reward_type: RewardType = "sparse",
         distance_threshold: float = 0.05,
         goal_range: float = 0.3,
+        table_friction: float = TABLE_FRICTION,
     ) -> None:
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.goal_range = goal_range
+        self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table and the target."""
-        create_table(client)
+        create_table(client, friction=self.table_friction)
         return Bodies(targets=(client.create_marker((0.0, 0.0, 0.0), MARKER),))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
     NO_ROTATION,
+    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
@@ -18,8 +19,6 @@ from torch_panda.tasks.push import sample_on_table
 
 PUCK_RADIUS = 0.03  # [m]
 PUCK_HEIGHT = 0.03  # [m]
-PUCK_MASS = 1.0  # [kg]
-PUCK_LATERAL_FRICTION = 0.04
 # Poses are given at this height, as in panda-gym; the puck drops 1.5 cm from there.
 PUCK_START_HEIGHT = 0.03  # [m]
 
@@ -38,6 +37,9 @@ class Slide(Task):
         obj_xy_range: edge length of the square of start positions [m].
         table_length: length of the table along x [m].
         table_x_offset: x of its centre [m].
+        object_mass: of the puck [kg].
+        object_friction: lateral friction of the puck.
+        table_friction: lateral friction of the table.
     """
 
     goal_dim = 3
@@ -53,6 +55,9 @@ class Slide(Task):
         obj_xy_range: float = 0.3,
         table_length: float = 1.9,
         table_x_offset: float = 0.15,
+        object_mass: float = 2.0,
+        object_friction: float = 0.5,
+        table_friction: float = TABLE_FRICTION,
     ) -> None:
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.goal_xy_range = goal_xy_range
@@ -60,17 +65,25 @@ class Slide(Task):
         self.obj_xy_range = obj_xy_range
         self.table_length = table_length
         self.table_x_offset = table_x_offset
+        self.object_mass = object_mass
+        self.object_friction = object_friction
+        self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the puck and the target."""
-        create_table(client, length=self.table_length, x_offset=self.table_x_offset)
+        create_table(
+            client,
+            length=self.table_length,
+            x_offset=self.table_x_offset,
+            friction=self.table_friction,
+        )
         puck = client.create_cylinder(
             PUCK_RADIUS,
             PUCK_HEIGHT,
-            mass=PUCK_MASS,
+            mass=self.object_mass,
             position=(0.0, 0.0, PUCK_START_HEIGHT),
         )
-        client.set_friction(puck, lateral=PUCK_LATERAL_FRICTION)
+        client.set_friction(puck, lateral=self.object_friction)
         target = client.create_marker(
             (0.0, 0.0, PUCK_START_HEIGHT), Cylinder(PUCK_RADIUS, PUCK_HEIGHT)
         )

@@ -10,6 +10,7 @@ from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
 from torch_panda.bullet.shapes import GREEN, RED, Color
 from torch_panda.tasks.base import (
     NO_ROTATION,
+    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
@@ -18,8 +19,6 @@ from torch_panda.tasks.base import (
 )
 from torch_panda.tasks.push import CUBE, CUBE_SIZE, create_cube, sample_on_table
 
-LOWER_MASS = 2.0  # [kg]
-UPPER_MASS = 1.0  # [kg]
 LOWER_HEIGHT = CUBE_SIZE / 2  # [m], of the centre
 UPPER_HEIGHT = 3 * CUBE_SIZE / 2  # [m]
 
@@ -39,6 +38,9 @@ class Stack(Task):
         obj_xy_range: edge length of the square of start positions [m].
         lower_color: of the lower cube and its target.
         upper_color: of the upper cube and its target.
+        object_mass: of the lower and of the upper cube [kg].
+        object_friction: lateral friction of both cubes.
+        table_friction: lateral friction of the table.
     """
 
     goal_dim = 6
@@ -55,21 +57,33 @@ class Stack(Task):
         obj_xy_range: float = 0.3,
         lower_color: Color = RED,
         upper_color: Color = GREEN,
+        object_mass: tuple[float, float] = (2.0, 2.0),
+        object_friction: float = 5.0,
+        table_friction: float = TABLE_FRICTION,
     ) -> None:
         super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
         self.per_object = per_object
         self.goal_xy_range = goal_xy_range
         self.obj_xy_range = obj_xy_range
         self.lower_look, self.upper_look = Look(lower_color), Look(upper_color)
+        self.object_mass = object_mass
+        self.object_friction = object_friction
+        self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cubes, the lower one first, and their targets."""
-        create_table(client)
-        lower = create_cube(client, mass=LOWER_MASS, look=self.lower_look)
+        create_table(client, friction=self.table_friction)
+        lower_mass, upper_mass = self.object_mass
+        friction = self.object_friction
+        lower = create_cube(
+            client, mass=lower_mass, friction=friction, look=self.lower_look
+        )
         lower_target = client.create_marker(
             (0.0, 0.0, 0.05), CUBE, look=self.lower_look
         )
-        upper = create_cube(client, mass=UPPER_MASS, x=0.5, look=self.upper_look)
+        upper = create_cube(
+            client, mass=upper_mass, friction=friction, x=0.5, look=self.upper_look
+        )
         upper_target = client.create_marker(
             (0.5, 0.0, 0.05), CUBE, look=self.upper_look
         )
