@@ -1,5 +1,6 @@
 """Restoring a world: bodies are back, and Bullet has forgotten the rest."""
 
+import random
 from ctypes import c_double
 
 import pytest
@@ -90,4 +91,55 @@ def test_what_follows_does_not_depend_on_what_was(client):
             client.step()
             contacts.append(client.contact_points())
         ends.append((poses(client), contacts))
+    assert all(end == ends[0] for end in ends)
+
+
+def test_what_follows_is_what_follows_in_a_new_client():
+    def build(client):
+        client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
+        for k in range(6):
+            client.create_box(CUBE, mass=1.0, position=(0.5, 0.0, 0.02 + 0.04 * k))
+
+    def sweep(client):
+        arm, contacts = client.bodies[0], []
+        client.set_joints(arm, (0, 1, 3, 5), (-0.5, 0.6, -2.0, 2.6), (2.0, 0.5, 0, 0))
+        for _ in range(200):
+            client.step()
+            contacts.append(client.contact_points())
+        return poses(client), contacts
+
+    with PhysicsClient() as new, PhysicsClient() as used:
+        build(new)
+        build(used)
+        world = BuiltWorld(used)
+        for num_steps in (0, 7, 40, 300):
+            used.set_joint(used.bodies[0], 1, 1.2, 0.5)
+            used.step(num_steps)
+        world.restore()
+        assert sweep(used) == sweep(new)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cubes_that_fly_apart_do_so_again(seed):
+    """Where Bullet looks for pairs that have parted is one more thing it remembers."""
+    rng = random.Random(seed)
+    starts = [(0.1 * (k % 4), 0.1 * (k // 4), 0.03) for k in range(12)]
+    velocities = [
+        (rng.uniform(-2, 2), rng.uniform(-2, 2), rng.random()) for _ in starts
+    ]
+    with PhysicsClient() as client:
+        client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
+        cubes = [client.create_box(CUBE, mass=1.0, position=start) for start in starts]
+        world = BuiltWorld(client)
+        ends = []
+        for _ in range(8):
+            world.restore()
+            for cube, start, velocity in zip(cubes, starts, velocities, strict=True):
+                client.set_base(cube, start, linear_velocity=velocity)
+            client.step(200)
+            ends.append(poses(client))
+            for cube in cubes:
+                client.set_base(cube, [0.3 * rng.random() for _ in range(3)])
+            client.step(rng.randrange(1, 200))
     assert all(end == ends[0] for end in ends)

@@ -8,24 +8,10 @@ from tensordict import TensorDict
 import torch_panda
 from tests.envs import record_panda_gym_1_1_0 as old
 from tests.panda_gym_reference import make_reference, start
-from torch_panda.bullet.built_world import BuiltWorld
 
 V3_IDS = [env_id for env_id in torch_panda.ENV_IDS if env_id.endswith("-v3")]
 STEPS = 60
 KEYS = ("observation", "achieved_goal", "desired_goal")
-
-
-def with_known_difference(env_id):
-    """Stack: 6 of 120 such episodes differ. A reset cannot bring back one detail.
-
-    While Bullet loads a URDF it puts the links' boxes at other places than later, so
-    the first pairs of the arm's own links are found in an order that no later command
-    can repeat. It shows only where both cubes, the table and the arm are in contact.
-    """
-    if "Stack" not in env_id:
-        return env_id
-    reason = "the order of simultaneous contacts depends on Bullet's broad phase"
-    return pytest.param(env_id, marks=pytest.mark.xfail(reason=reason, strict=False))
 
 
 def choose_action(env_id, observation, rng, size):
@@ -65,16 +51,8 @@ def make_v1(task, **options):
     )
 
 
-# One of Stack's recorded episodes differs, for the reason above: without the way back
-# to the built world, as a fresh client's first episode, it does not.
-DIFFERENT_AFTER_A_RESET = {"Stack": {3}}
-
-
-@pytest.mark.parametrize("is_fresh", [True, False], ids=["fresh", "reset"])
 @pytest.mark.parametrize("task", old.TASKS)
-def test_v1_equals_panda_gym_1_1_0(task, is_fresh, monkeypatch):
-    if is_fresh:
-        monkeypatch.setattr(BuiltWorld, "restore", lambda world: None)
+def test_v1_equals_panda_gym_1_1_0(task):
     with np.load(old.FILE) as file:
         recorded = {
             key.removeprefix(f"{task}/"): torch.from_numpy(file[key])
@@ -105,9 +83,7 @@ def test_v1_equals_panda_gym_1_1_0(task, is_fresh, monkeypatch):
                 expected = recorded[key][:, step].reshape(td[key].shape)
                 unequal = (td[key].double() != expected.double()).any(-1)
                 differing.update(unequal.nonzero().flatten().tolist())
-    assert differing == (
-        set() if is_fresh else DIFFERENT_AFTER_A_RESET.get(task, set())
-    )
+    assert not differing
 
 
 def set_table_friction(reference, friction):
@@ -117,10 +93,7 @@ def set_table_friction(reference, friction):
 
 
 # Flip came after 1.1.0: its -v1 has the cube of 3.0.7 on the table of 1.1.0.
-@pytest.mark.parametrize(
-    "env_id",
-    [*map(with_known_difference, V3_IDS), "PandaFlip-v1", "PandaFlipJoints-v1"],
-)
+@pytest.mark.parametrize("env_id", [*V3_IDS, "PandaFlip-v1", "PandaFlipJoints-v1"])
 def test_equals_panda_gym(env_id):
     episodes = 4
     contacts = 0

@@ -48,6 +48,8 @@ CMD_CREATE_COLLISION_SHAPE_COMPLETED = 80
 CMD_CREATE_VISUAL_SHAPE_COMPLETED = 82
 CMD_CREATE_MULTI_BODY_COMPLETED = 84
 CMD_CUSTOM_COMMAND_COMPLETED = 89
+CMD_SAVE_STATE_COMPLETED = 93
+CMD_RESTORE_STATE_COMPLETED = 95
 CMD_PERFORM_COLLISION_DETECTION_COMPLETED = 112
 
 # enum eURDF_Flags
@@ -381,6 +383,12 @@ pose_set_joint_velocity = bind(
     c_int,
     c_double,
 )
+
+# Snapshots
+save_init = bind(_cheap, "b3SaveStateCommandInit", _command, _client)
+status_snapshot = bind(_cheap, "b3GetStatusGetStateId", c_int, _status)
+load_init = bind(_cheap, "b3LoadStateCommandInit", _command, _client)
+load_set_snapshot = bind(_cheap, "b3LoadStateSetStateId", c_int, _command, c_int)
 
 # Motors
 motor_init = bind(_cheap, "b3JointControlCommandInit2", _command, _client, c_int, c_int)

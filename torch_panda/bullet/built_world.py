@@ -7,11 +7,14 @@ happened before. The broad phase holds
 * the pairs whose boxes overlap, in an order that additions and removals shuffle;
 * a tree of all boxes, whose shape decides the order of pairs that are found together;
 * a counter of collision detections, whose bits pick the leaf of the tree that each
-  detection inserts anew.
+  detection inserts anew;
+* a mark in the order of pairs, from which each detection looks for pairs that overlap
+  no longer.
 
 No command resets them, so each is led back to where it was.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from torch_panda.bullet import _capi
@@ -19,7 +22,7 @@ from torch_panda.bullet.client import PhysicsClient, read_doubles
 
 # [m]; so much farther than the world is wide that a box put back lands beside those
 # that are back already, never among those that still wait.
-_FAR_AWAY = 10_000.0
+_FAR_AWAY = (0.0, 0.0, 10_000.0)
 # A detection reads one bit of the counter for each level of the tree. Trees of the
 # shipped tasks have up to 11 levels, but no episode of 120 changed with bits from 6 on.
 _DETECTION_CYCLE = 256
@@ -27,68 +30,106 @@ _DETECTION_CYCLE = 256
 _NOTHING = (0, 0)  # collision group and mask of what touches nothing
 
 
-class _Body(NamedTuple):
-    """A body as it was built."""
+class _Link(NamedTuple):
+    """A link as its body was built."""
 
     body: int
-    position: tuple[float, ...]  # of the base, world frame [m]
-    orientation: tuple[float, ...]  # quaternion xyzw
-    joints: tuple[int, ...]  # the movable ones
-    joint_positions: tuple[float, ...]  # [rad] or [m]
-    filters: tuple[tuple[int, int, int], ...]  # link, collision group and mask
+    link: int
+    group_mask: tuple[int, int]  # collision group and mask
+    snapshot: int  # in which the link is where it entered the broad phase
 
 
 class BuiltWorld:
     """What a client has built so far, and the way back to it.
 
+    Bodies go back by snapshots, which leave the links' boxes where they are: a link
+    enters the broad phase anew when its collision filter is set, and no other one does.
+
     Args:
-        client: a client that will get no more bodies.
+        client: a client that will get no more bodies, and whose bodies have not moved
+            since they were built.
     """
 
     def __init__(self, client: PhysicsClient) -> None:
         self._client = client
-        self._bodies = tuple(_read(client, body) for body in client.bodies)
+        self._num_detections = client.num_detections
+        self._links: list[_Link] = []
+        bodies = {body: _read_poses(client, body) for body in client.bodies}
+        # A snapshot with contacts would detect collisions when it is loaded.
+        for body, poses in bodies.items():
+            for link in range(-1, len(poses) - 1):
+                client.set_collision_filter(body, link, *_NOTHING)
+        self._built = client.save()
+        for body, poses in bodies.items():
+            self._read_links(body, poses)
+        for body in bodies:
+            client.set_base(body, _FAR_AWAY)
+        self._away = client.save()
+        self.restore()
 
     def restore(self) -> None:
         """Put all bodies where they were built, and make Bullet forget the rest.
 
-        Takes each body out of the broad phase and puts them back one by one, in the
+        Takes each link out of the broad phase and puts them back one by one, in the
         order in which they were built. What is put in anew has no overlaps and no
         contacts, and once nothing of the old tree is near, the tree of what is back
         depends on the way back alone.
         """
         client = self._client
-        for body, (
-            x,
-            y,
-            z,
-        ), orientation, joints, joint_positions, filters in self._bodies:
-            if joints:
-                client.set_joints(body, joints, joint_positions, (0.0,) * len(joints))
-            client.set_base(body, (x, y, z + _FAR_AWAY), orientation)
-            # Links of one body overlap wherever it is, unless they touch nothing.
-            for link, _, _ in filters:
-                client.set_collision_filter(body, link, *_NOTHING)
+        client.load(self._away)
+        # Links overlap there, too, unless they touch nothing.
+        for body, link, _, _ in self._links:
+            client.set_collision_filter(body, link, *_NOTHING)
+        # A detection that finds a single pair puts the mark at the first one.
+        pair = client.bodies[:2]
+        for body in pair:
+            client.set_collision_filter(body, -1, *_capi.FILTER_DYNAMIC)
+        client.detect_collisions()
+        for body in pair:
+            client.set_collision_filter(body, -1, *_NOTHING)
         # Cheap here, where nothing overlaps: about 1 us each.
-        client.detect_collisions(-client.num_detections % _DETECTION_CYCLE)
-        for body, position, orientation, _, _, filters in self._bodies:
-            client.set_base(body, position, orientation)
-            for link, group, mask in filters:
-                client.set_collision_filter(body, link, group, mask)
+        past = client.num_detections - self._num_detections
+        client.detect_collisions(-past % _DETECTION_CYCLE)
+        for body, link, group_mask, snapshot in self._links:
+            client.load(snapshot)
+            client.set_collision_filter(body, link, *group_mask)
+        client.load(self._built)
+
+    def _read_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
+        """Find how the loader added a body's base and links to the broad phase.
+
+        It adds each one with its centre of mass at the origin of its frame, and when it
+        has added the last, moves them to their places, but not their boxes. That it
+        also turns those whose inertial frame is turned, as in no shipped robot, is not
+        repeated: then what follows is always the same, but not as in a new client.
+        """
+        client, base = self._client, poses[0]
+        for link, pose in enumerate(poses, start=-1):
+            snapshot = self._built
+            offset = _rotate(pose[3:], client.centre_of_mass(body, link))
+            if any(offset):
+                x, y, z = (x - dx for x, dx in zip(base[:3], offset, strict=True))
+                client.set_base(body, (x, y, z), base[3:])
+                snapshot = client.save()
+            is_static = link == -1 and not client.mass(body)
+            group_mask = _capi.FILTER_STATIC if is_static else _capi.FILTER_DYNAMIC
+            self._links.append(_Link(body, link, group_mask, snapshot))
 
 
-def _read(client: PhysicsClient, body: int) -> _Body:
-    joints = client.joints(body)
-    movable = tuple(joint.index for joint in joints if joint.is_movable)
-    state = client.state(body)
-    pose = read_doubles(state.q, 7)
-    base = _capi.FILTER_DYNAMIC if client.mass(body) else _capi.FILTER_STATIC
-    links = ((joint.index, *_capi.FILTER_DYNAMIC) for joint in joints)
-    return _Body(
-        body=body,
-        position=pose[:3],
-        orientation=pose[3:],
-        joints=movable,
-        joint_positions=read_doubles(state.joint_positions, len(movable)),
-        filters=((-1, *base), *links),
-    )
+def _read_poses(client: PhysicsClient, body: int) -> list[tuple[float, ...]]:
+    """Poses of the centres of mass of a body's base and links."""
+    state, joints = client.state(body), client.joints(body)
+    addresses = [state.q, *(state.link_pose(joint.index) for joint in joints)]
+    return [read_doubles(address, 7) for address in addresses]
+
+
+def _rotate(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:
+    """Rotate a vector by a quaternion xyzw."""
+    x, y, z, w = quaternion
+    a, b, c = vector
+    p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return [
+        a + w * p + y * r - z * q,
+        b + w * q + z * p - x * r,
+        c + w * r + x * q - y * p,
+    ]

@@ -343,13 +343,20 @@ class PhysicsClient(Closing):
 
     def mass(self, body: int, link: int = -1) -> float:
         """Mass of a link (-1 is the base) [kg]; 0 for a base that cannot move."""
+        return float(self._dynamics(body, link).mass)
+
+    def centre_of_mass(self, body: int, link: int = -1) -> tuple[float, ...]:
+        """Centre of mass of a link (-1 is the base) in the frame of its URDF [m]."""
+        return tuple(self._dynamics(body, link).local_inertial_frame[:3])
+
+    def _dynamics(self, body: int, link: int) -> _capi.DynamicsInfo:
         command = _capi.dynamics_info_init(self._open(), body, link)
         status = self._submit(
-            command, _capi.CMD_GET_DYNAMICS_INFO_COMPLETED, "report a mass"
+            command, _capi.CMD_GET_DYNAMICS_INFO_COMPLETED, "report dynamics"
         )
         info = _capi.DynamicsInfo()
         _capi.dynamics_info(status, byref(info))
-        return float(info.mass)
+        return info
 
     def joints(self, body: int) -> list[Joint]:
         """The joints of a body, in the order of its URDF."""
@@ -409,6 +416,22 @@ class PhysicsClient(Closing):
         _capi.pose_set_position(command, *position)
         _capi.pose_set_orientation(command, *orientation)
         self._submit(command, _capi.CMD_CLIENT_COMMAND_COMPLETED, "set a base pose")
+
+    def save(self) -> int:
+        """Take a snapshot of all poses, velocities and contacts; return its id."""
+        command = _capi.save_init(self._open())
+        status = self._submit(command, _capi.CMD_SAVE_STATE_COMPLETED, "save a state")
+        return int(_capi.status_snapshot(status))
+
+    def load(self, snapshot: int) -> None:
+        """Put everything where it was in a snapshot that was taken without contacts.
+
+        Other than `set_base` it leaves the links' boxes, from which Bullet's broad
+        phase finds overlaps, where they are until the next collision detection.
+        """
+        command = _capi.load_init(self._open())
+        _capi.load_set_snapshot(command, snapshot)
+        self._submit(command, _capi.CMD_RESTORE_STATE_COMPLETED, "load a state")
 
     def control_joints(self, body: int, targets: int, forces: Array[c_double]) -> None:
         """Drive all movable joints to target positions.
