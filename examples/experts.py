@@ -10,8 +10,9 @@ frame [m]; an action of 1 displaces the end-effector by 5 cm.
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 import torch
@@ -25,7 +26,18 @@ import torch_panda
 from evaluate import wilson_interval
 from flip_expert import flip
 from limits import check_limits
-from moves import CUBE, carry, go_over, go_to, is_held, norm, push_to, unit
+from moves import (
+    CUBE,
+    ROUGH,
+    carry,
+    drag_to,
+    go_over,
+    go_to,
+    is_held,
+    norm,
+    push_to,
+    unit,
+)
 
 # (observation, achieved_goal, desired_goal), each (..., size), to the action.
 Expert = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -59,8 +71,13 @@ def reach(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
 
 def push(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Push the cube to the goal."""
-    velocity = observation[..., 12:14]
-    return push_to(observation[..., :3], achieved_goal, velocity, desired_goal)
+    ee, velocity = observation[..., :3], observation[..., 12:14]
+    return push_to(ee, achieved_goal, velocity, desired_goal, ROUGH)
+
+
+def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """Drag the cube to the goal, pressing on it: struck, it would slide too far."""
+    return drag_to(observation[..., :3], achieved_goal, desired_goal)
 
 
 def pick_and_place(
@@ -94,63 +111,131 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
     finish = torch.where(stacked, 0.0, carry(ee, width, upper, top, clearance=0.06))
     finish = torch.where(leave, rise, finish)
 
-    apart = upper - lower
-    blocked = (apart[..., :2].abs() < apart.new_tensor((0.045, 0.085))).all(-1, True)
-    side = torch.where(apart[..., :1] > 0, 0.1, -0.1)
-    aside = torch.cat((lower[..., :1] + side, upper[..., 1:]), -1)
-    clear = push_to(ee, upper, observation[..., 25:27], aside)
+    # The fingers need room beside the lower cube, where it lies and where it goes.
+    room = upper.new_tensor((0.045, 0.085))
+
+    def crowds(point: Tensor) -> Tensor:
+        return ((upper - point)[..., :2].abs() < room).all(-1, True)
+
+    at = torch.where(crowds(lower) | placed, lower, goal)
+    apart = (upper - at)[..., :2]
+    along_x = apart[..., :1].abs() > apart[..., 1:].abs()
+    # `push_to` may leave it 3 cm short of there.
+    side = at[..., :2] + apart.sign() * apart.new_tensor((0.1, 0.125))
+    x, y, z = upper.split(1, -1)
+    x, y = (
+        torch.where(along_x, side[..., :1], x),
+        torch.where(along_x, y, side[..., 1:]),
+    )
+    aside = torch.cat((x, y, z), -1)
+    clear = push_to(ee, upper, observation[..., 25:27], aside, ROUGH)
     clear = torch.cat((clear, 0 * width - 1), -1)
-    start = torch.where(blocked & ~lower_held, clear, carry(ee, width, lower, goal))
-    return torch.where(placed, finish, start)
+    blocked = crowds(at) & ~(lower_held | upper_held) & (upper[..., 2:] < 0.03)
+    action = torch.where(placed, finish, carry(ee, width, lower, goal))
+    return torch.where(blocked, torch.where(leave, rise, clear), action)
 
 
 # How far the closed fingers reach along x and y from the end-effector, and the puck [m]
 FINGERS_X, FINGERS_Y, PUCK_RADIUS = 0.008, 0.0217, 0.029
-STRIKE_GAP = 0.008  # [m] between fingers and puck before the strike
-# Action of the strike for a puck that should move by `distance` until the episode ends,
-#   BIAS + DISTANCE * distance + STRETCH * r + STRETCH2 * r^2 + SIDE * |sin(direction)|,
-# r: how much farther than 0.6 m from the arm's base the puck is [m]. A least-squares
-# fit to 258 strikes of random strength (PandaSlide-v1, residual 0.03); BIAS is 0.006
-# above the fit, for the median puck stopped 9 mm short.
-BIAS, DISTANCE, STRETCH, STRETCH2, SIDE = 0.151, 0.593, 0.815, 4.6, -0.142
+STRIKE_GAP = 0.014  # [m] between fingers and puck before the strike
+STRIKE_HEIGHT = 0.02  # [m] of the end-effector
+# How strong a strike must be, and by how much the puck then leaves its direction [rad]:
+# polynomials in s, the root of the distance; x and y, the puck's place; n, the sine of
+# the direction ("sxn" is their product, "" is 1). Fits by fit_strike.py to strikes of
+# random strength: of others 90 % stop within 5 cm along the direction, 99 % across it.
+# The terms are those that a full cubic, of 35, could not spare.
+STRENGTH = {
+    "": 0.3047, "s": 0.5741, "x": 0.8988, "ss": 0.2025, "sn": -0.1505, "xn": -2.9521,
+    "yn": 0.6878, "sxx": 7.388, "sxn": 3.4006, "xxx": 22.7439,
+}  # fmt: skip
+DEVIATION = {
+    "": -0.0092, "xx": 1.5458, "xy": -4.1378, "xn": 3.2703, "yy": 1.8564,
+    "yn": -2.3399, "nn": 0.4009, "xyn": 8.9578, "xnn": -3.859, "ynn": 3.1839,
+}  # fmt: skip
+
+
+OVERSHOOT = 0.006  # [m], of such strikes at the median
+
+
+def strike_terms(
+    terms: Iterable[str], puck: Tensor, distance: Tensor, aim: Tensor, side: Tensor
+) -> Tensor:
+    """Terms of a polynomial for strikes, mirrored so that they go to the left.
+
+    Args:
+        terms: the variables of each, see `STRENGTH`.
+        puck: its position, (..., 3).
+        distance: how far it should slide [m], (..., 1).
+        aim: the direction of the strike, (..., 2).
+        side: 1 to the left and -1 to the right, (..., 1).
+
+    Returns:
+        (..., terms).
+    """
+    values = {
+        "s": distance.sqrt(),
+        "x": puck[..., :1],
+        "y": puck[..., 1:2] * side,
+        "n": aim[..., 1:] * side,
+    }
+    one = torch.ones_like(side)
+    return torch.cat([prod((values[v] for v in term), start=one) for term in terms], -1)
+
+
+def strike(
+    observation: Tensor, puck: Tensor, aim: Tensor, side: Tensor, strength: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The action that prepares a strike or does it, and whether it does, (..., 1).
+
+    A corner of the closed fingers strikes along ``aim``, from rest: then the speed at
+    which it meets the puck is always the same. For the others see `strike_terms`.
+    """
+    ee, ee_velocity = observation[..., :3], observation[..., 3:6]
+    corner = torch.cat((FINGERS_X + 0 * side, FINGERS_Y * side), -1)
+    behind = puck[..., :2] - corner - (PUCK_RADIUS + STRIKE_GAP) * aim
+    ready = torch.cat((behind, torch.full_like(side, STRIKE_HEIGHT)), -1)
+    set_up = (norm(ready - ee) < 0.001) & (norm(ee_velocity) < 0.05)
+    hit = torch.cat((aim * strength, (ready - ee)[..., 2:] / 0.05), -1)
+    action = torch.where(set_up, hit, go_over(ee, ready, 0.05))
+    moving = norm(observation[..., 12:14]) > 0.05
+    return torch.where(moving, 0.0, action), set_up & ~moving
 
 
 def slide(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Strike the puck once, with a corner of the fingers, so that it stops there.
 
-    The puck leaves along the line from the corner to its centre, hardly braked by
-    friction; the arm moves in jerks, so that one action from a known gap gives a
-    reproducible speed.
+    The puck leaves along the line from the corner to its centre, or nearly so.
     """
-    ee, ee_velocity = observation[..., :3], observation[..., 3:6]
-    offset = (desired_goal - achieved_goal)[..., :2]
-    distance, direction = norm(offset), unit(offset)
-    sine = direction[..., 1:]
-    corner = torch.cat((FINGERS_X + 0 * sine, FINGERS_Y * sine.sign()), -1)
-    contact = achieved_goal[..., :2] - PUCK_RADIUS * direction - corner
-    ready = contact - STRIKE_GAP * direction
-    ready = torch.cat((ready, torch.full_like(sine, 0.015)), -1)
-    base = observation.new_tensor((-0.6, 0.0))
-    r = norm(achieved_goal[..., :2] - base) - 0.6
-    amplitude = BIAS + DISTANCE * distance + r * (STRETCH + r * STRETCH2)
-    strike = direction * (amplitude + SIDE * sine.abs())
-    strike = torch.cat((strike, (ready - ee)[..., 2:] / 0.05), -1)
-    set_up = (norm(ready - ee) < 0.001) & (norm(ee_velocity) < 0.05)
-    action = torch.where(set_up, strike, go_over(ee, ready, 0.05))
-    moving = norm(observation[..., 12:14]) > 0.05
-    return torch.where(moving, 0.0, action)
+    puck, offset = achieved_goal, (desired_goal - achieved_goal)[..., :2]
+    direction = unit(offset)
+    distance = (norm(offset) - OVERSHOOT).clamp(min=0.01)
+    side = torch.where(direction[..., 1:] < 0, -1.0, 1.0)
+    left = torch.cat((-direction[..., 1:], direction[..., :1]), -1)
+
+    def evaluate(polynomial: dict[str, float], aim: Tensor) -> Tensor:
+        terms = strike_terms(polynomial, puck, distance, aim, side)
+        return (terms * terms.new_tensor([*polynomial.values()])).sum(-1, keepdim=True)
+
+    aim = direction
+    for _ in range(3):  # until the puck, leaving its aim, goes to the goal
+        aim = unit(direction - evaluate(DEVIATION, aim) * side * left)
+    return strike(observation, puck, aim, side, evaluate(STRENGTH, aim))[0]
 
 
 # ---- running them ----------------------------------------------------------------
 
 EXPERTS: dict[str, Expert] = {
     "Reach": reach,
-    "Push": push,
+    "Push": drag,
     "Slide": slide,
     "PickAndPlace": pick_and_place,
     "Stack": stack,
     "Flip": flip,
 }
+
+
+# On the rougher table of -v3 a cube can be pushed.
+V3_EXPERTS: dict[str, Expert] = EXPERTS | {"Push": push}
 
 
 def make_expert(env_id: str) -> TensorDictModule:
@@ -159,14 +244,15 @@ def make_expert(env_id: str) -> TensorDictModule:
     Raises:
         ValueError: there is no expert for it.
     """
-    match = re.fullmatch(r"Panda([A-Za-z]+?)(Dense)?-v[13]", env_id)
+    match = re.fullmatch(r"Panda([A-Za-z]+?)(Dense)?-v([13])", env_id)
     if match is None or match[1] not in EXPERTS:
         raise ValueError(
             f"no expert for {env_id!r}; accepted are "
             f"Panda{{{','.join(EXPERTS)}}}{{,Dense}}-v{{1,3}}"
         )
     keys = ["observation", "achieved_goal", "desired_goal"]
-    return TensorDictModule(EXPERTS[match[1]], keys, ["action"])
+    experts = EXPERTS if match[3] == "1" else V3_EXPERTS
+    return TensorDictModule(experts[match[1]], keys, ["action"])
 
 
 def play(

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from moves import CUBE, DECELERATION, GAIN, OPEN, norm, open_to, unit
+from moves import CUBE, GAIN, OPEN, ROUGH, norm, open_to, unit
 
 GRASP_ASIDE = 0.014  # [m] beside the cube's centre, so that its weight turns it
 CREEP, RELAX = 0.0012, -0.001  # the gripper's action until the cube turns, and then
@@ -114,7 +114,7 @@ def flip(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Te
     goal, offset = desired_goal, cube - ee
     speed, turning, one = norm(velocity), norm(spin), torch.ones_like(width)
     zero = torch.zeros_like(width)
-    rest = cube[..., :2] + velocity * speed / (2 * DECELERATION)
+    rest = cube[..., :2] + velocity * speed / (2 * ROUGH)
     rest = torch.cat((rest, cube[..., 2:]), -1)  # where it will have stopped
     distance = 1 - (achieved_goal * goal).sum(-1, keepdim=True).square()
     tumbling = (turning > 3) | (cube[..., 2:] > 0.025)

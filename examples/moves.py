@@ -10,8 +10,11 @@ from torch import Tensor
 GAIN = 0.8 / 0.05  # actions per metre: the arm covers 0.8 of an offset in a step
 GRIPPER = 0.2  # [m] that an action of 1 opens the fingers
 OPEN = 0.075  # [m], fingers' width before a grasp
-DECELERATION = 0.25 * 9.81  # [m/s^2] of a cube that slides on the table
 CUBE = 0.04  # [m], edge length
+# Deceleration of a cube that slides where friction is 0.5 * 0.5, as on the table of
+# -v3; on that of -v1 the cubes of Stack, with 5 * 0.1, stop still sooner [m/s^2].
+ROUGH = 0.25 * 9.81
+ON_TOP = 0.01  # [m] above an object's top: where the end-effector presses on it
 
 
 def norm(vector: Tensor) -> Tensor:
@@ -46,7 +49,9 @@ def go_over(
     return move(torch.cat((offset[..., :2] * free, rise), -1), limit)
 
 
-def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
+def push_to(
+    ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor, deceleration: float
+) -> Tensor:
     """Get behind a cube, seen from the goal, and push until it will slide there.
 
     Args:
@@ -54,6 +59,7 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
         cube: its position, (..., 3).
         velocity: of the cube along x and y [m/s], (..., 2).
         goal: where to push it, (..., 3).
+        deceleration: of the cube when it slides [m/s^2].
     """
     offset, beside, height = (goal - cube)[..., :2], (ee - cube)[..., :2], cube[..., 2:]
     distance, direction = norm(offset), unit(offset)
@@ -61,7 +67,7 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     lateral = beside - along * direction
     behind = torch.cat((cube[..., :2] - 0.06 * direction, height), -1)
     pushing = (along < -0.02) & (norm(lateral) < 0.02) & (ee[..., 2:] < height + 0.02)
-    left = distance - velocity.square().sum(-1, keepdim=True) / (2 * DECELERATION)
+    left = distance - velocity.square().sum(-1, keepdim=True) / (2 * deceleration)
     step = (0.5 * left).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
     # A cube within 3 cm is left alone: another approach would disturb it.
@@ -70,10 +76,27 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     return torch.where(done, 0.0, action)
 
 
+def drag_to(ee: Tensor, cube: Tensor, goal: Tensor) -> Tensor:
+    """Press on a cube from above and drag it: on a slippery table it follows.
+
+    Args:
+        ee: end-effector, (..., 3).
+        cube: its position, (..., 3).
+        goal: where to drag it, (..., 3).
+    """
+    beside, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE / 2 + ON_TOP
+    pressing = (norm(beside) < CUBE / 2) & (ee[..., 2:] < top + 0.004)
+    step = 0.6 * (goal - cube)[..., :2]
+    step = step / (norm(step) / 0.02).clamp(min=1.0)
+    drag = torch.cat((step, torch.full_like(top, -0.01)), -1) / 0.05
+    on_top = torch.cat((cube[..., :2], top - 0.003), -1)
+    return torch.where(pressing, drag, go_over(ee, on_top, 0.04))
+
+
 def is_held(ee: Tensor, width: Tensor, cube: Tensor) -> Tensor:
-    """Whether the fingers hold a cube; they may slide along y while they do."""
+    """Whether the fingers hold a cube, turned or not; it may slide along y."""
     offset = (cube - ee).abs() < ee.new_tensor((0.02, 0.04, 0.02))
-    return (width > 0.02) & (width < 0.05) & offset.all(-1, keepdim=True)
+    return (width > 0.02) & (width < 0.057) & offset.all(-1, keepdim=True)
 
 
 def open_to(width: Tensor, wanted: float) -> Tensor:

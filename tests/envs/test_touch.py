@@ -72,16 +72,17 @@ def test_lift_a_cube():
     contact, torque = td["finger_contact"], td["joint_torque"]
     assert td["observation"][9] > 0.15, "the cube must hang in the air"
     env.close()
-    # The cube, 1 kg, pulls the fingers down with its weight, and nowhere else: at rest
+    # The cube pulls the fingers down with its weight, and nowhere else: at rest
     # this holds to the cube's remaining acceleration, below 0.02 m/s^2.
-    weight = torch.tensor([0.0, 0.0, -1.0 * G])
+    cube = env.task.object_mass
+    weight = torch.tensor([0.0, 0.0, -cube * G])
     torch.testing.assert_close(contact.sum(0), weight, atol=0.02, rtol=0)
     # Each finger is pushed outwards as hard as its motor pushes inwards.
     assert contact[0, 1] * contact[1, 1] < 0
     torch.testing.assert_close(contact[:, 1].abs(), -torque[ARM:], rtol=0.01, atol=0)
     # The wrist bears the hand, then hand and cube. The arm holds still to 0.1 m/s^2.
     down = torch.tensor([0.0, 0.0, 1.0])
-    for measured, mass in ((free, HAND_MASS), (loaded, HAND_MASS + 1.0)):
+    for measured, mass in ((free, HAND_MASS), (loaded, HAND_MASS + cube)):
         torch.testing.assert_close(measured, mass * G * down, atol=0.1 * mass, rtol=0)
 
 
