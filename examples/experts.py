@@ -103,11 +103,16 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
         return torch.where(held, (error < 0.01) & (speed < 0.1), error < tolerance)
 
     placed = arrived(norm(lower - goal), lower_speed, lower_held, 0.025)
+    # What counts as success is not taken apart again.
+    good = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.04
+    placed = placed | good & ~lower_held
     stacked = arrived(norm(upper - top), upper_speed, upper_held, 0.02)
     to_lower, to_upper = norm(ee - lower), norm(ee - upper)
     leave = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
     leave = leave | stacked & (ee[..., 2:] < 0.15)
-    rise = torch.cat((0 * ee[..., :2], 1 + 0 * width, 0.4 + 0 * width), -1)
+    # Rising while the fingers open would take the cube along.
+    upwards = torch.where((width < 0.02) | (width > 0.06), 1.0, 0.0)
+    rise = torch.cat((0 * ee[..., :2], upwards, 0.4 + 0 * width), -1)
     finish = torch.where(stacked, 0.0, carry(ee, width, upper, top, clearance=0.06))
     finish = torch.where(leave, rise, finish)
 
@@ -121,7 +126,8 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
     apart = (upper - at)[..., :2]
     along_x = apart[..., :1].abs() > apart[..., 1:].abs()
     # `push_to` may leave it 3 cm short of there.
-    side = at[..., :2] + apart.sign() * apart.new_tensor((0.1, 0.125))
+    sign = torch.where(apart < 0, -1.0, 1.0)
+    side = at[..., :2] + sign * apart.new_tensor((0.1, 0.125))
     x, y, z = upper.split(1, -1)
     x, y = (
         torch.where(along_x, side[..., :1], x),
@@ -130,7 +136,8 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
     aside = torch.cat((x, y, z), -1)
     clear = push_to(ee, upper, observation[..., 25:27], aside, ROUGH)
     clear = torch.cat((clear, 0 * width - 1), -1)
-    blocked = crowds(at) & ~(lower_held | upper_held) & (upper[..., 2:] < 0.03)
+    on_top = upper[..., 2:] > 0.03
+    blocked = crowds(at) & ~(lower_held | upper_held | placed & on_top)
     action = torch.where(placed, finish, carry(ee, width, lower, goal))
     return torch.where(blocked, torch.where(leave, rise, clear), action)
 
