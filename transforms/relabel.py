@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import threading
+import warnings
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer, RoundRobinWriter
 
-from torch_panda.transforms.buffer_only import BufferTransform
-from torch_panda.transforms.memory import GoalMemory
-from torch_panda.transforms.rewrite import GoalFunction
-from torch_panda.transforms.strategies import LOOKING_AHEAD, Shares, Strategy
-from torch_panda.transforms.trajectories import (
-    TRAJECTORY_KEY,
-    Integers,
-    streams_of,
-    time_first,
-    time_last,
+from torch_panda.transforms.base import (
+    SERIAL_KEY,
+    BufferTransform,
+    calling_buffer,
+    samples_slices,
 )
-
-SERIAL_KEY = "hindsight_serial"
+from torch_panda.transforms.rewrite import GoalFunction
+from torch_panda.transforms.strategies import draw_uniform
+from torch_panda.transforms.trajectories import Integers
 
 
 class HindsightRelabel(BufferTransform):
@@ -33,62 +29,42 @@ class HindsightRelabel(BufferTransform):
     and step every transition belongs and what it achieved; on `sample` it relabels a
     random `her_ratio` of the rows. The others come out as they were stored.
 
-    A trajectory goes on in a later `extend` where a row of its id begins at the goal
-    that was achieved last. If the data lack the root achieved goal, or it is never
-    what the step before achieved, the id alone decides: call `end_trajectories` before
-    data of a new collector, whose ids begin anew. Loading a saved buffer does so.
+    A trajectory goes on where a row of its id begins at the goal that was achieved
+    last. If the data lack the root achieved goal, or it is never what the step before
+    achieved, the id alone decides: call `end_trajectories` before data of a new
+    collector, whose ids begin anew. Loading a saved buffer does so.
 
-    =====================  ====  ====  ====  ====  ====
-    k (goals a transition)    1     2     4     8    16
-    her_ratio = k / (k+1)   0.5  0.67   0.8  0.89  0.94
-    =====================  ====  ====  ====  ====  ====
+    Strategies are "future" (this step or a later one of the episode), "final" (its last
+    step), "episode" (any of its steps), "random" (any stored transition), where the
+    goal is what the step led to, ("next", achieved_goal); and "desired", the desired
+    goal of any stored transition.
 
     Args:
-        reward_fn: the environment's reward, called once for all the relabelled rows,
-            on the batch's device: (achieved_goal, desired_goal), each (n, *goal), to
-            (n, 1). A row's reward may depend on that row only.
-
-    Keyword Args:
-        her_ratio: share of the rows that are relabelled, in [0, 1].
-        strategy: where the goal is from: "future" (this step or a later one of the
-            same episode), "final" (its last step), "episode" (any of its steps),
-            "random" (any stored transition), or a function
-            `(step, first, end, generator) -> goal step`, see `strategies`. It is what
-            the step led to, ("next", achieved_goal), of what is stored of the episode.
-        goal_key: the desired goal, rewritten in the root and under "next".
-        achieved_goal_key: the achieved goal, read under "next" and, if there, in the
-            root.
-        reward_key: the reward.
-        terminated_fn: maps as `reward_fn` does to (n, 1) bool, for tasks that end on
-            success: also ("next", "terminated") and ("next", "done") are rewritten.
-            A `SliceSampler` puts the stored flags back, unless truncated_key=None.
-        trajectory_key: ids that tell trajectories apart. Data without them are taken
-            for [*batch, time], one environment a row, in the same order every time.
-        single_env: takes 1-d data without ids, and those of `add`, for consecutive
-            steps of one environment.
+        reward_fn: see `BufferTransform`, as for the options that are not named here.
+        her_ratio: fraction of the rows that are relabelled, in [0, 1]: k / (k + 1) for
+            the k goals a transition of the paper.
         unit: "row" draws a goal a row. "slice" gives all the rows of a slice (rows that
             follow each other in the batch and in time) one goal, drawn for its last
-            row: for recurrent and n-step learners on a `SliceSampler`.
-        capacity: transitions that the buffer holds. By default it is found out from
-            the samples, and needed only if the rows carry no "index", as in a plain
-            `ReplayBuffer`; then call `empty` after emptying the buffer, too.
-        seed: seeds a generator of its own. By default torch's is used.
+            row: for recurrent and n-step learners on a `SliceSampler`, which puts the
+            stored ends back, unless truncated_key=None.
+        capacity: transitions to remember if no buffer of torchrl's calls the transform;
+            otherwise the buffer tells.
+        goal_parts: sizes of the parts of a goal vector, e.g. (3, 3) for two objects.
+            Every part is relabelled with probability her_ratio, with a goal drawn for
+            it alone, whatever happens to the others (multi-criteria hindsight, Lanier
+            et al. 2019, arXiv 1906.03710).
+        **options: see `BufferTransform`.
 
     Raises:
         ValueError: an argument is out of range; the data do not tell which trajectory a
-            transition belongs to; a function returned the wrong shape; the transform
-            is put into an environment.
+            transition belongs to, or a new goal would contradict what is not rewritten
+            (see `checks`); a function returned the wrong shape; the transform is put
+            into an environment.
         KeyError: the data lack an entry that is needed; what is sampled was stored
             before the transform was in the buffer.
         RuntimeError: the buffer cannot be followed: it is not written round-robin,
-            shared between processes, or combined with `MultiStepTransform`.
-
-    Example:
-        >>> rb = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(1_000_000),
-        ...     transform=HindsightRelabel(env.compute_reward, her_ratio=0.8),
-        ...     batch_size=256,
-        ... )
+            shared between processes, combined with `MultiStepTransform`, or of other
+            dimensions than the data.
     """
 
     def __init__(
@@ -96,181 +72,168 @@ class HindsightRelabel(BufferTransform):
         reward_fn: GoalFunction,
         *,
         her_ratio: float = 0.8,
-        strategy: str | Strategy = "future",
-        goal_key: NestedKey = "desired_goal",
-        achieved_goal_key: NestedKey = "achieved_goal",
-        reward_key: NestedKey = ("next", "reward"),
-        terminated_fn: GoalFunction | None = None,
-        trajectory_key: NestedKey = TRAJECTORY_KEY,
-        single_env: bool = False,
         unit: Literal["row", "slice"] = "row",
         capacity: int | None = None,
-        seed: int | None = None,
+        goal_parts: tuple[int, ...] | None = None,
+        **options: Any,  # noqa: ANN401 (those of the base class)
     ) -> None:
-        super().__init__(
-            reward_fn,
-            strategy=strategy,
-            goal_key=goal_key,
-            achieved_goal_key=achieved_goal_key,
-            reward_key=reward_key,
-            terminated_fn=terminated_fn,
-            trajectory_key=trajectory_key,
-            single_env=single_env,
-            seed=seed,
-        )
+        super().__init__(reward_fn, **options)
         if not 0 <= her_ratio <= 1:
             raise ValueError(f"her_ratio must be within [0, 1], got {her_ratio}.")
         if unit not in ("row", "slice"):
             raise ValueError(f'unit must be "row" or "slice", got {unit!r}.')
-        if capacity is not None and not (
-            capacity >= 1 and float(capacity).is_integer()
-        ):
+        if capacity is not None and (capacity < 1 or not float(capacity).is_integer()):
             raise ValueError(f"capacity must be a positive integer, got {capacity}.")
+        if goal_parts is not None and (not goal_parts or min(goal_parts) < 1):
+            raise ValueError(f"goal_parts must be positive sizes, got {goal_parts!r}.")
         self.her_ratio = her_ratio
         self.unit = unit
-        self._memory = GoalMemory(capacity)
-        self._lock = threading.Lock()  # a prefetching buffer samples in threads
-
-    # -- a replay buffer's two calls --------------------------------------------------
+        self.capacity = capacity
+        self.goal_parts = goal_parts
+        self._has_warned = False
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        self._check_chain()
-        shape = tensordict.batch_size
-        with self._lock:
-            achieved = tensordict.get(self._rewriter.next_achieved_key, None)
-            done = tensordict.get(("next", "done"), None)
-            if self._memory.head == 0 or achieved is None or done is None:
-                self._rewriter.check(tensordict)
-            root = tensordict.get(self._rewriter.achieved_goal_key, None)
-            serial = self._memory.write(
-                streams_of(tensordict, self.trajectory_key, self.single_env),
-                time_first(done.reshape(shape), len(shape)),
-                time_first(achieved, len(shape)),
-                None if root is None else time_first(root, len(shape)),
-                unit=shape[:-1].numel(),
+        buffer, _ = self._writing_buffer()
+        capacity, dims = self.capacity, 1
+        if buffer is not None:
+            self._check_layout(buffer, tensordict)
+            capacity, dims = buffer.storage.max_size, buffer.storage.ndim
+        is_item = tensordict.ndim < dims  # one step
+        batch = tensordict.unsqueeze(-1) if is_item else tensordict
+        size = batch.get(self._rewriter.goal_key).shape[-1]
+        if self.goal_parts is not None and size != sum(self.goal_parts):
+            raise ValueError(
+                f"goal_parts must add up to the goal's size {size}: {self.goal_parts}."
             )
-        return tensordict.set(SERIAL_KEY, time_last(serial, shape))
+        with self._lock:
+            batch = self._note(batch, self._stored(buffer), capacity)
+        return batch.squeeze(-1) if is_item else batch
+
+    def _check_layout(self, buffer: ReplayBuffer, batch: TensorDictBase) -> None:
+        """Raises a RuntimeError if the buffer does not write rows in order of time."""
+        cannot = "HindsightRelabel cannot follow this buffer: "
+        if not isinstance(buffer.writer, RoundRobinWriter):
+            raise RuntimeError(
+                f"{cannot}{type(buffer.writer).__name__} does not write its rows one "
+                "after the other. Use the default, a round-robin writer."
+            )
+        ndim = buffer.storage.ndim
+        if batch.ndim not in (ndim - 1, ndim) or buffer.dim_extend != ndim - 1:
+            raise RuntimeError(
+                f"{cannot}data of shape {list(batch.shape)} cannot be told apart in a "
+                f"storage with ndim={ndim} (dim_extend={buffer.dim_extend}). Extend "
+                "with data.reshape(-1), or give the storage several dimensions, "
+                "ndim=2 for [num_envs, time], which a collector that extends the "
+                "buffer itself (replay_buffer=) needs."
+            )
+
+    def _stored(self, buffer: ReplayBuffer | None) -> int:
+        """Returns how many transitions the buffer holds."""
+        if buffer is not None:
+            return len(buffer.storage)
+        return min(self._memory.head, self.capacity or self._memory.head)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled."""
         tag = tensordict.get(SERIAL_KEY, None)
-        if tag is None:
-            raise KeyError(
-                "the sampled rows were not noted by HindsightRelabel, which does so on "
-                "extend: it must be in the buffer before the first one."
+        buffer, _ = calling_buffer()
+        if self.unit == "row" and not self._has_warned and samples_slices(buffer):
+            self._has_warned = True
+            warnings.warn(
+                "HindsightRelabel gives every row a goal of its own, so the rows of a "
+                'slice have several: pass unit="slice" for one goal a slice.',
+                stacklevel=2,
             )
-        serial = tag.cpu().numpy().reshape(-1)
         with self._lock:
-            floor = self._floor(serial, tensordict)
-            choose = self._choose_rows if self.unit == "row" else self._choose_slices
-            rows, last, share, place = choose(serial)
-            if not len(rows):
-                return tensordict.exclude(SERIAL_KEY)
-            goals = self._memory.draw(
-                last, self.strategy, share, floor, self._generator
-            )
-        if place is not None:
-            goals = goals[place]
-        device = tag.device
-        relabelled = self._rewriter.rewrite(
-            tensordict, torch.from_numpy(rows).to(device), goals.to(device)
-        )
-        return relabelled.del_(SERIAL_KEY)
+            floor = self._memory.head - self._stored(buffer)
+            if tag is None or floor < 0:
+                raise (KeyError if tag is None else RuntimeError)(
+                    "the buffer holds rows that HindsightRelabel has not noted: it "
+                    "must be in the buffer before the first extend(). Data that exist "
+                    "already are noted by prepare()."
+                )
+            self._check_data(tensordict)
+            rows, goals = self._draw(tag.cpu().numpy().reshape(-1), floor, tensordict)
+        if len(rows):
+            index = torch.from_numpy(rows).to(tag.device)
+            tensordict = self._rewriter.rewrite(tensordict, index, goals.to(tag.device))
+        return tensordict.exclude(SERIAL_KEY)
 
-    def _floor(self, serial: Integers, tensordict: TensorDictBase) -> int:
-        """Returns the serial from which on goals may be drawn."""
-        memory = self._memory
-        if memory.capacity is not None and self.strategy in LOOKING_AHEAD:
-            return memory.floor  # these strategies need no other
-        index = tensordict.get("index", None)
-        if index is not None:
-            return memory.observe(serial, index.reshape(-1).cpu().numpy())
-        if memory.capacity is None:
-            raise RuntimeError(
-                'the sampled rows have no "index": use a TensorDictReplayBuffer, or '
-                "pass capacity=, the number of transitions the buffer holds."
-            )
-        return memory.floor
+    def _draw(
+        self, serial: Integers, floor: int, batch: TensorDictBase
+    ) -> tuple[Integers, torch.Tensor]:
+        """Draws rows of a batch, (n,), and their new goals, (n, *goal).
 
-    def _choose(self, number: int) -> tuple[NDArray[np.bool_], Shares]:
-        """Chooses a random `her_ratio` of so many, and numbers to draw goals with."""
-        # The generator is the CPU's, so that a seed means the same on every device.
-        drawn = torch.rand(
-            number, generator=self._generator, dtype=torch.float64, device="cpu"
-        )
-        share = drawn.numpy()
-        # Those below the ratio are uniform up to it: no second draw is needed.
-        return share < self.her_ratio, share / (self.her_ratio or 1)
-
-    def _choose_rows(self, serial: Integers) -> tuple[Integers, Integers, Shares, None]:
-        """Chooses rows (n,) of a batch; returns also serials and shares, (n,) each."""
-        chosen, share = self._choose(len(serial))
-        chosen &= serial >= self._memory.floor  # the others were overwritten since
-        rows = chosen.nonzero()[0]
-        return rows, serial[rows], share[rows], None
-
-    def _choose_slices(
-        self, serial: Integers
-    ) -> tuple[Integers, Integers, Shares, Integers]:
-        """Chooses slices of a batch.
-
-        Returns:
-            Their rows, (n,), serials of their last rows and shares, (slices,) each, and
-            which of these slices every row is in, (n,).
+        Args:
+            serial: serials of the batch's rows.
+            floor: serial of the oldest transition that is stored.
+            batch: the rows, of any batch shape.
         """
-        floor = self._memory.floor
-        trajectory, step = self._memory.find(serial.clip(floor))
+        last, unit = serial, np.arange(len(serial))
+        if self.unit == "slice":
+            last, unit = self._slices(serial)
+        parts = self.goal_parts or (1,)
+        u = draw_uniform(len(parts) * len(last), self._generator)
+        chosen = u.reshape(len(parts), -1) < self.her_ratio
+        chosen[:, unit[serial < self._memory.freed]] = False  # overwritten since
+        rows = chosen.any(0)[unit].nonzero()[0]
+        own = batch.get(self._rewriter.goal_key)
+        goals = own.reshape(-1, *own.shape[batch.ndim :])[torch.from_numpy(rows)]
+        start = 0
+        for size, mask in zip(parts, chosen, strict=True):
+            drawn = self._memory.draw(
+                last[mask], self._weights, floor, self._generator
+            ).to(goals)
+            mine = mask[unit[rows]].nonzero()[0]
+            place = (mask.cumsum() - 1)[unit[rows[mine]]]
+            drawn = drawn[torch.from_numpy(place)]
+            if self.goal_parts is None:
+                return rows, drawn
+            part = slice(start, start := start + size)
+            goals[torch.from_numpy(mine), part] = drawn[:, part]
+        return rows, goals
+
+    def _slices(self, serial: Integers) -> tuple[Integers, Integers]:
+        """Returns the serials of slices' last rows, (m,), and every row's slice, (n,)."""
+        trajectory, step = self._memory.find(serial.clip(self._memory.freed))
         ahead = np.diff(step)
         # A padded slice repeats its last row: still the same slice.
         goes_on = (np.diff(trajectory) == 0) & ((ahead == 0) | (ahead == 1))
-        last = np.append(~goes_on, True)
-        ends = last.nonzero()[0]
-        slices = last.cumsum() - last
-        chosen, share = self._choose(len(ends))
-        chosen[slices[serial < floor]] = False
-        rows = chosen[slices].nonzero()[0]
-        place = (chosen.cumsum() - 1)[slices[rows]]
-        return rows, serial[ends[chosen]], share[chosen], place
+        is_last = np.append(~goes_on, True)
+        return serial[is_last], is_last.cumsum() - is_last
 
-    def end_trajectories(self) -> None:
-        """Ends all trajectories; what is written next begins new ones."""
-        with self._lock:
-            self._memory.end_trajectories()
+    def prepare(self, data: TensorDictBase) -> TensorDictBase:
+        """Notes transitions that exist already: a data set, or a buffer's storage.
 
-    def empty(self) -> None:
-        """Forgets all transitions, as after the buffer's own `empty`.
+        What is returned is sampled by a buffer with this transform:
+        `ReplayBuffer(storage=TensorStorage(relabel.prepare(data)), transform=relabel)`.
+        Memory-mapped entries stay where they are, and are only read; the goals are
+        noted in memory.
 
-        Buffers do not tell their transforms. Where the rows carry an "index" the next
-        sample shows it, unless a multiple of the capacity had been written.
+        Args:
+            data: transitions with trajectory ids, of any shape, in the order of time;
+                without ids [trajectories, time], one trajectory a row.
+
+        Returns:
+            The data, flat, with a tag; `data` itself is left as it is.
+
+        Raises:
+            ValueError: as the class.
+            KeyError: as the class.
+            RuntimeError: other transitions were noted before.
         """
+        if self._memory.head:
+            raise RuntimeError("prepare() must come before other transitions.")
+        flat = data.reshape(-1).copy()
+        noted = flat
+        if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
+            trajectory = torch.arange(len(flat), device="cpu") // data.shape[-1]
+            noted = flat.copy().set(self.trajectory_key, trajectory)
         with self._lock:
-            self._memory.clear()
-
-    # -- what torchrl's machinery asks for --------------------------------------------
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Returns the memory and the generator, for `state_dict` and `dumps`."""
-        with self._lock:
-            return {
-                "memory": self._memory.state(),
-                "generator": self._generator_state(),
-            }
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Takes what `get_extra_state` returned."""
-        with self._lock:
-            self._memory.load(state["memory"])
-            self._load_generator(state["generator"])
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = super().__getstate__()
-        del state["_lock"]
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._lock = threading.Lock()
+            tag = self._note(noted, 0, None).get(SERIAL_KEY)
+        self.end_trajectories()
+        return flat.set(SERIAL_KEY, tag)
 
     def __repr__(self) -> str:
         return (

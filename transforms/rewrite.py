@@ -17,41 +17,36 @@ GoalFunction = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass
 class Rewriter:
-    """Gives transitions another goal, reward and, if told how, another end.
+    """Gives transitions another goal, reward and, if told how, success and end.
 
-    Attributes:
-        reward_fn: maps (achieved_goal, desired_goal), (n, *goal) each, to (n, 1).
-        terminated_fn: the same for `terminated`, bool; None leaves the flags alone.
-        goal_key: the desired goal, in the root and under "next".
-        achieved_goal_key: the achieved goal, of which that under "next" is read here.
-        reward_key: the reward, from the root, e.g. ("next", "reward").
+    The functions map (achieved_goal, desired_goal), (n, *goal) each, to (n, 1); without
+    one of them what it would give is left alone. The keys are those of the root; both
+    goals are also under "next".
     """
 
     reward_fn: GoalFunction
+    success_fn: GoalFunction | None
     terminated_fn: GoalFunction | None
     goal_key: NestedKey
     achieved_goal_key: NestedKey
     reward_key: NestedKey
+    success_key: NestedKey
 
     def __post_init__(self) -> None:
         """Works out the keys under "next"."""
         self.goal_key = unravel_key(self.goal_key)
         self.reward_key = unravel_key(self.reward_key)
+        self.success_key = unravel_key(self.success_key)
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
+        goals = [self.goal_key, self.next_goal_key, self.next_achieved_key]
+        self._needed = [*goals, self.reward_key, _DONE]
+        self._needed += [self.success_key] if self.success_fn is not None else []
+        self._needed += [_TERMINATED] if self.terminated_fn is not None else []
 
     def check(self, batch: TensorDictBase) -> None:
         """Raises a KeyError that names the entries that are missing in the batch."""
-        needed = [
-            self.goal_key,
-            self.next_goal_key,
-            self.next_achieved_key,
-            self.reward_key,
-            _DONE,
-        ]
-        if self.terminated_fn is not None:
-            needed.append(_TERMINATED)
-        missing = [key for key in needed if batch.get(key, None) is None]
+        missing = [key for key in self._needed if batch.get(key, None) is None]
         if missing:
             raise KeyError(
                 f"hindsight relabelling needs {missing} in the data; found "
@@ -72,52 +67,61 @@ class Rewriter:
             goals: their new goals, (n, *goal).
 
         Raises:
-            ValueError: `reward_fn` or `terminated_fn` returned another shape, or
-                something else than a tensor.
+            ValueError: a function does not return a tensor of the right shape.
         """
         flat = batch if batch.ndim == 1 else batch.reshape(-1)
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
-        old = flat.get(self.goal_key)
-        if goals.dtype != old.dtype:
-            goals = goals.to(old.dtype)
-        next_old = flat.get(self.next_goal_key)
-        new = {
-            self.goal_key: old.index_copy(0, rows, goals),
-            self.next_goal_key: next_old.index_copy(0, rows, goals),
-        }
-        n = rows.shape[0]
+        old_goals = flat.get(self.goal_key)
+        goals = goals.to(old_goals.dtype)
+        new = {self.goal_key: goals, self.next_goal_key: goals}
         reward = flat.get(self.reward_key)
-        values = _check("reward_fn", self.reward_fn(achieved, goals), n, reward)
-        new[self.reward_key] = reward.index_copy(0, rows, values)
+        new[self.reward_key] = evaluate(
+            "reward_fn", self.reward_fn, achieved, goals, reward
+        )
+        if self.success_fn is not None:
+            success = flat.get(self.success_key)
+            new[self.success_key] = evaluate(
+                "success_fn", self.success_fn, achieved, goals, success
+            )
         if self.terminated_fn is not None:
+            end = "terminated_fn", self.terminated_fn, achieved
             done, terminated = flat.get(_DONE), flat.get(_TERMINATED)
             truncated = flat.get(_TRUNCATED, None)
             if truncated is None:  # what ended without terminating
                 truncated = done & ~terminated
-            values = self.terminated_fn(achieved, goals)
-            values = _check("terminated_fn", values, n, terminated)
-            new[_TERMINATED] = terminated.index_copy(0, rows, values)
-            values = values | truncated.index_select(0, rows)
-            new[_DONE] = done.index_copy(0, rows, values)
+            stays = terminated.index_select(0, rows)
+            if stays.any():  # unless the old goal is why it ended: a failure, say
+                old = old_goals.index_select(0, rows)
+                stays = stays & ~evaluate(*end, old, terminated)
+            new[_TERMINATED] = evaluate(*end, goals, terminated) | stays
+            new[_DONE] = new[_TERMINATED] | truncated.index_select(0, rows)
         result = batch.exclude(*new)  # a copy also of the tensordicts that hold these
-        for key, value in new.items():
+        for key, values in new.items():
+            value = flat.get(key).index_copy(0, rows, values)
             if flat is not batch:
                 value = value.reshape(*batch.shape, *value.shape[1:])
             result.set(key, value)
         return result
 
 
-def _check(function: str, values: Tensor, n: int, old: Tensor) -> Tensor:
-    """Returns what a function gave for n rows, in the type of the old values."""
-    expected = (n, *old.shape[1:])
+def evaluate(
+    name: str, function: GoalFunction, achieved: Tensor, desired: Tensor, old: Tensor
+) -> Tensor:
+    """Returns what a function gives for goals, (n, *goal) each, in the old type.
+
+    Raises:
+        ValueError: it is no tensor of shape (n, *) like the old values, (rows, *).
+    """
+    values = function(achieved, desired)
+    expected = (len(achieved), *old.shape[1:])
     if not isinstance(values, Tensor):
         raise ValueError(
-            f"{function} must return a tensor of shape {expected}, got "
+            f"{name} must return a tensor of shape {expected}, got "
             f"{type(values).__name__}."
         )
     if values.shape != expected:
         raise ValueError(
-            f"{function} must map (achieved_goal, desired_goal) of {n} transitions to "
-            f"shape {expected}, got {tuple(values.shape)}."
+            f"{name} must map (achieved_goal, desired_goal) of {len(achieved)} "
+            f"transitions to shape {expected}, got {tuple(values.shape)}."
         )
-    return values if values.dtype == old.dtype else values.to(old.dtype)
+    return values.to(old.dtype)

@@ -1,7 +1,8 @@
-"""Which trajectory every transition of a batch belongs to."""
+"""Which trajectory every transition belongs to."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,94 +13,124 @@ from torch import Tensor
 
 Integers = NDArray[np.integer[Any]]
 
-TRAJECTORY_KEY = ("collector", "traj_ids")
-
 
 class Runs(NamedTuple):
-    """Consecutive steps of one trajectory each, found in a batch sorted by stream.
+    """Consecutive steps of one trajectory each, found in a batch.
 
     Attributes:
-        start: first row of every run, shape (m,), int64.
-        length: number of rows of every run, shape (m,), int64.
-        stream: the stream of every run, m numbers.
-        ended: whether the run's last row ends its trajectory, shape (m,), bool.
+        order: the batch's rows, sorted by run and within a run by time, (n,).
+        start: place in `order` where every run begins, (m,).
+        length: number of rows of every run, (m,).
+        trajectory: the serial number of its trajectory's first transition, (m,).
     """
 
+    order: Integers
     start: Integers
     length: Integers
-    stream: list[int]
-    ended: NDArray[np.bool_]
+    trajectory: Integers
 
 
-def split_runs(stream: Integers, done: NDArray[np.bool_]) -> Runs:
-    """Cuts a sorted batch into runs: where the stream changes, and after every done.
+class TrajectoryTracker:
+    """Follows trajectories from batch to batch.
 
-    Args:
-        stream: what the transition comes from (a trajectory's or an environment's
-            number), shape (n,), sorted. Rows of one stream are in time order.
-        done: whether the transition ends its trajectory, shape (n,).
+    A row goes on with the trajectory of the row of its id before it, unless that one
+    was done, or had achieved another goal than this row begins with (ids begin anew
+    with every collector). If no row ever begins with the goal achieved before it, or
+    what it begins with is unknown, the ids alone decide.
+
+    Attributes:
+        count: transitions so far, which numbers them.
+        open: id -> trajectory that may go on.
     """
-    last = done.copy()
-    last[-1] = True
-    last[:-1] |= stream[1:] != stream[:-1]
-    ends = last.nonzero()[0]
-    start = np.zeros_like(ends)
-    start[1:] = ends[:-1] + 1
-    return Runs(start, ends + 1 - start, stream[ends].tolist(), done[ends])
 
+    def __init__(self) -> None:
+        self.count = 0
+        self.open: dict[int, int] = {}
+        self._has_roots = False
+        self._links = False  # whether a row ever began with the goal before it
 
-def find_strays(
-    order: Integers, before: Integers, achieved: Tensor, root: Tensor
-) -> Integers:
-    """Finds the rows after which the next one begins elsewhere than they got to.
+    def follow(
+        self,
+        ids: Tensor,
+        done: Tensor,
+        achieved: Tensor,
+        root: Tensor | None,
+        last_achieved: Callable[[list[int]], Tensor],
+    ) -> Runs:
+        """Finds the trajectories of a batch.
 
-    Args:
-        order: a batch's rows, sorted, (n,).
-        before: places in `order` of the rows to look at, (m,).
-        achieved: what every row achieved, (n, *goal).
-        root: what was achieved before it, (n, *goal).
+        Args:
+            ids: id of every row's trajectory or environment, (n,). The rows of an id
+                are in time order.
+            done: whether the row ends its trajectory, (n,), bool.
+            achieved: what the row achieved, (n, *goal).
+            root: what had been achieved before it, (n, *goal), None if unknown.
+            last_achieved: returns what trajectories achieved last, (k, *goal).
+        """
+        if self._has_roots != (root is not None):
+            self.open.clear()
+            self._has_roots = root is not None
+        unsorted_ids = ids.cpu().numpy()
+        order = unsorted_ids.argsort(kind="stable")
+        names, ends = unsorted_ids[order], done.cpu().numpy()[order]
+        is_head = np.ones(len(order), dtype=bool)  # the first row of its id
+        is_head[1:] = names[1:] != names[:-1]
+        known = np.full(len(order), -1)
+        known[is_head] = [self.open.pop(i, -1) for i in names[is_head].tolist()]
+        begins = known < 0
+        begins[1:] &= is_head[1:] | ends[:-1]
+        if root is not None:
+            inner = (~begins & ~is_head).nonzero()[0]
+            resumed = (known >= 0).nonzero()[0]
+            places = np.concatenate([inner, resumed])
+            before = achieved[torch.from_numpy(order[inner - 1])]
+            if len(resumed):
+                last = last_achieved(known[resumed].tolist())
+                before = torch.cat([before, last.to(before)])
+            after = root[torch.from_numpy(order[places])]
+            follows = (before == after).flatten(1).all(1).cpu().numpy()
+            self._links = self._links or bool(follows.any())
+            if self._links:
+                begins[places[~follows]] = True
+        start = (begins | is_head).nonzero()[0]
+        length = np.diff(start, append=len(order))
+        trajectory = np.where(begins, self.count + order, known)[start]
+        self.count += len(order)
+        last_rows = start + length - 1
+        for i, t, end in zip(names[start], trajectory, ends[last_rows], strict=True):
+            self.open[int(i)] = int(t)
+            if end:
+                del self.open[int(i)]
+        return Runs(order, start, length, trajectory)
 
-    Returns:
-        Those of the places `before`, (k,).
-    """
-    rows, following = (
-        torch.from_numpy(order[x]).to(root.device) for x in (before, before + 1)
-    )
-    return before[differ(achieved[rows], root[following])]
+    def state(self) -> dict[str, Any]:
+        """Returns a copy of everything, as numbers and dicts."""
+        return {**vars(self), "open": dict(self.open)}
 
-
-def differ(a: Tensor, b: Tensor) -> Integers:
-    """Returns the places, (m,), where goals, (n, *goal) each, are not the same."""
-    if torch.equal(a, b):  # as a rule, and much faster
-        return np.zeros(0, dtype=np.int64)
-    return (a != b).reshape(len(a), -1).any(1).cpu().numpy().nonzero()[0]
+    def load(self, state: dict[str, Any]) -> None:
+        """Takes the state that another tracker returned."""
+        vars(self).update(state, open=dict(state["open"]))
+        if not self._links:  # nothing would show that an id is used again
+            self.open.clear()
 
 
 def time_first(value: Tensor, batch_dims: int) -> Tensor:
     """Flattens [*batch, time, ...] to (time * batch, ...), time slowest.
 
-    That is the order in which a multi-dimensional storage fills up. One-dimensional
-    data keep their order, a single transition becomes one row.
+    That is the order in which a multi-dimensional storage fills up.
     """
-    if batch_dims == 0:
-        return value.unsqueeze(0)
     if batch_dims == 1:
         return value
     return value.movedim(batch_dims - 1, 0).flatten(0, batch_dims - 1)
 
 
 def time_last(value: Tensor, shape: torch.Size) -> Tensor:
-    """Undoes `time_first` for a batch of that shape: (n, ...) to (*shape, ...)."""
-    if not shape:
-        return value.squeeze(0)
-    if len(shape) == 1:
-        return value
-    value = value.view(shape[-1], *shape[:-1], *value.shape[1:])
-    return value.movedim(0, len(shape) - 1)
+    """Undoes `time_first` for a batch of that shape: (n,) to (*shape)."""
+    return value.view(shape[-1], *shape[:-1]).movedim(0, -1)
 
 
-def streams_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tensor:
-    """Returns the stream of every transition, in the order of `time_first`, (n,).
+def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tensor:
+    """Returns the id of every transition's trajectory, in `time_first` order, (n,).
 
     Args:
         batch: transitions of shape [*batch, time], or flattened.
@@ -112,8 +143,6 @@ def streams_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tenso
     """
     ids = batch.get(key, None)
     if ids is not None:
-        if ids.ndim == 1 and ids.shape == batch.shape:
-            return ids
         if ids.numel() != batch.numel():
             raise ValueError(
                 f"expected one trajectory id a transition under {key!r}, got shape "
@@ -129,5 +158,4 @@ def streams_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tenso
             "consecutive steps of one environment."
         )
     envs = batch.shape[:-1].numel()
-    steps = batch.shape[-1] if batch.ndim else 1
-    return torch.arange(envs, device="cpu").repeat(steps)
+    return torch.arange(envs, device="cpu").repeat(batch.shape[-1])

@@ -1,0 +1,121 @@
+"""Looking at the first batches for what another goal would contradict."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from tensordict import TensorDictBase
+
+from torch_panda.transforms.rewrite import Rewriter, evaluate
+
+# Rows of a batch that are looked at, and batches that are.
+MAX_ROWS, MAX_BATCHES = 128, 10
+# So many numbers, of two goals at least, do not coincide by chance.
+MIN_NUMBERS = 6
+
+
+class DataCheck:
+    """Refuses data in which a new goal would contradict what is not rewritten.
+
+    Only batches tell something whose rows were asked for several goals; the first ten
+    of these are looked at, as they were collected or sampled.
+
+    Args:
+        rewriter: knows the goals, the reward and their keys.
+    """
+
+    def __init__(self, rewriter: Rewriter) -> None:
+        self._rewriter = rewriter
+        self._batches = 0
+        self._has_warned = False
+
+    def __call__(self, batch: TensorDictBase) -> None:
+        """Looks at transitions, of any batch shape.
+
+        Raises:
+            ValueError: an entry holds a copy of the goal; the rewards are of several
+                steps, or `reward_fn`'s times a factor or plus a constant.
+        """
+        steps = batch.get("steps_to_next_obs", None)
+        if steps is not None and (steps != 1).any():
+            raise ValueError(
+                "the rewards are of several steps (steps_to_next_obs, as MultiStep "
+                "writes it): those of another goal cannot be told from one transition."
+                " Collect without that postproc; for n-step returns sample slices with "
+                'HindsightRelabel(unit="slice").'
+            )
+        if self._batches == MAX_BATCHES:
+            return
+        batch = batch.reshape(-1)
+        goals = batch.get(self._rewriter.goal_key)
+        if (goals != goals[:1]).any():
+            self._batches += 1
+            rows = batch[:: -(-len(batch) // MAX_ROWS)]
+            self._check_copies(rows)
+            self._check_rewards(rows)
+
+    def _check_copies(self, batch: TensorDictBase) -> None:
+        """Raises a ValueError if columns of an entry are always the desired goal."""
+        keys = self._rewriter
+        goals = batch.get(keys.goal_key)
+        achieved = batch.get(keys.achieved_goal_key, batch.get(keys.next_achieved_key))
+        # Where the goal is achieved, an observation may well say so.
+        is_open = (achieved != goals).flatten(1).any(1)
+        goals = goals.flatten(1)[is_open]
+        size = goals.shape[1]
+        if len(goals.unique(dim=0)) < max(2, MIN_NUMBERS / size):
+            return
+        for key, entry in batch.exclude("next", "action").items(True, True):
+            is_own = key in (keys.goal_key, keys.achieved_goal_key)
+            if is_own or entry.ndim != 2 or entry.shape[1] < size:
+                continue
+            windows = entry[is_open].to(goals.dtype).unfold(1, size, 1)
+            column = (windows == goals[:, None]).all(-1).all(0).nonzero()
+            if len(column):
+                raise ValueError(
+                    f"{key!r} holds a copy of {keys.goal_key!r} from column "
+                    f"{int(column[0])} on, which would stay as it is: do not "
+                    "concatenate in the environment that is collected from, but in the "
+                    "buffer, after this transform: "
+                    "rb.append_transform(CatTensors(..., del_keys=False))."
+                )
+
+    def _check_rewards(self, batch: TensorDictBase) -> None:
+        """Raises a ValueError if the rewards are `reward_fn`'s, scaled or shifted."""
+        keys = self._rewriter
+        old, goals = batch.get(keys.reward_key), batch.get(keys.goal_key)
+        achieved = batch.get(keys.next_achieved_key)
+        values = evaluate("reward_fn", keys.reward_fn, achieved, goals, old)
+        stored, expected = old.flatten().double(), values.flatten().double()
+        # Thresholds and distances may be measured to more precise goals: a thousandth
+        # of the largest reward, and 5 % of the rows, may differ.
+        tolerance = 1e-3 * float(expected.abs().max()) + 1e-6
+
+        def agree(other: torch.Tensor, tolerance: float) -> bool:
+            return bool(((stored - other).abs() > tolerance).double().mean() <= 0.05)
+
+        if agree(expected, tolerance):
+            return
+        low, high = expected.min(), expected.max()
+        at_low, at_high = (stored[expected == x].median() for x in (low, high))
+        factor, constant = 0.0, 0.0
+        if high > low:
+            factor = float((at_high - at_low) / (high - low))
+            constant = float(at_low) - factor * float(low)
+        elif low:  # as long as nothing succeeds: a factor is likelier than a constant
+            factor = float(at_low / low)
+        if factor and agree(factor * expected + constant, tolerance * abs(factor)):
+            raise ValueError(
+                f"the rewards are reward_fn's times {factor:.4g} plus {constant:.4g}, "
+                "as RewardScaling makes them: those of other goals would have another "
+                "scale. Scale in the buffer, after this transform, or in reward_fn."
+            )
+        if not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                "reward_fn gives other rewards than those in the data, e.g. "
+                f"{float(expected[0]):.4g} and {float(stored[0]):.4g}: relabelled rows "
+                "will have reward_fn's.",
+                stacklevel=2,
+            )
