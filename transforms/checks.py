@@ -20,9 +20,6 @@ class DataCheck:
 
     Only batches tell something whose rows were asked for several goals; the first ten
     of these are looked at, as they were collected or sampled.
-
-    Args:
-        rewriter: knows the goals, the reward and their keys.
     """
 
     def __init__(self, rewriter: Rewriter) -> None:
@@ -31,19 +28,13 @@ class DataCheck:
         self._has_warned = False
 
     def __call__(self, batch: TensorDictBase) -> None:
-        """Looks at transitions, of any batch shape.
-
-        Raises:
-            ValueError: an entry holds a copy of the goal; the rewards are of several
-                steps, or `reward_fn`'s times a factor or plus a constant.
-        """
+        """Looks at transitions, of any batch shape; a ValueError refuses them."""
         steps = batch.get("steps_to_next_obs", None)
         if steps is not None and (steps != 1).any():
             raise ValueError(
                 "the rewards are of several steps (steps_to_next_obs, as MultiStep "
-                "writes it): those of another goal cannot be told from one transition."
-                " Collect without that postproc; for n-step returns sample slices with "
-                'HindsightRelabel(unit="slice").'
+                "writes it), which cannot be told for another goal: collect without "
+                'that postproc, and sample slices with HindsightRelabel(unit="slice").'
             )
         if self._batches == MAX_BATCHES:
             return
@@ -56,7 +47,7 @@ class DataCheck:
             self._check_rewards(rows)
 
     def _check_copies(self, batch: TensorDictBase) -> None:
-        """Raises a ValueError if columns of an entry are always the desired goal."""
+        """Looks for entries of which some columns are always the desired goal."""
         keys = self._rewriter
         goals = batch.get(keys.goal_key)
         achieved = batch.get(keys.achieved_goal_key, batch.get(keys.next_achieved_key))
@@ -75,47 +66,41 @@ class DataCheck:
             if len(column):
                 raise ValueError(
                     f"{key!r} holds a copy of {keys.goal_key!r} from column "
-                    f"{int(column[0])} on, which would stay as it is: do not "
-                    "concatenate in the environment that is collected from, but in the "
-                    "buffer, after this transform: "
-                    "rb.append_transform(CatTensors(..., del_keys=False))."
+                    f"{int(column[0])} on, which another goal would contradict: do not "
+                    "concatenate in the environment, but in the buffer, after this "
+                    "transform: rb.append_transform(CatTensors(..., del_keys=False))."
                 )
 
     def _check_rewards(self, batch: TensorDictBase) -> None:
-        """Raises a ValueError if the rewards are `reward_fn`'s, scaled or shifted."""
+        """Looks for rewards that are `reward_fn`'s, times a factor plus a constant."""
         keys = self._rewriter
         old, goals = batch.get(keys.reward_key), batch.get(keys.goal_key)
-        achieved = batch.get(keys.next_achieved_key)
-        values = evaluate("reward_fn", keys.reward_fn, achieved, goals, old)
+        values = evaluate(keys.reward_fn, batch.get(keys.next_achieved_key), goals, old)
         stored, expected = old.flatten().double(), values.flatten().double()
         # Thresholds and distances may be measured to more precise goals: a thousandth
         # of the largest reward, and 5 % of the rows, may differ.
         tolerance = 1e-3 * float(expected.abs().max()) + 1e-6
 
-        def agree(other: torch.Tensor, tolerance: float) -> bool:
-            return bool(((stored - other).abs() > tolerance).double().mean() <= 0.05)
+        def differ(other: torch.Tensor, tolerance: float) -> bool:
+            return bool(((stored - other).abs() > tolerance).double().mean() > 0.05)
 
-        if agree(expected, tolerance):
+        if self._has_warned or not differ(expected, tolerance):
             return
         low, high = expected.min(), expected.max()
         at_low, at_high = (stored[expected == x].median() for x in (low, high))
-        factor, constant = 0.0, 0.0
-        if high > low:
-            factor = float((at_high - at_low) / (high - low))
-            constant = float(at_low) - factor * float(low)
-        elif low:  # as long as nothing succeeds: a factor is likelier than a constant
-            factor = float(at_low / low)
-        if factor and agree(factor * expected + constant, tolerance * abs(factor)):
+        factor = float((at_high - at_low) / (high - low).clamp(min=1e-12))
+        if low == high:  # as long as nothing succeeds: likelier than a constant
+            factor = float(at_low / low) if low else 0.0
+        constant = float(at_low) - factor * float(low)
+        if factor and not differ(factor * expected + constant, tolerance * abs(factor)):
             raise ValueError(
                 f"the rewards are reward_fn's times {factor:.4g} plus {constant:.4g}, "
-                "as RewardScaling makes them: those of other goals would have another "
-                "scale. Scale in the buffer, after this transform, or in reward_fn."
+                "as RewardScaling makes them; relabelled rows would have another scale."
+                " Scale in the buffer, after this transform, or in reward_fn."
             )
-        if not self._has_warned:
-            self._has_warned = True
-            warnings.warn(
-                "reward_fn gives other rewards than those in the data, e.g. "
-                f"{float(expected[0]):.4g} and {float(stored[0]):.4g}: relabelled rows "
-                "will have reward_fn's.",
-                stacklevel=2,
-            )
+        self._has_warned = True
+        warnings.warn(
+            f"reward_fn gives other rewards ({float(expected[0]):.4g}) than the data "
+            f"have ({float(stored[0]):.4g}): relabelled rows get reward_fn's.",
+            stacklevel=2,
+        )

@@ -10,12 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
-from torch_panda.transforms.base import (
-    SERIAL_KEY,
-    BufferTransform,
-    calling_buffer,
-    samples_slices,
-)
+from torch_panda.transforms.base import SERIAL_KEY, BufferTransform
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import draw_uniform
 from torch_panda.transforms.trajectories import Integers
@@ -24,15 +19,12 @@ from torch_panda.transforms.trajectories import Integers
 class HindsightRelabel(BufferTransform):
     """Gives sampled transitions goals that their trajectory achieved later.
 
-    Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495) for a
-    replay buffer of any layout: on `extend` the transform notes to which trajectory
-    and step every transition belongs and what it achieved; on `sample` it relabels a
-    random `her_ratio` of the rows. The others come out as they were stored.
-
-    A trajectory goes on where a row of its id begins at the goal that was achieved
-    last. If the data lack the root achieved goal, or it is never what the step before
-    achieved, the id alone decides: call `end_trajectories` before data of a new
-    collector, whose ids begin anew. Loading a saved buffer does so.
+    Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): `extend`
+    notes to which trajectory every transition belongs and what it achieved; `sample`
+    relabels a random `her_ratio` of the rows. The others come out as they were stored.
+    If the data lack the root achieved goal, or it is never what the step before
+    achieved, call `end_trajectories` before data of a new collector, whose ids begin
+    anew; otherwise it is seen. See README.md beside this file.
 
     Strategies are "future" (this step or a later one of the episode), "final" (its last
     step), "episode" (any of its steps), "random" (any stored transition), where the
@@ -40,31 +32,25 @@ class HindsightRelabel(BufferTransform):
     goal of any stored transition.
 
     Args:
-        reward_fn: see `BufferTransform`, as for the options that are not named here.
+        reward_fn: see `BufferTransform`, as for all options that are not named here.
         her_ratio: fraction of the rows that are relabelled, in [0, 1]: k / (k + 1) for
             the k goals a transition of the paper.
-        unit: "row" draws a goal a row. "slice" gives all the rows of a slice (rows that
-            follow each other in the batch and in time) one goal, drawn for its last
-            row: for recurrent and n-step learners on a `SliceSampler`, which puts the
-            stored ends back, unless truncated_key=None.
+        unit: "row" draws a goal a row, "slice" one for all rows of a slice (that follow
+            each other in the batch and in time), drawn for its last row: for learners
+            on a `SliceSampler`, which puts stored ends back unless truncated_key=None.
         capacity: transitions to remember if no buffer of torchrl's calls the transform;
             otherwise the buffer tells.
         goal_parts: sizes of the parts of a goal vector, e.g. (3, 3) for two objects.
             Every part is relabelled with probability her_ratio, with a goal drawn for
-            it alone, whatever happens to the others (multi-criteria hindsight, Lanier
-            et al. 2019, arXiv 1906.03710).
+            it alone (multi-criteria hindsight, Lanier et al. 2019, arXiv 1906.03710).
         **options: see `BufferTransform`.
 
     Raises:
-        ValueError: an argument is out of range; the data do not tell which trajectory a
-            transition belongs to, or a new goal would contradict what is not rewritten
-            (see `checks`); a function returned the wrong shape; the transform is put
-            into an environment.
-        KeyError: the data lack an entry that is needed; what is sampled was stored
-            before the transform was in the buffer.
-        RuntimeError: the buffer cannot be followed: it is not written round-robin,
-            shared between processes, combined with `MultiStepTransform`, or of other
-            dimensions than the data.
+        ValueError: an argument is out of range; the data do not tell their trajectories
+            or would contradict another goal, see `checks`; it is for an environment.
+        KeyError: the data lack an entry, or were not noted.
+        RuntimeError: the buffer cannot be followed: it is not written round-robin, is
+            shared, makes n-step rewards, or has other dimensions than the data.
     """
 
     def __init__(
@@ -75,7 +61,7 @@ class HindsightRelabel(BufferTransform):
         unit: Literal["row", "slice"] = "row",
         capacity: int | None = None,
         goal_parts: tuple[int, ...] | None = None,
-        **options: Any,  # noqa: ANN401 (those of the base class)
+        **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(reward_fn, **options)
         if not 0 <= her_ratio <= 1:
@@ -86,59 +72,43 @@ class HindsightRelabel(BufferTransform):
             raise ValueError(f"capacity must be a positive integer, got {capacity}.")
         if goal_parts is not None and (not goal_parts or min(goal_parts) < 1):
             raise ValueError(f"goal_parts must be positive sizes, got {goal_parts!r}.")
-        self.her_ratio = her_ratio
-        self.unit = unit
-        self.capacity = capacity
-        self.goal_parts = goal_parts
+        self.her_ratio, self.unit = her_ratio, unit
+        self.capacity, self.goal_parts = capacity, goal_parts
         self._has_warned = False
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        buffer, _ = self._writing_buffer()
-        capacity, dims = self.capacity, 1
+        buffer, _ = self._find_buffer()
+        is_item = not tensordict.ndim  # one step
         if buffer is not None:
-            self._check_layout(buffer, tensordict)
-            capacity, dims = buffer.storage.max_size, buffer.storage.ndim
-        is_item = tensordict.ndim < dims  # one step
+            ndim, writer = buffer.storage.ndim, type(buffer.writer)
+            fits = tensordict.ndim in (ndim - 1, ndim) and buffer.dim_extend == ndim - 1
+            if not fits or not issubclass(writer, RoundRobinWriter):
+                raise RuntimeError(
+                    "HindsightRelabel needs rows in order of time, written round-robin "
+                    f"(here: {writer.__name__}); got data of {list(tensordict.shape)} "
+                    f"for ndim={ndim}, dim_extend={buffer.dim_extend}: extend with "
+                    "data.reshape(-1), or use a storage of several dimensions, ndim=2 "
+                    "for [num_envs, time] (as collectors with replay_buffer= write)."
+                )
+            is_item = tensordict.ndim < ndim
         batch = tensordict.unsqueeze(-1) if is_item else tensordict
-        size = batch.get(self._rewriter.goal_key).shape[-1]
-        if self.goal_parts is not None and size != sum(self.goal_parts):
-            raise ValueError(
-                f"goal_parts must add up to the goal's size {size}: {self.goal_parts}."
-            )
+        capacity = self.capacity if buffer is None else buffer.storage.max_size
         with self._lock:
             batch = self._note(batch, self._stored(buffer), capacity)
         return batch.squeeze(-1) if is_item else batch
 
-    def _check_layout(self, buffer: ReplayBuffer, batch: TensorDictBase) -> None:
-        """Raises a RuntimeError if the buffer does not write rows in order of time."""
-        cannot = "HindsightRelabel cannot follow this buffer: "
-        if not isinstance(buffer.writer, RoundRobinWriter):
-            raise RuntimeError(
-                f"{cannot}{type(buffer.writer).__name__} does not write its rows one "
-                "after the other. Use the default, a round-robin writer."
-            )
-        ndim = buffer.storage.ndim
-        if batch.ndim not in (ndim - 1, ndim) or buffer.dim_extend != ndim - 1:
-            raise RuntimeError(
-                f"{cannot}data of shape {list(batch.shape)} cannot be told apart in a "
-                f"storage with ndim={ndim} (dim_extend={buffer.dim_extend}). Extend "
-                "with data.reshape(-1), or give the storage several dimensions, "
-                "ndim=2 for [num_envs, time], which a collector that extends the "
-                "buffer itself (replay_buffer=) needs."
-            )
-
     def _stored(self, buffer: ReplayBuffer | None) -> int:
         """Returns how many transitions the buffer holds."""
-        if buffer is not None:
-            return len(buffer.storage)
-        return min(self._memory.head, self.capacity or self._memory.head)
+        count = self._memory.tracker.count
+        stored = min(count, self.capacity or count)
+        return stored if buffer is None else len(buffer.storage)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled."""
         tag = tensordict.get(SERIAL_KEY, None)
-        buffer, _ = calling_buffer()
-        if self.unit == "row" and not self._has_warned and samples_slices(buffer):
+        buffer, is_sliced = self._find_buffer()
+        if is_sliced and self.unit == "row" and not self._has_warned:
             self._has_warned = True
             warnings.warn(
                 "HindsightRelabel gives every row a goal of its own, so the rows of a "
@@ -146,7 +116,7 @@ class HindsightRelabel(BufferTransform):
                 stacklevel=2,
             )
         with self._lock:
-            floor = self._memory.head - self._stored(buffer)
+            floor = self._memory.tracker.count - self._stored(buffer)
             if tag is None or floor < 0:
                 raise (KeyError if tag is None else RuntimeError)(
                     "the buffer holds rows that HindsightRelabel has not noted: it "
@@ -163,16 +133,14 @@ class HindsightRelabel(BufferTransform):
     def _draw(
         self, serial: Integers, floor: int, batch: TensorDictBase
     ) -> tuple[Integers, torch.Tensor]:
-        """Draws rows of a batch, (n,), and their new goals, (n, *goal).
-
-        Args:
-            serial: serials of the batch's rows.
-            floor: serial of the oldest transition that is stored.
-            batch: the rows, of any batch shape.
-        """
-        last, unit = serial, np.arange(len(serial))
+        """Draws rows of a batch of serials, (n,), and their new goals, (n, *goal)."""
+        last, unit = serial, np.arange(len(serial))  # last rows; unit of every row
         if self.unit == "slice":
-            last, unit = self._slices(serial)
+            trajectory, step = self._memory.find(serial.clip(self._memory.freed))
+            # A padded slice repeats its last row.
+            goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
+            is_last = np.append(~goes_on, True)
+            last, unit = serial[is_last], is_last.cumsum() - is_last
         parts = self.goal_parts or (1,)
         u = draw_uniform(len(parts) * len(last), self._generator)
         chosen = u.reshape(len(parts), -1) < self.her_ratio
@@ -182,34 +150,24 @@ class HindsightRelabel(BufferTransform):
         goals = own.reshape(-1, *own.shape[batch.ndim :])[torch.from_numpy(rows)]
         start = 0
         for size, mask in zip(parts, chosen, strict=True):
-            drawn = self._memory.draw(
-                last[mask], self._weights, floor, self._generator
-            ).to(goals)
+            drawn = self._memory.draw(last[mask], self._weights, floor, self._generator)
             mine = mask[unit[rows]].nonzero()[0]
             place = (mask.cumsum() - 1)[unit[rows[mine]]]
-            drawn = drawn[torch.from_numpy(place)]
+            drawn = drawn[torch.from_numpy(place)].to(goals)
             if self.goal_parts is None:
                 return rows, drawn
             part = slice(start, start := start + size)
             goals[torch.from_numpy(mine), part] = drawn[:, part]
+        if start != goals.shape[-1]:
+            raise ValueError(f"goal_parts must add up to {goals.shape[-1]}: {parts}.")
         return rows, goals
-
-    def _slices(self, serial: Integers) -> tuple[Integers, Integers]:
-        """Returns the serials of slices' last rows, (m,), and every row's slice, (n,)."""
-        trajectory, step = self._memory.find(serial.clip(self._memory.freed))
-        ahead = np.diff(step)
-        # A padded slice repeats its last row: still the same slice.
-        goes_on = (np.diff(trajectory) == 0) & ((ahead == 0) | (ahead == 1))
-        is_last = np.append(~goes_on, True)
-        return serial[is_last], is_last.cumsum() - is_last
 
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
         """Notes transitions that exist already: a data set, or a buffer's storage.
 
         What is returned is sampled by a buffer with this transform:
         `ReplayBuffer(storage=TensorStorage(relabel.prepare(data)), transform=relabel)`.
-        Memory-mapped entries stay where they are, and are only read; the goals are
-        noted in memory.
+        Memory-mapped entries are only read, and stay where they are.
 
         Args:
             data: transitions with trajectory ids, of any shape, in the order of time;
@@ -217,26 +175,19 @@ class HindsightRelabel(BufferTransform):
 
         Returns:
             The data, flat, with a tag; `data` itself is left as it is.
-
-        Raises:
-            ValueError: as the class.
-            KeyError: as the class.
-            RuntimeError: other transitions were noted before.
         """
-        if self._memory.head:
+        if self._memory.tracker.count:
             raise RuntimeError("prepare() must come before other transitions.")
         flat = data.reshape(-1).copy()
-        noted = flat
+        noted = flat.copy()
         if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
             trajectory = torch.arange(len(flat), device="cpu") // data.shape[-1]
-            noted = flat.copy().set(self.trajectory_key, trajectory)
+            noted.set(self.trajectory_key, trajectory)
         with self._lock:
             tag = self._note(noted, 0, None).get(SERIAL_KEY)
         self.end_trajectories()
         return flat.set(SERIAL_KEY, tag)
 
     def __repr__(self) -> str:
-        return (
-            f"HindsightRelabel(her_ratio={self.her_ratio}, "
-            f"strategy={self.strategy!r}, unit={self.unit!r})"
-        )
+        options = f"her_ratio={self.her_ratio}, strategy={self.strategy!r}"
+        return f"HindsightRelabel({options}, unit={self.unit!r})"

@@ -31,36 +31,23 @@ NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
 def parse_strategies(strategy: str | Strategy | Mapping[Any, float]) -> Weights:
-    """Returns strategies and their weights, which add up to 1.
-
-    Raises:
-        ValueError: a strategy is neither a name nor a function; a weight is no
-            positive number.
-    """
+    """Returns strategies and weights that add up to 1; a ValueError if it cannot."""
     weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
     for name in weights or [strategy]:
         if not callable(name) and name not in NAMES:
-            raise ValueError(
-                f"strategy must be one of {[*NAMES]}, a callable, or a mapping of "
-                f"these to weights, got {name!r}."
-            )
+            known = f"one of {[*NAMES]}, a callable, or a mapping of these to weights"
+            raise ValueError(f"strategy must be {known}, got {name!r}.")
     if not all(weight > 0 and isfinite(weight) for weight in weights.values()):
-        raise ValueError(
-            f"the weights of strategies must be positive numbers, got {strategy!r}."
-        )
+        raise ValueError(f"strategy must have positive weights, got {strategy!r}.")
     total = sum(weights.values())
     return {name: weight / total for name, weight in weights.items()}
 
 
 def draw_uniform(number: int, generator: Generator | None) -> NDArray[np.float64]:
-    """Draws random numbers from 0 to 1, (number,).
-
-    The generator is the CPU's, so that a seed means the same on every device; float32
-    would skip steps of trajectories longer than 2**24.
-    """
-    return torch.rand(
-        number, generator=generator, dtype=torch.float64, device="cpu"
-    ).numpy()
+    """Draws random numbers from 0 to 1, (number,), with a generator of the CPU's."""
+    # float32 would skip steps of trajectories longer than 2**24.
+    options = {"dtype": torch.float64, "device": "cpu"}
+    return torch.rand(number, generator=generator, **options).numpy()
 
 
 def draw_integers(
@@ -71,16 +58,6 @@ def draw_integers(
     return low + (u * (end - low)).astype(np.int64)
 
 
-def draw_strategies(
-    weights: Weights, number: int, generator: Generator | None
-) -> Integers:
-    """Draws strategies by weight; returns their places in `weights`, (number,)."""
-    if len(weights) == 1:
-        return np.zeros(number, dtype=np.int64)
-    limits = np.cumsum([*weights.values()])[:-1]
-    return limits.searchsorted(draw_uniform(number, generator), side="right")
-
-
 def choose_steps(
     strategy: str | Strategy,
     step: Integers,
@@ -88,28 +65,20 @@ def choose_steps(
     end: Integers,
     generator: Generator | None,
 ) -> Integers:
-    """Chooses the step whose goal every transition gets, (n,).
-
-    Raises:
-        ValueError: a user's own strategy does not return one integer step a
-            transition from first up to end.
-    """
+    """Chooses steps, (n,); a ValueError if a user's own strategy returns no such."""
     if strategy == "final":
         return end - 1
     if isinstance(strategy, str):
         return draw_integers(step if strategy == "future" else first, end, generator)
     tensors = (torch.from_numpy(x.astype(np.int32)) for x in (step, first, end))
     chosen = strategy(*tensors, generator)
+    must = "the strategy must return"
     if not isinstance(chosen, Tensor):
-        raise ValueError(
-            f"the strategy must return a tensor, got {type(chosen).__name__}."
-        )
+        raise ValueError(f"{must} a tensor, got {type(chosen).__name__}.")
     if chosen.shape != step.shape or chosen.is_floating_point():
-        raise ValueError(
-            f"the strategy must return integer steps of shape {tuple(step.shape)}, "
-            f"got {chosen.dtype} of shape {tuple(chosen.shape)}."
-        )
+        got = f"{chosen.dtype} of shape {tuple(chosen.shape)}"
+        raise ValueError(f"{must} integer steps {tuple(step.shape)}, got {got}.")
     goal_step: Integers = chosen.cpu().numpy()
     if ((goal_step < first) | (goal_step >= end)).any():
-        raise ValueError("the strategy must return steps from first up to end.")
+        raise ValueError(f"{must} steps from first up to end.")
     return goal_step

@@ -1,6 +1,7 @@
 """Time and memory beside other buffers, on one thread (OMP_NUM_THREADS=1)."""
 
 import statistics
+import sys
 import time
 
 import gymnasium
@@ -231,6 +232,9 @@ def test_memory_a_transition(capacity):
         rb.extend(source.chunk(capacity // 2500))
         rb.sample()
     serial = rb.storage[:]["hindsight_serial"]
-    total = rb.transform[0]._memory.nbytes() + serial.nbytes
+    memory = rb.transform[0]._memory
+    steps = sum(map(sys.getsizeof, memory._steps.values()))
+    own = memory._goals.nbytes + memory._distance.nbytes
+    total = own + steps + sys.getsizeof(memory._steps) + serial.nbytes
     print(f"{total / capacity:.1f} bytes a transition")
     assert total / capacity <= 3 * 4 + 24
