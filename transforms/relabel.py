@@ -96,6 +96,9 @@ class HindsightRelabel(BufferTransform):
         capacity = self.capacity if buffer is None else buffer.storage.max_size
         with self._lock:
             batch = self._note(batch, self._stored(buffer), capacity)
+        size = batch.get(self._rewriter.goal_key).shape[-1]
+        if self.goal_parts is not None and sum(self.goal_parts) != size:
+            raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}.")
         return batch.squeeze(-1) if is_item else batch
 
     def _stored(self, buffer: ReplayBuffer | None) -> int:
@@ -158,8 +161,6 @@ class HindsightRelabel(BufferTransform):
                 return rows, drawn
             part = slice(start, start := start + size)
             goals[torch.from_numpy(mine), part] = drawn[:, part]
-        if start != goals.shape[-1]:
-            raise ValueError(f"goal_parts must add up to {goals.shape[-1]}: {parts}.")
         return rows, goals
 
     def prepare(self, data: TensorDictBase) -> TensorDictBase:

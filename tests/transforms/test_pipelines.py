@@ -8,12 +8,14 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import (
+    LazyMemmapStorage,
     LazyTensorStorage,
     MultiStep,
     ReplayBuffer,
     SliceSampler,
     TensorDictMaxValueWriter,
     TensorDictReplayBuffer,
+    TensorStorage,
 )
 from torchrl.envs import (
     CatTensors,
@@ -147,6 +149,8 @@ def test_copies_of_the_goal_are_refused(hindsight, collector):
     rb = buffer(hindsight.from_env(env))
     with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
         for data in collect(env) if collector else [env.rollout(10)]:
+            if not collector:
+                data["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 10)
             rb.extend(data.reshape(-1))
 
 
@@ -154,7 +158,7 @@ def test_copies_made_in_the_buffer_before_hindsight_are_refused():
     env = make()
     cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
     rb = buffer(Compose(cat, HindsightRelabel.from_env(env)))
-    rb.extend(env.rollout(10).reshape(-1))
+    rb.extend(next(iter(collect(env))).reshape(-1))
     with pytest.raises(ValueError, match=r"policy_input.*copy"):
         rb.sample()
 
@@ -163,7 +167,7 @@ def test_concatenating_after_hindsight_has_the_new_goal():
     env = make()
     cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
     rb = buffer(Compose(HindsightRelabel.from_env(env, her_ratio=1.0), cat))
-    rb.extend(env.rollout(10).reshape(-1))
+    rb.extend(next(iter(collect(env))).reshape(-1))
     batch = rb.sample()
     goal = batch["desired_goal"]
     pieces = batch["policy_input"].unfold(1, 3, 1)
@@ -292,8 +296,7 @@ def test_replaced_rows_are_refused():
 # -- collectors that extend the buffer themselves -------------------------------------
 
 
-@pytest.mark.parametrize("extend_buffer", [True, False])
-def test_collector_with_the_buffer(extend_buffer):
+def test_collector_with_the_buffer():
     rb = buffer(HindsightRelabel(reward_fn), ndim=2)
     collector = Collector(
         toy.make_env,
@@ -301,14 +304,13 @@ def test_collector_with_the_buffer(extend_buffer):
         frames_per_batch=3 * 5,
         total_frames=3 * 5 * 100,
         replay_buffer=rb,
-        extend_buffer=extend_buffer,
     )
     for _ in collector:
         batch = rb.sample()
         check_batch(batch, rb.storage[:].reshape(-1), "future")
         assert relabelled(batch).any()
     collector.shutdown()
-    assert len(rb) == 1000 // 3 * 3 or len(rb) >= 990
+    assert rb.write_count > len(rb.storage) // 3  # it was written over
 
 
 def test_collector_with_a_flat_buffer_is_refused():
@@ -323,8 +325,14 @@ def test_collector_with_a_flat_buffer_is_refused():
 
 @pytest.mark.parametrize("ndim", [1, 2])
 def test_multi_process_collector_with_the_buffer_is_refused(ndim):
-    rb = buffer(HindsightRelabel(reward_fn), ndim=ndim)
-    with pytest.raises(RuntimeError, match=r"(multi-process collector|replay_buffer=)"):
+    # A TensorDictReplayBuffer of ndim=2 fails at the first [num_envs, 1] by itself.
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(1000, ndim=ndim),
+        transform=HindsightRelabel(reward_fn),
+        batch_size=64,
+    )
+    message = "multi-process collector" if ndim == 2 else "replay_buffer="
+    with pytest.raises(RuntimeError, match=message):
         MultiSyncCollector(
             [toy.make_first, functools.partial(toy.make_env, 2)],
             None,
@@ -405,7 +413,7 @@ def test_parts_are_relabelled_on_their_own(unit):
     rb.extend(data)
     batch = rb.sample(40_000)
     goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
-    own = data["desired_goal"][batch["index"]]
+    own = data["desired_goal"][batch["index"].reshape(len(batch), -1)[:, 0]]
     first, second = (goal[:, :2] != own[:, :2]).all(1), goal[:, 2] != own[:, 2]
     assert (goal[first][:, :2] == achieved[first][:, :2]).all()
     assert (goal[second][:, 2] >= achieved[second][:, 2]).all()
@@ -437,7 +445,7 @@ def test_parts_drawn_from_the_same_steps_as_whole_goals():
     """Of Stack: each cube's goal is its own later position, or as it was."""
     env = make("PandaStack-v1")
     rb = buffer(HindsightRelabel.from_env(env, goal_parts=(3, 3), her_ratio=0.7))
-    rb.extend(env.rollout(100).reshape(-1))
+    rb.extend(next(iter(collect(env, 100))).reshape(-1))
     batch, stored = rb.sample(), rb.storage[:]
     held = stored["next", "achieved_goal"]
     for part in (slice(0, 3), slice(3, 6)):
@@ -456,8 +464,6 @@ def test_parts_drawn_from_the_same_steps_as_whole_goals():
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
 @pytest.mark.parametrize("layout", ["ids", "trajectories"])
 def test_data_that_exist_already(storage, layout, tmp_path):
-    from torchrl.data import TensorStorage
-
     if layout == "ids":
         data = Envs(4, [5, 9]).chunk(30).reshape(-1)
     else:
@@ -486,8 +492,6 @@ def test_data_that_exist_already(storage, layout, tmp_path):
 
 
 def test_storage_of_a_buffer_that_was_filled_without():
-    from torchrl.data import LazyMemmapStorage, TensorStorage
-
     filled = TensorDictReplayBuffer(storage=LazyMemmapStorage(70), batch_size=8)
     envs = Envs(4, [5, 9])
     for _ in range(9):  # wrapped around
