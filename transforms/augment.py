@@ -26,10 +26,6 @@ class HindsightAugment(BufferTransform):
         k: number of relabelled copies of a transition.
         **options: see `BufferTransform`. Strategies are those of `HindsightRelabel`,
             but for "random" and "desired", which would need the other episodes.
-
-    Raises:
-        ValueError: as for `HindsightRelabel`; the data come from `add`.
-        RuntimeError: as for `HindsightRelabel`; several dimensions; slices.
     """
 
     def __init__(self, reward_fn: GoalFunction, *, k: int = 4, **options: Any) -> None:  # noqa: ANN401
@@ -37,10 +33,8 @@ class HindsightAugment(BufferTransform):
         if k < 1 or not float(k).is_integer():
             raise ValueError(f"k must be an integer of at least 1, got {k}.")
         if RANDOM in self._weights or DESIRED in self._weights:
-            raise ValueError(
-                "HindsightAugment sees one episode at a time and cannot draw "
-                f"{self.strategy!r} goals; HindsightRelabel can."
-            )
+            goals = f"cannot draw {self.strategy!r} goals; HindsightRelabel can"
+            raise ValueError(f"HindsightAugment sees one episode at a time: {goals}.")
         self.k = k
         self._held: list[TensorDictBase] = []  # of open trajectories, in order
 
@@ -48,10 +42,7 @@ class HindsightAugment(BufferTransform):
         """Takes transitions in and returns those of the episodes that have ended."""
         buffer, is_sliced = self._find_buffer()
         if not tensordict.ndim:
-            raise ValueError(
-                "HindsightAugment stores many transitions at once, which `add` takes "
-                "for one item: use `extend`, with data of shape [1] for a single one."
-            )
+            raise ValueError("HindsightAugment stores many rows: extend, do not `add`.")
         if is_sliced or (buffer is not None and buffer.storage.ndim > 1):
             raise RuntimeError(
                 "HindsightAugment stores flat transitions, several goals an id: use a "
@@ -97,6 +88,3 @@ class HindsightAugment(BufferTransform):
         """Takes what `get_extra_state` returned."""
         super().set_extra_state(state)
         self._held = [TensorDict(p, [len(p[SERIAL_KEY])]) for p in state["held"]]
-
-    def __repr__(self) -> str:
-        return f"HindsightAugment(k={self.k}, strategy={self.strategy!r})"

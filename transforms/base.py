@@ -85,13 +85,10 @@ class BufferTransform(envs.Transform):
         """Makes the transform that belongs to an environment, e.g. a `RobotTaskEnv`.
 
         Its `compute_reward` and `is_success` become `reward_fn` and `success_fn`; the
-        latter also `terminated_fn` if its `terminate_on_success` is true. A
-        `TransformedEnv` has its base environment's; for a `ParallelEnv` or `SerialEnv`,
-        which do not hand out functions, one more environment is made, and closed. The
-        options are the constructor's; of these three what is given is not read.
-
-        Raises:
-            ValueError: the environment lacks one that is not given.
+        latter also `terminated_fn` if its `terminate_on_success` is true. For a
+        `ParallelEnv` or `SerialEnv`, which do not hand out functions, one more
+        environment is made, and closed. The options are the constructor's, and what is
+        given of these three is not read; what is missing is a ValueError.
         """
         while isinstance(env, envs.TransformedEnv):
             env = env.base_env
@@ -110,9 +107,8 @@ class BufferTransform(envs.Transform):
                 value = getattr(env, attribute, None)
                 if value is None:
                     raise ValueError(f"{env} has no {attribute}: give {option}=.")
-                if option == "terminated_fn":
-                    value = options["success_fn"] if value else None
-                options[option] = value
+                ends = option == "terminated_fn"
+                options[option] = (env.is_success if value else None) if ends else value
         return cls(**options)
 
     def _find_buffer(self) -> tuple[ReplayBuffer | None, bool]:
@@ -144,15 +140,14 @@ class BufferTransform(envs.Transform):
         shape = batch.batch_size
         self._rewriter.check(batch)
         self._check_data(batch)
-        done = batch.get(("next", "done")).reshape(shape)
-        achieved = batch.get(self._rewriter.next_achieved_key)
-        root = batch.get(self._rewriter.achieved_goal_key, None)
+        keys = self._rewriter
+        root = batch.get(keys.achieved_goal_key, None)
         serial = self._memory.write(
             ids_of(batch, self.trajectory_key, self.single_env),
-            time_first(done, len(shape)),
-            time_first(achieved, len(shape)),
+            time_first(batch.get(("next", "done")).reshape(shape), len(shape)),
+            time_first(batch.get(keys.next_achieved_key), len(shape)),
             None if root is None else time_first(root, len(shape)),
-            time_first(batch.get(self._rewriter.goal_key), len(shape)),
+            time_first(batch.get(keys.goal_key), len(shape)),
             stored=stored,
             capacity=capacity,
         )
@@ -171,9 +166,8 @@ class BufferTransform(envs.Transform):
     def share_memory_(self) -> None:
         """Is called for a buffer that several processes write to: a RuntimeError."""
         raise RuntimeError(
-            "hindsight follows what one process writes (there is no share_memory_): "
-            "do not give the buffer to a multi-process collector (replay_buffer=), but "
-            "extend it with what the collector yields."
+            "hindsight has no share_memory_: do not give the buffer to a multi-process "
+            "collector (replay_buffer=), but extend it with what the collector yields."
         )
 
     def set_container(self, container: envs.Transform | envs.EnvBase) -> None:
@@ -213,7 +207,7 @@ class BufferTransform(envs.Transform):
 
 
 def _has_multi_step(transform: envs.Transform | None) -> bool:
-    """Tells whether a MultiStepTransform is in the same chain, which may be nested."""
+    """Looks for a MultiStepTransform in the same chain, which may be nested."""
     while transform is not None:
         root, container = transform, transform.__dict__["_container"]
         transform = container() if container is not None else None

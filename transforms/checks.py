@@ -32,9 +32,8 @@ class DataCheck:
         steps = batch.get("steps_to_next_obs", None)
         if steps is not None and (steps != 1).any():
             raise ValueError(
-                "the rewards are of several steps (steps_to_next_obs, as MultiStep "
-                "writes it), which cannot be told for another goal: collect without "
-                'that postproc, and sample slices with HindsightRelabel(unit="slice").'
+                "rewards of several steps (of MultiStep) are not known for other goals:"
+                ' collect one step and sample slices, HindsightRelabel(unit="slice").'
             )
         if self._batches == MAX_BATCHES:
             return
@@ -66,9 +65,8 @@ class DataCheck:
             if len(column):
                 raise ValueError(
                     f"{key!r} holds a copy of {keys.goal_key!r} from column "
-                    f"{int(column[0])} on, which another goal would contradict: do not "
-                    "concatenate in the environment, but in the buffer, after this "
-                    "transform: rb.append_transform(CatTensors(..., del_keys=False))."
+                    f"{int(column[0])} on: do not concatenate in the environment, but "
+                    "in the buffer, after this transform (append_transform)."
                 )
 
     def _check_rewards(self, batch: TensorDictBase) -> None:
@@ -94,13 +92,9 @@ class DataCheck:
         constant = float(at_low) - factor * float(low)
         if factor and not differ(factor * expected + constant, tolerance * abs(factor)):
             raise ValueError(
-                f"the rewards are reward_fn's times {factor:.4g} plus {constant:.4g}, "
-                "as RewardScaling makes them; relabelled rows would have another scale."
-                " Scale in the buffer, after this transform, or in reward_fn."
+                f"the rewards are reward_fn's times {factor:.4g} plus {constant:.4g} "
+                "(RewardScaling?): scale in the buffer, after this transform."
             )
         self._has_warned = True
-        warnings.warn(
-            f"reward_fn gives other rewards ({float(expected[0]):.4g}) than the data "
-            f"have ({float(stored[0]):.4g}): relabelled rows get reward_fn's.",
-            stacklevel=2,
-        )
+        pair = f"{float(expected[0]):.4g} and {float(stored[0]):.4g}"
+        warnings.warn(f"reward_fn gives other rewards than the data have: {pair}.")  # noqa: B028

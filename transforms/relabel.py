@@ -22,35 +22,26 @@ class HindsightRelabel(BufferTransform):
     Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): `extend`
     notes to which trajectory every transition belongs and what it achieved; `sample`
     relabels a random `her_ratio` of the rows. The others come out as they were stored.
-    If the data lack the root achieved goal, or it is never what the step before
-    achieved, call `end_trajectories` before data of a new collector, whose ids begin
-    anew; otherwise it is seen. See README.md beside this file.
-
     Strategies are "future" (this step or a later one of the episode), "final" (its last
-    step), "episode" (any of its steps), "random" (any stored transition), where the
-    goal is what the step led to, ("next", achieved_goal); and "desired", the desired
-    goal of any stored transition.
+    step), "episode" (any of its steps) and "random" (any stored transition), where the
+    goal is what the step achieved; and "desired", what any stored one was asked for.
 
     Args:
-        reward_fn: see `BufferTransform`, as for all options that are not named here.
+        reward_fn: see `BufferTransform`, as for **options.
         her_ratio: fraction of the rows that are relabelled, in [0, 1]: k / (k + 1) for
             the k goals a transition of the paper.
         unit: "row" draws a goal a row, "slice" one for all rows of a slice (that follow
             each other in the batch and in time), drawn for its last row: for learners
             on a `SliceSampler`, which puts stored ends back unless truncated_key=None.
-        capacity: transitions to remember if no buffer of torchrl's calls the transform;
-            otherwise the buffer tells.
+        capacity: transitions to remember where no buffer calls, which would tell.
         goal_parts: sizes of the parts of a goal vector, e.g. (3, 3) for two objects.
             Every part is relabelled with probability her_ratio, with a goal drawn for
             it alone (multi-criteria hindsight, Lanier et al. 2019, arXiv 1906.03710).
-        **options: see `BufferTransform`.
 
     Raises:
-        ValueError: an argument is out of range; the data do not tell their trajectories
-            or would contradict another goal, see `checks`; it is for an environment.
+        ValueError: an argument, or the data, would make goals or rewards wrong.
         KeyError: the data lack an entry, or were not noted.
-        RuntimeError: the buffer cannot be followed: it is not written round-robin, is
-            shared, makes n-step rewards, or has other dimensions than the data.
+        RuntimeError: the buffer cannot be followed.
     """
 
     def __init__(
@@ -87,22 +78,22 @@ class HindsightRelabel(BufferTransform):
                 raise RuntimeError(
                     "HindsightRelabel needs rows in order of time, written round-robin "
                     f"(here: {writer.__name__}); got data of {list(tensordict.shape)} "
-                    f"for ndim={ndim}, dim_extend={buffer.dim_extend}: extend with "
-                    "data.reshape(-1), or use a storage of several dimensions, ndim=2 "
-                    "for [num_envs, time] (as collectors with replay_buffer= write)."
+                    f"for ndim={ndim}: extend with data.reshape(-1), or use a storage "
+                    "of several dimensions, ndim=2 for [num_envs, time] (as collectors "
+                    "with replay_buffer= write)."
                 )
             is_item = tensordict.ndim < ndim
         batch = tensordict.unsqueeze(-1) if is_item else tensordict
-        capacity = self.capacity if buffer is None else buffer.storage.max_size
-        with self._lock:
-            batch = self._note(batch, self._stored(buffer), capacity)
+        self._rewriter.check(batch)
         size = batch.get(self._rewriter.goal_key).shape[-1]
         if self.goal_parts is not None and sum(self.goal_parts) != size:
             raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}.")
+        capacity = self.capacity if buffer is None else buffer.storage.max_size
+        with self._lock:
+            batch = self._note(batch, self._stored(buffer), capacity)
         return batch.squeeze(-1) if is_item else batch
 
     def _stored(self, buffer: ReplayBuffer | None) -> int:
-        """Returns how many transitions the buffer holds."""
         count = self._memory.tracker.count
         stored = min(count, self.capacity or count)
         return stored if buffer is None else len(buffer.storage)
@@ -113,18 +104,14 @@ class HindsightRelabel(BufferTransform):
         buffer, is_sliced = self._find_buffer()
         if is_sliced and self.unit == "row" and not self._has_warned:
             self._has_warned = True
-            warnings.warn(
-                "HindsightRelabel gives every row a goal of its own, so the rows of a "
-                'slice have several: pass unit="slice" for one goal a slice.',
-                stacklevel=2,
-            )
+            cure = 'pass unit="slice" for one goal a slice'
+            warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
         with self._lock:
             floor = self._memory.tracker.count - self._stored(buffer)
             if tag is None or floor < 0:
                 raise (KeyError if tag is None else RuntimeError)(
-                    "the buffer holds rows that HindsightRelabel has not noted: it "
-                    "must be in the buffer before the first extend(). Data that exist "
-                    "already are noted by prepare()."
+                    "HindsightRelabel must be in the buffer before the first extend(), "
+                    "or its rows be noted by prepare()."
                 )
             self._check_data(tensordict)
             rows, goals = self._draw(tag.cpu().numpy().reshape(-1), floor, tensordict)
@@ -166,16 +153,10 @@ class HindsightRelabel(BufferTransform):
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
         """Notes transitions that exist already: a data set, or a buffer's storage.
 
-        What is returned is sampled by a buffer with this transform:
-        `ReplayBuffer(storage=TensorStorage(relabel.prepare(data)), transform=relabel)`.
-        Memory-mapped entries are only read, and stay where they are.
-
-        Args:
-            data: transitions with trajectory ids, of any shape, in the order of time;
-                without ids [trajectories, time], one trajectory a row.
-
-        Returns:
-            The data, flat, with a tag; `data` itself is left as it is.
+        They are of any shape, in order of time, with trajectory ids; or [trajectories,
+        time]. Returns them flat and with a tag, for the `TensorStorage` of a buffer
+        with this transform. Memory-mapped entries are only read, and stay where they
+        are; `data` itself is left as it is.
         """
         if self._memory.tracker.count:
             raise RuntimeError("prepare() must come before other transitions.")
@@ -188,7 +169,3 @@ class HindsightRelabel(BufferTransform):
             tag = self._note(noted, 0, None).get(SERIAL_KEY)
         self.end_trajectories()
         return flat.set(SERIAL_KEY, tag)
-
-    def __repr__(self) -> str:
-        options = f"her_ratio={self.her_ratio}, strategy={self.strategy!r}"
-        return f"HindsightRelabel({options}, unit={self.unit!r})"
