@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torch_panda.transforms.base import SERIAL_KEY, BufferTransform
+from torch_panda.transforms.base import SERIAL_KEY, BufferTransform, samples_slices
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import DESIRED, RANDOM
 
@@ -40,31 +41,32 @@ class HindsightAugment(BufferTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Takes transitions in and returns those of the episodes that have ended."""
-        buffer, is_sliced = self._find_buffer()
+        buffer = self._find_buffer()
         if not tensordict.ndim:
-            raise ValueError("HindsightAugment stores many rows: extend, do not `add`.")
-        if is_sliced or (buffer is not None and buffer.storage.ndim > 1):
+            raise ValueError("`add` takes many rows for one item: use `extend`.")
+        if samples_slices(buffer) or (buffer is not None and buffer.storage.ndim > 1):
             raise RuntimeError(
                 "HindsightAugment stores flat transitions, several goals an id: use a "
                 "storage with ndim=1 ([num_envs, time] data may go in) and sample no "
                 'slices of it; for these take HindsightRelabel(unit="slice").'
             )
+        self._rewriter.check(tensordict)
         stored = self._memory.tracker.count
         stored -= int(self._held[0].get(SERIAL_KEY)[0]) if self._held else stored
         self._held.append(self._note(tensordict, stored, None).reshape(-1))
         held = TensorDict.cat(self._held)
         held = held[held.get(SERIAL_KEY).argsort()]  # in order of time
-        trajectory, _ = self._memory.find(held.get(SERIAL_KEY).cpu().numpy())
-        still_open = set(self._memory.tracker.open.values())
-        is_open = [t in still_open for t in trajectory.tolist()]
-        is_open = torch.tensor(is_open, device="cpu")
+        trajectory, *_ = self._memory.find(held.get(SERIAL_KEY).cpu().numpy())
+        still_open = [*self._memory.tracker.open.values()]
+        is_open = torch.from_numpy(np.isin(trajectory, still_open))
         self._held = [held[is_open]] if is_open.any() else []
         return None if is_open.all() else self._augment(held[~is_open])
 
     def _augment(self, original: TensorDictBase) -> TensorDictBase:
         """Returns transitions of whole episodes, then k relabelled copies of each."""
         serial = original.get(SERIAL_KEY).cpu().numpy().repeat(self.k)
-        goals = self._memory.draw(serial, self._weights, 0, self._generator)
+        drawn = self._memory.draw(serial, self._weights, 0, self._generator)
+        goals = torch.from_numpy(drawn).to(original.get(SERIAL_KEY).device)
         rows = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
         every = torch.arange(len(rows), device=goals.device)
         copies = self._rewriter.rewrite(original[rows], every, goals)

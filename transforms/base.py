@@ -111,8 +111,8 @@ class BufferTransform(envs.Transform):
                 options[option] = (env.is_success if value else None) if ends else value
         return cls(**options)
 
-    def _find_buffer(self) -> tuple[ReplayBuffer | None, bool]:
-        """Returns the buffer that calls, if any, and whether slices are sampled."""
+    def _find_buffer(self) -> ReplayBuffer | None:
+        """Returns the buffer that calls, if any."""
         # torchrl gives transforms no handle on their buffer, and the data do not tell
         # its size, layout, writer and sampler before it is too late.
         name = type(self).__name__
@@ -128,17 +128,15 @@ class BufferTransform(envs.Transform):
             if issubclass(type(buffer), ReplayBuffer):
                 if frame.f_code.co_name == "__setitem__":
                     raise RuntimeError(f"{name} cannot follow rows that are replaced.")
-                is_sliced = isinstance(buffer.sampler, SliceSampler)
-                return buffer, is_sliced or isinstance(buffer._sample_unit, Sequence)
+                return buffer
             frame = frame.f_back
-        return None, False
+        return None
 
     def _note(
         self, batch: TensorDictBase, stored: int, capacity: int | None
     ) -> TensorDictBase:
         """Remembers transitions [*batch, time], and tags them with their serials."""
         shape = batch.batch_size
-        self._rewriter.check(batch)
         self._check_data(batch)
         keys = self._rewriter
         root = batch.get(keys.achieved_goal_key, None)
@@ -151,7 +149,8 @@ class BufferTransform(envs.Transform):
             stored=stored,
             capacity=capacity,
         )
-        return batch.set(SERIAL_KEY, serial.view(shape[-1], *shape[:-1]).movedim(0, -1))
+        tag = torch.from_numpy(serial).view(shape[-1], *shape[:-1]).movedim(0, -1)
+        return batch.set(SERIAL_KEY, tag.to(batch.get(keys.goal_key).device))
 
     def end_trajectories(self) -> None:
         """Ends all trajectories; what is written next begins new ones."""
@@ -204,6 +203,12 @@ class BufferTransform(envs.Transform):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__({**state, "_lock": threading.Lock()})
+
+
+def samples_slices(buffer: ReplayBuffer | None) -> bool:
+    """Tells whether a buffer samples rows that follow each other in time."""
+    sampler, unit = getattr(buffer, "sampler", None), getattr(buffer, "_sample_unit", 0)
+    return isinstance(sampler, SliceSampler) or isinstance(unit, Sequence)
 
 
 def _has_multi_step(transform: envs.Transform | None) -> bool:

@@ -29,14 +29,14 @@ class DataCheck:
 
     def __call__(self, batch: TensorDictBase) -> None:
         """Looks at transitions, of any batch shape; a ValueError refuses them."""
+        if self._batches == MAX_BATCHES:
+            return
         steps = batch.get("steps_to_next_obs", None)
         if steps is not None and (steps != 1).any():
             raise ValueError(
                 "rewards of several steps (of MultiStep) are not known for other goals:"
                 ' collect one step and sample slices, HindsightRelabel(unit="slice").'
             )
-        if self._batches == MAX_BATCHES:
-            return
         batch = batch.reshape(-1)
         goals = batch.get(self._rewriter.goal_key)
         if (goals != goals[:1]).any():

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 from array import array
 from bisect import bisect_left
+from operator import getitem
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Generator, Tensor
+from numpy.typing import NDArray
+from torch import Generator
 
 from torch_panda.transforms.strategies import (
     DESIRED,
@@ -21,7 +23,7 @@ from torch_panda.transforms.strategies import (
     draw_integers,
     draw_uniform,
 )
-from torch_panda.transforms.trajectories import Integers, TrajectoryTracker
+from torch_panda.transforms.trajectories import Goals, Integers, TrajectoryTracker
 
 
 class GoalMemory:
@@ -31,29 +33,29 @@ class GoalMemory:
     overwrites its oldest rows, so it holds the last serials; what lies ahead of a
     stored transition in its trajectory was written later, so it is stored too. A ring
     holds the goals of every serial, and a growing array the serials of a trajectory,
-    which is named by its first one; the others are kept as distances from it. Only the
-    goals are torch's, whose operations on few numbers take three times as long.
+    which is named by its first one; the others are kept as distances from it. All is
+    numpy's and Python's: torch takes three times as long for a few hundred numbers.
     """
 
     def __init__(self, keeps_desired: bool = False) -> None:
         self._kinds = 2 if keeps_desired else 1
         self.tracker = TrajectoryTracker()
         self.freed = 0  # serial of the oldest transition that is remembered
-        self._goals = torch.zeros(0, device="cpu")  # (rows, achieved or desired, *goal)
+        self._goals: Goals = np.zeros(0)  # (rows, achieved or desired, *goal)
         self._distance = np.zeros(0, dtype=np.int32)  # from the first serial, (rows,)
         self._steps: dict[int, array[int]] = {}  # trajectory -> distances, ascending
 
     def write(
         self,
-        ids: Tensor,
-        done: Tensor,
-        achieved: Tensor,
-        root: Tensor | None,
-        desired: Tensor,
+        ids: Integers,
+        done: NDArray[np.bool_],
+        achieved: Goals,
+        root: Goals | None,
+        desired: Goals,
         *,
         stored: int,
         capacity: int | None,
-    ) -> Tensor:
+    ) -> Integers:
         """Takes the goals of transitions and returns their serials, (n,).
 
         The arguments are those of `TrajectoryTracker.follow`, what was asked for, (n,
@@ -64,9 +66,9 @@ class GoalMemory:
         order, length, trajectory = self.tracker.follow(
             ids, done, achieved, root, self._last_achieved
         )
-        serial = torch.arange(head, head + len(order), device=self._goals.device)
-        kinds = [x.to(self._goals) for x in (achieved, desired)[: self._kinds]]
-        self._goals.index_copy_(0, serial % len(self._goals), torch.stack(kinds, 1))
+        serial = np.arange(head, head + len(order))
+        for kind, goals in enumerate((achieved, desired)[: self._kinds]):
+            self._goals[serial % len(self._goals), kind] = goals
         distance = head + order - trajectory.repeat(length)
         self._distance[(head + order) % len(self._distance)] = distance
         numbers, ends = distance.tolist(), length.cumsum()
@@ -75,16 +77,17 @@ class GoalMemory:
             self._steps.setdefault(t, array("i")).extend(numbers[i:j])
         return serial
 
-    def _last_achieved(self, trajectories: list[int]) -> Tensor:
-        return self._read(np.array([t + self._steps[t][-1] for t in trajectories]))
+    def _last_achieved(self, trajectories: Integers) -> Goals:
+        last = (self._steps[t][-1] for t in trajectories.tolist())
+        return self._read(trajectories + np.fromiter(last, np.int64, len(trajectories)))
 
     def _make_room(
-        self, head: int, goals: Tensor, stored: int, capacity: int | None
+        self, head: int, goals: Goals, stored: int, capacity: int | None
     ) -> None:
-        """Makes the ring hold some more; the first goals tell type and device."""
+        """Makes the ring hold some more; the first goals tell their type."""
         rows = len(self._distance)
         if not rows:
-            self._goals = goals.new_zeros(0, self._kinds, *goals.shape[1:])
+            self._goals = np.zeros((0, self._kinds, *goals.shape[1:]), goals.dtype)
         end = head + len(goals)
         if end - self.freed > rows:
             self._free(head - stored)
@@ -96,11 +99,11 @@ class GoalMemory:
         room = max(end - self.freed, room)
         serial = np.arange(self.freed, head)
         distance = np.zeros(room, dtype=np.int32)
-        larger = self._goals.new_zeros(room, *self._goals.shape[1:])
+        larger = np.zeros((room, *self._goals.shape[1:]), self._goals.dtype)
         if len(serial):
             old, new = serial % rows, serial % room
             distance[new] = self._distance[old]
-            larger[torch.from_numpy(new)] = self._goals[torch.from_numpy(old)]
+            larger[new] = self._goals[old]
         self._goals, self._distance = larger, distance
 
     def _free(self, floor: int) -> None:
@@ -118,24 +121,23 @@ class GoalMemory:
             ids = self.tracker.open.items()
             self.tracker.open = {i: t for i, t in ids if t not in gone}
 
-    def _read(self, serial: Integers, kind: int = 0) -> Tensor:
+    def _read(self, serial: Integers, kind: int = 0) -> Goals:
         """Returns the achieved (0) or desired (1) goals of serials, (n, *goal)."""
-        rows = torch.from_numpy(serial % len(self._goals)).to(self._goals.device)
-        return self._goals[:, kind].index_select(0, rows)
+        return self._goals[serial % len(self._goals), kind]
 
     def _trajectory_of(self, serial: Integers) -> Integers:
         return serial - self._distance[serial % len(self._distance)]
 
-    def find(self, serial: Integers) -> tuple[Integers, Integers]:
-        """Returns trajectory and step of remembered transitions, (n,) each."""
+    def find(self, serial: Integers) -> tuple[Integers, Integers, list[array[int]]]:
+        """Returns trajectory and step of transitions, (n,), and all their distances."""
         trajectory = self._trajectory_of(serial)
-        pairs = zip(serial.tolist(), trajectory.tolist(), strict=True)
-        step = (bisect_left(self._steps[t], s - t) for s, t in pairs)
-        return trajectory, np.fromiter(step, np.int64, len(serial))
+        steps = [*map(self._steps.__getitem__, trajectory.tolist())]
+        step = map(bisect_left, steps, (serial - trajectory).tolist())
+        return trajectory, np.fromiter(step, np.int64, len(serial)), steps
 
     def draw(
         self, serial: Integers, weights: Weights, floor: int, rng: Generator | None
-    ) -> Tensor:
+    ) -> Goals:
         """Draws a goal for each of some remembered transitions, (n, *goal).
 
         They are those of the serials, (n,); `floor` is the serial of the oldest one
@@ -147,11 +149,10 @@ class GoalMemory:
             return self._read(source, kind=int(strategy == DESIRED))
         limits = np.cumsum([*weights.values()])[:-1]
         which = limits.searchsorted(draw_uniform(len(serial), rng), side="right")
-        goals = self._goals.new_empty(len(serial), *self._goals.shape[2:])
+        goals = np.empty((len(serial), *self._goals.shape[2:]), self._goals.dtype)
         for number, strategy in enumerate(weights):
             rows = (which == number).nonzero()[0]
-            drawn = self.draw(serial[rows], {strategy: 1.0}, floor, rng)
-            goals[torch.from_numpy(rows)] = drawn
+            goals[rows] = self.draw(serial[rows], {strategy: 1.0}, floor, rng)
         return goals
 
     def _draw(
@@ -164,21 +165,19 @@ class GoalMemory:
         """Draws the serials of the transitions that goals are from, (n,)."""
         if strategy in (RANDOM, DESIRED):
             return draw_integers(floor, np.full_like(serial, self.tracker.count), rng)
-        trajectory, step = self.find(serial)
-        names = trajectory.tolist()
-        steps = [self._steps[t] for t in names]
+        trajectory, step, steps = self.find(serial)
         end = np.fromiter(map(len, steps), np.int64, len(steps))
         first = np.zeros_like(end)
         if strategy not in LOOKING_AHEAD:
-            oldest = (bisect_left(self._steps[t], floor - t) for t in names)
+            oldest = map(bisect_left, steps, (floor - trajectory).tolist())
             first = np.minimum(np.fromiter(oldest, np.int64, len(steps)), step)
-        chosen = choose_steps(strategy, step, first, end, rng).tolist()
-        distance = (s[i] for s, i in zip(steps, chosen, strict=True))
+        chosen = choose_steps(strategy, step, first, end, rng)
+        distance = map(getitem, steps, chosen.tolist())
         return trajectory + np.fromiter(distance, np.int64, len(steps))
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
-        rings = self._goals, torch.from_numpy(self._distance)
+        rings = torch.from_numpy(self._goals), torch.from_numpy(self._distance)
         steps = {t: steps.tolist() for t, steps in self._steps.items()}
         state = {"freed": self.freed, "rings": rings, "steps": steps}
         return copy.deepcopy({**state, "tracker": vars(self.tracker)})
@@ -187,6 +186,6 @@ class GoalMemory:
         """Takes the state that another memory returned."""
         state = copy.deepcopy(state)
         self.freed = state["freed"]
-        self._goals, self._distance = state["rings"][0], state["rings"][1].numpy()
+        self._goals, self._distance = (ring.numpy() for ring in state["rings"])
         self._steps = {t: array("i", steps) for t, steps in state["steps"].items()}
         self.tracker.load(state["tracker"])

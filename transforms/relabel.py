@@ -7,13 +7,14 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
-from torch_panda.transforms.base import SERIAL_KEY, BufferTransform
+from torch_panda.transforms.base import SERIAL_KEY, BufferTransform, samples_slices
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import draw_uniform
-from torch_panda.transforms.trajectories import Integers
+from torch_panda.transforms.trajectories import Goals, Integers
 
 
 class HindsightRelabel(BufferTransform):
@@ -65,11 +66,11 @@ class HindsightRelabel(BufferTransform):
             raise ValueError(f"goal_parts must be positive sizes, got {goal_parts!r}.")
         self.her_ratio, self.unit = her_ratio, unit
         self.capacity, self.goal_parts = capacity, goal_parts
-        self._has_warned = False
+        self._is_first_sample = True
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        buffer, _ = self._find_buffer()
+        buffer = self._find_buffer()
         is_item = not tensordict.ndim  # one step
         if buffer is not None:
             ndim, writer = buffer.storage.ndim, type(buffer.writer)
@@ -101,11 +102,11 @@ class HindsightRelabel(BufferTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled."""
         tag = tensordict.get(SERIAL_KEY, None)
-        buffer, is_sliced = self._find_buffer()
-        if is_sliced and self.unit == "row" and not self._has_warned:
-            self._has_warned = True
+        buffer = self._find_buffer()
+        if self._is_first_sample and self.unit == "row" and samples_slices(buffer):
             cure = 'pass unit="slice" for one goal a slice'
             warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
+        self._is_first_sample = False
         with self._lock:
             floor = self._memory.tracker.count - self._stored(buffer)
             if tag is None or floor < 0:
@@ -115,39 +116,39 @@ class HindsightRelabel(BufferTransform):
                 )
             self._check_data(tensordict)
             rows, goals = self._draw(tag.cpu().numpy().reshape(-1), floor, tensordict)
-        if len(rows):
-            index = torch.from_numpy(rows).to(tag.device)
-            tensordict = self._rewriter.rewrite(tensordict, index, goals.to(tag.device))
-        return tensordict.exclude(SERIAL_KEY)
+        if not len(rows):
+            return tensordict.exclude(SERIAL_KEY)
+        index, new = (torch.from_numpy(x).to(tag.device) for x in (rows, goals))
+        return self._rewriter.rewrite(tensordict, index, new).del_(SERIAL_KEY)
 
     def _draw(
         self, serial: Integers, floor: int, batch: TensorDictBase
-    ) -> tuple[Integers, torch.Tensor]:
+    ) -> tuple[Integers, Goals]:
         """Draws rows of a batch of serials, (n,), and their new goals, (n, *goal)."""
         last, unit = serial, np.arange(len(serial))  # last rows; unit of every row
         if self.unit == "slice":
-            trajectory, step = self._memory.find(serial.clip(self._memory.freed))
+            trajectory, step, _ = self._memory.find(serial.clip(self._memory.freed))
             # A padded slice repeats its last row.
             goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
             is_last = np.append(~goes_on, True)
             last, unit = serial[is_last], is_last.cumsum() - is_last
         parts = self.goal_parts or (1,)
         u = draw_uniform(len(parts) * len(last), self._generator)
-        chosen = u.reshape(len(parts), -1) < self.her_ratio
+        chosen: NDArray[np.bool_] = u.reshape(len(parts), -1) < self.her_ratio
         chosen[:, unit[serial < self._memory.freed]] = False  # overwritten since
         rows = chosen.any(0)[unit].nonzero()[0]
-        own = batch.get(self._rewriter.goal_key)
-        goals = own.reshape(-1, *own.shape[batch.ndim :])[torch.from_numpy(rows)]
-        start = 0
-        for size, mask in zip(parts, chosen, strict=True):
+        draws = []
+        for mask in chosen:  # a goal for every chosen unit, then for all its rows
             drawn = self._memory.draw(last[mask], self._weights, floor, self._generator)
-            mine = mask[unit[rows]].nonzero()[0]
-            place = (mask.cumsum() - 1)[unit[rows[mine]]]
-            drawn = drawn[torch.from_numpy(place)].to(goals)
-            if self.goal_parts is None:
-                return rows, drawn
-            part = slice(start, start := start + size)
-            goals[torch.from_numpy(mine), part] = drawn[:, part]
+            mine = mask[unit[rows]]
+            draws.append((mine, drawn[(mask.cumsum() - 1)[unit[rows[mine]]]]))
+        if self.goal_parts is None:
+            return rows, draws[0][1]
+        own = batch.get(self._rewriter.goal_key)
+        goals = own.reshape(-1, own.shape[-1]).cpu().numpy()[rows]
+        ends = np.cumsum(parts)
+        for end, size, (mine, drawn) in zip(ends, parts, draws, strict=True):
+            goals[mine, end - size : end] = drawn[:, end - size : end]
         return rows, goals
 
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
@@ -165,6 +166,7 @@ class HindsightRelabel(BufferTransform):
         if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
             trajectory = torch.arange(len(flat), device="cpu") // data.shape[-1]
             noted.set(self.trajectory_key, trajectory)
+        self._rewriter.check(noted)
         with self._lock:
             tag = self._note(noted, 0, None).get(SERIAL_KEY)
         self.end_trajectories()

@@ -46,8 +46,8 @@ def parse_strategies(strategy: str | Strategy | Mapping[Any, float]) -> Weights:
 def draw_uniform(number: int, generator: Generator | None) -> NDArray[np.float64]:
     """Draws random numbers from 0 to 1, (number,), with a generator of the CPU's."""
     # float32 would skip steps of trajectories longer than 2**24.
-    options = {"dtype": torch.float64, "device": "cpu"}
-    return torch.rand(number, generator=generator, **options).numpy()
+    u = torch.rand(number, generator=generator, dtype=torch.float64, device="cpu")
+    return u.numpy()
 
 
 def draw_integers(
@@ -70,8 +70,8 @@ def choose_steps(
         return end - 1
     if isinstance(strategy, str):
         return draw_integers(step if strategy == "future" else first, end, generator)
-    tensors = (torch.from_numpy(x.astype(np.int32)) for x in (step, first, end))
-    chosen = strategy(*tensors, generator)
+    s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in (step, first, end))
+    chosen = strategy(s, f, e, generator)
     must = "the strategy must return"
     if not isinstance(chosen, Tensor):
         raise ValueError(f"{must} a tensor, got {type(chosen).__name__}.")

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 Integers = NDArray[np.integer[Any]]
+Goals = NDArray[Any]  # (n, *goal)
 
 
 class TrajectoryTracker:
@@ -31,11 +31,11 @@ class TrajectoryTracker:
 
     def follow(
         self,
-        ids: Tensor,
-        done: Tensor,
-        achieved: Tensor,
-        root: Tensor | None,
-        last_achieved: Callable[[list[int]], Tensor],
+        ids: Integers,
+        done: NDArray[np.bool_],
+        achieved: Goals,
+        root: Goals | None,
+        last_achieved: Callable[[Integers], Goals],
     ) -> tuple[Integers, Integers, Integers]:
         """Finds the trajectories of a batch in which the rows of an id are in order.
 
@@ -47,8 +47,8 @@ class TrajectoryTracker:
         if self._has_roots != (root is not None):
             self.open.clear()
             self._has_roots = root is not None
-        order = ids.cpu().numpy().argsort(kind="stable")
-        names, ends = ids.cpu().numpy()[order], done.cpu().numpy()[order]
+        order = ids.argsort(kind="stable")
+        names, ends = ids[order], done[order]
         is_head = np.ones(len(order), dtype=bool)  # the first row of its id
         is_head[1:] = names[1:] != names[:-1]
         known = np.full(len(order), -1)
@@ -58,13 +58,10 @@ class TrajectoryTracker:
         if root is not None:
             inner = (~begins & ~is_head).nonzero()[0]
             resumed = (known >= 0).nonzero()[0]
-            before = achieved[torch.from_numpy(order[inner - 1])]
-            if len(resumed):
-                last = last_achieved(known[resumed].tolist())
-                before = torch.cat([before, last.to(before)])
+            before = achieved[order[inner - 1]], last_achieved(known[resumed])
             places = np.concatenate([inner, resumed])
-            after = root[torch.from_numpy(order[places])]
-            follows = (before == after).flatten(1).all(1).cpu().numpy()
+            same = np.concatenate(before) == root[order[places]]
+            follows = same.reshape(len(places), root[:1].size).all(1)
             self._links = self._links or bool(follows.any())
             begins[places[~follows]] = self._links
         start = (begins | is_head).nonzero()[0]
@@ -85,14 +82,14 @@ class TrajectoryTracker:
             self.open.clear()
 
 
-def time_first(value: Tensor, batch_dims: int) -> Tensor:
+def time_first(value: Tensor, batch_dims: int) -> Any:  # noqa: ANN401 (of any type)
     """Flattens [*batch, time, ...] to (time * batch, ...), as storages fill up."""
-    if batch_dims == 1:
-        return value
-    return value.movedim(batch_dims - 1, 0).flatten(0, batch_dims - 1)
+    if batch_dims > 1:
+        value = value.movedim(batch_dims - 1, 0).flatten(0, batch_dims - 1)
+    return value.cpu().numpy()
 
 
-def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tensor:
+def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Integers:
     """Returns ids, or environments, of [*batch, time] in `time_first` order, (n,).
 
     Raises:
@@ -105,12 +102,12 @@ def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tensor:
             raise ValueError(
                 f"expected ids {shape} at {key!r}, got {tuple(ids.shape)}."
             )
-        return time_first(ids.reshape(batch.shape), batch.ndim)
+        numbers: Integers = time_first(ids.reshape(batch.shape), batch.ndim)
+        return numbers
     if batch.ndim < 2 and not single_env:
         raise ValueError(
             f"cannot tell trajectories apart in a batch {shape} without ids at {key!r}:"
             " keep the collector's ids, name others with trajectory_key=, extend with "
             "[num_envs, time], or pass single_env=True for steps of one environment."
         )
-    envs = batch.shape[:-1].numel()
-    return torch.arange(envs, device="cpu").repeat(batch.shape[-1])
+    return np.tile(np.arange(batch.shape[:-1].numel()), batch.shape[-1])

@@ -131,7 +131,7 @@ def test_an_end_for_another_reason_stays(with_success):
     )
     rb = buffer(transform)
     rb.extend(data)
-    batch, stored = rb.sample(), rb.storage[:]
+    batch, stored = rb.sample(2000), rb.storage[:]
     success = reached(batch["next", "achieved_goal"], batch["desired_goal"])
     failed = stored["next", "terminated"][batch["index"]]
     assert (batch["next", "terminated"] == (success | failed)).all()
