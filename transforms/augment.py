@@ -17,16 +17,13 @@ class HindsightAugment(BufferTransform):
     """Stores every transition once more for each of k goals achieved in its episode.
 
     The paper's own way (Andrychowicz et al. 2017, arXiv 1707.01495, algorithm 1). An
-    episode is held back until it ends, as `HindsightRelabel` tells; then `extend`
-    stores its transitions and k relabelled copies of each: k + 1 times the memory. What
-    comes out is flat, and the copies keep the trajectory id, so trajectories cannot be
-    told apart in the buffer. An episode that never ends is never stored.
+    episode is held back until it ends; then `extend` stores its transitions and k
+    relabelled copies of each, flat, under the same trajectory id.
 
     Args:
         reward_fn: see `BufferTransform`; called once an `extend`.
         k: number of relabelled copies of a transition.
-        **options: see `BufferTransform`. Strategies are those of `HindsightRelabel`,
-            but for "random" and "desired", which would need the other episodes.
+        **options: see `BufferTransform`; no strategy of other episodes.
     """
 
     def __init__(self, reward_fn: GoalFunction, *, k: int = 4, **options: Any) -> None:  # noqa: ANN401
@@ -46,9 +43,8 @@ class HindsightAugment(BufferTransform):
             raise ValueError("`add` takes many rows for one item: use `extend`.")
         if samples_slices(buffer) or (buffer is not None and buffer.storage.ndim > 1):
             raise RuntimeError(
-                "HindsightAugment stores flat transitions, several goals an id: use a "
-                "storage with ndim=1 ([num_envs, time] data may go in) and sample no "
-                'slices of it; for these take HindsightRelabel(unit="slice").'
+                "HindsightAugment stores rows one by one: use ndim=1, and "
+                'no slices but HindsightRelabel(unit="slice").'
             )
         self._rewriter.check(tensordict)
         stored = self._memory.tracker.count
@@ -64,9 +60,10 @@ class HindsightAugment(BufferTransform):
 
     def _augment(self, original: TensorDictBase) -> TensorDictBase:
         """Returns transitions of whole episodes, then k relabelled copies of each."""
-        serial = original.get(SERIAL_KEY).cpu().numpy().repeat(self.k)
+        tag = original.get(SERIAL_KEY)
+        serial = tag.cpu().numpy().repeat(self.k)
         drawn = self._memory.draw(serial, self._weights, 0, self._generator)
-        goals = torch.from_numpy(drawn).to(original.get(SERIAL_KEY).device)
+        goals = torch.from_numpy(drawn).to(tag.device)
         rows = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
         every = torch.arange(len(rows), device=goals.device)
         copies = self._rewriter.rewrite(original[rows], every, goals)

@@ -29,24 +29,19 @@ class BufferTransform(envs.Transform):
     Args:
         reward_fn: maps (achieved_goal, desired_goal), each (n, *goal), to the reward,
             (n, 1), a row's by that row only. The first batches are compared with it.
-        strategy: where goals are from: a name, a function `(step, first, end,
-            generator) -> goal step` (see `strategies`), or a mapping of these to
-            weights (divided by their sum), drawn for every goal.
+        strategy: a name, a function `(step, first, end, generator) -> goal step` (see
+            `strategies`), or a mapping of these to weights, divided by their sum.
         success_fn: the same for the success, bool: also `success_key` is rewritten.
         terminated_fn: the same for tasks that end on success: also ("next",
             "terminated") and ("next", "done") are. What ended otherwise stays so.
-        goal_key: the desired goal, rewritten in the root and under "next".
-        achieved_goal_key: the achieved goal, read under "next" and in the root.
-        reward_key: the reward.
-        success_key: the success.
-        trajectory_key: ids that tell trajectories apart. Data without them are taken
-            for [*batch, time], one environment a row, in the same order every time.
+        goal_key: the desired goal, as `achieved_goal_key` also under "next".
+        achieved_goal_key, reward_key, success_key: the others.
+        trajectory_key: ids of trajectories; data without are [*environments, time].
         single_env: takes 1-d data without ids for one environment's steps.
         seed: seeds a generator of its own. By default torch's is used.
     """
 
-    # Tells torchrl that processes which share the buffer must share this, too.
-    requires_shared_write_state = True
+    requires_shared_write_state = True  # by all processes that share the buffer
 
     def __init__(
         self,
@@ -69,15 +64,13 @@ class BufferTransform(envs.Transform):
         self.strategy = strategy
         self._weights = parse_strategies(strategy)
         self.trajectory_key, self.single_env = trajectory_key, single_env
-        functions = reward_fn, success_fn, terminated_fn
         keys = goal_key, achieved_goal_key, reward_key, success_key
-        self._rewriter = Rewriter(*functions, *keys)
+        self._rewriter = Rewriter(reward_fn, success_fn, terminated_fn, *keys)
         self._check_data = DataCheck(self._rewriter)
         self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
         self._generator: torch.Generator | None = None
         if seed is not None:
             self._generator = torch.Generator("cpu").manual_seed(seed)
-        self._is_chain_checked = False
         self._lock = threading.Lock()  # a prefetching buffer samples in threads
 
     @classmethod
@@ -85,10 +78,8 @@ class BufferTransform(envs.Transform):
         """Makes the transform that belongs to an environment, e.g. a `RobotTaskEnv`.
 
         Its `compute_reward` and `is_success` become `reward_fn` and `success_fn`; the
-        latter also `terminated_fn` if its `terminate_on_success` is true. For a
-        `ParallelEnv` or `SerialEnv`, which do not hand out functions, one more
-        environment is made, and closed. The options are the constructor's, and what is
-        given of these three is not read; what is missing is a ValueError.
+        latter also `terminated_fn` if it is `terminate_on_success`. What is neither an
+        option nor there is a ValueError. A `ParallelEnv` has one more worker made.
         """
         while isinstance(env, envs.TransformedEnv):
             env = env.base_env
@@ -113,21 +104,15 @@ class BufferTransform(envs.Transform):
 
     def _find_buffer(self) -> ReplayBuffer | None:
         """Returns the buffer that calls, if any."""
-        # torchrl gives transforms no handle on their buffer, and the data do not tell
-        # its size, layout, writer and sampler before it is too late.
-        name = type(self).__name__
-        if not self._is_chain_checked and _has_multi_step(self):
-            raise RuntimeError(
-                f"{name} cannot recompute the n-step rewards of MultiStepTransform: "
-                'sample slices with HindsightRelabel(unit="slice") instead.'
-            )
-        self._is_chain_checked = True
+        # torchrl gives transforms no other handle on its size, layout and sampler.
         frame = inspect.currentframe()
         while frame is not None:
             buffer = frame.f_locals.get("self")
             if issubclass(type(buffer), ReplayBuffer):
                 if frame.f_code.co_name == "__setitem__":
-                    raise RuntimeError(f"{name} cannot follow rows that are replaced.")
+                    raise RuntimeError(
+                        "hindsight cannot follow rows that are replaced."
+                    )
                 return buffer
             frame = frame.f_back
         return None
@@ -137,18 +122,22 @@ class BufferTransform(envs.Transform):
     ) -> TensorDictBase:
         """Remembers transitions [*batch, time], and tags them with their serials."""
         shape = batch.batch_size
+        if _has_multi_step(self):
+            raise RuntimeError(
+                "n-step rewards, of MultiStepTransform, are not known for other goals: "
+                'sample slices with HindsightRelabel(unit="slice") instead.'
+            )
         self._check_data(batch)
         keys = self._rewriter
         root = batch.get(keys.achieved_goal_key, None)
-        serial = self._memory.write(
+        columns = (
             ids_of(batch, self.trajectory_key, self.single_env),
             time_first(batch.get(("next", "done")).reshape(shape), len(shape)),
             time_first(batch.get(keys.next_achieved_key), len(shape)),
             None if root is None else time_first(root, len(shape)),
-            time_first(batch.get(keys.goal_key), len(shape)),
-            stored=stored,
-            capacity=capacity,
         )
+        desired = time_first(batch.get(keys.goal_key), len(shape))
+        serial = self._memory.write(columns, desired, stored, capacity)
         tag = torch.from_numpy(serial).view(shape[-1], *shape[:-1]).movedim(0, -1)
         return batch.set(SERIAL_KEY, tag.to(batch.get(keys.goal_key).device))
 
@@ -174,20 +163,14 @@ class BufferTransform(envs.Transform):
         if isinstance(container, envs.EnvBase) or container.parent is not None:
             self._call(None)
         super().set_container(container)
-        self.empty_cache()
-
-    def empty_cache(self) -> None:
-        """Is called by a chain when it changes: n-step rewards are looked for again."""
-        super().empty_cache()
-        self._is_chain_checked = False
 
     def _call(self, next_tensordict: TensorDictBase | None) -> TensorDictBase:
         raise ValueError("hindsight is for replay buffers, not for environments.")
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the memory and the generator, for `state_dict` and `dumps`."""
-        rng = self._generator and self._generator.get_state()
         with self._lock:
+            rng = self._generator and self._generator.get_state()
             return {"memory": self._memory.state(), "generator": rng}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

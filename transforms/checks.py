@@ -9,18 +9,13 @@ from tensordict import TensorDictBase
 
 from torch_panda.transforms.rewrite import Rewriter, evaluate
 
-# Rows of a batch that are looked at, and batches that are.
+# Rows of a batch, and batches asked for several goals, that are looked at.
 MAX_ROWS, MAX_BATCHES = 128, 10
-# So many numbers, of two goals at least, do not coincide by chance.
-MIN_NUMBERS = 6
+MIN_NUMBERS = 6  # of two goals at least: so many do not coincide by chance
 
 
 class DataCheck:
-    """Refuses data in which a new goal would contradict what is not rewritten.
-
-    Only batches tell something whose rows were asked for several goals; the first ten
-    of these are looked at, as they were collected or sampled.
-    """
+    """Refuses data in which a new goal would contradict what is not rewritten."""
 
     def __init__(self, rewriter: Rewriter) -> None:
         self._rewriter = rewriter
@@ -75,8 +70,7 @@ class DataCheck:
         old, goals = batch.get(keys.reward_key), batch.get(keys.goal_key)
         values = evaluate(keys.reward_fn, batch.get(keys.next_achieved_key), goals, old)
         stored, expected = old.flatten().double(), values.flatten().double()
-        # Thresholds and distances may be measured to more precise goals: a thousandth
-        # of the largest reward, and 5 % of the rows, may differ.
+        # Goals may have been more precise: 1 / 1000, and 5 % of the rows, may differ.
         tolerance = 1e-3 * float(expected.abs().max()) + 1e-6
 
         def differ(other: torch.Tensor, tolerance: float) -> bool:

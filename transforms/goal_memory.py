@@ -10,62 +10,39 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Generator
 
-from torch_panda.transforms.strategies import (
-    DESIRED,
-    LOOKING_AHEAD,
-    RANDOM,
-    Strategy,
-    Weights,
-    choose_steps,
-    draw_integers,
-    draw_uniform,
-)
-from torch_panda.transforms.trajectories import Goals, Integers, TrajectoryTracker
+from torch_panda.transforms import strategies
+from torch_panda.transforms.strategies import Strategy, Weights
+from torch_panda.transforms.trajectories import Columns, Goals, Integers
+from torch_panda.transforms.trajectories import TrajectoryTracker as Tracker
 
 
 class GoalMemory:
     """Finds the goal achieved at any stored step of a transition's trajectory.
 
-    Every transition has a serial number, in the order of writing. A round-robin buffer
-    overwrites its oldest rows, so it holds the last serials; what lies ahead of a
-    stored transition in its trajectory was written later, so it is stored too. A ring
-    holds the goals of every serial, and a growing array the serials of a trajectory,
-    which is named by its first one; the others are kept as distances from it. All is
-    numpy's and Python's: torch takes three times as long for a few hundred numbers.
+    Transitions are numbered in the order of writing. A round-robin buffer overwrites
+    its oldest rows, so it holds the last serials, and with a transition what lies ahead
+    of it. A ring holds the goals of every serial, and a growing array the serials of a
+    trajectory, which is named by its first one, as distances from it.
     """
 
     def __init__(self, keeps_desired: bool = False) -> None:
         self._kinds = 2 if keeps_desired else 1
-        self.tracker = TrajectoryTracker()
+        self.tracker = Tracker()
         self.freed = 0  # serial of the oldest transition that is remembered
         self._goals: Goals = np.zeros(0)  # (rows, achieved or desired, *goal)
         self._distance = np.zeros(0, dtype=np.int32)  # from the first serial, (rows,)
         self._steps: dict[int, array[int]] = {}  # trajectory -> distances, ascending
 
     def write(
-        self,
-        ids: Integers,
-        done: NDArray[np.bool_],
-        achieved: Goals,
-        root: Goals | None,
-        desired: Goals,
-        *,
-        stored: int,
-        capacity: int | None,
+        self, columns: Columns, desired: Goals, stored: int, capacity: int | None
     ) -> Integers:
-        """Takes the goals of transitions and returns their serials, (n,).
-
-        The arguments are those of `TrajectoryTracker.follow`, what was asked for, (n,
-        *goal), and how many transitions the buffer holds and, if known, can hold.
-        """
-        head = self.tracker.count
+        """Takes the goals of transitions and returns their serials, (n,)."""
+        head, achieved = self.tracker.count, columns[2]
         self._make_room(head, achieved, stored, capacity)
-        order, length, trajectory = self.tracker.follow(
-            ids, done, achieved, root, self._last_achieved
-        )
+        follow = self.tracker.follow
+        order, length, trajectory = follow(*columns, self._last_achieved)
         serial = np.arange(head, head + len(order))
         for kind, goals in enumerate((achieved, desired)[: self._kinds]):
             self._goals[serial % len(self._goals), kind] = goals
@@ -138,17 +115,15 @@ class GoalMemory:
     def draw(
         self, serial: Integers, weights: Weights, floor: int, rng: Generator | None
     ) -> Goals:
-        """Draws a goal for each of some remembered transitions, (n, *goal).
-
-        They are those of the serials, (n,); `floor` is the serial of the oldest one
-        that is stored.
-        """
+        """Draws a goal for each serial; the oldest that is stored is `floor`."""
         if len(weights) == 1:
             (strategy,) = weights
             source = self._draw(serial, strategy, max(floor, self.freed), rng)
-            return self._read(source, kind=int(strategy == DESIRED))
+            return self._read(source, kind=int(strategy == strategies.DESIRED))
         limits = np.cumsum([*weights.values()])[:-1]
-        which = limits.searchsorted(draw_uniform(len(serial), rng), side="right")
+        which = limits.searchsorted(
+            strategies.draw_uniform(len(serial), rng), side="right"
+        )
         goals = np.empty((len(serial), *self._goals.shape[2:]), self._goals.dtype)
         for number, strategy in enumerate(weights):
             rows = (which == number).nonzero()[0]
@@ -163,23 +138,25 @@ class GoalMemory:
         rng: Generator | None,
     ) -> Integers:
         """Draws the serials of the transitions that goals are from, (n,)."""
-        if strategy in (RANDOM, DESIRED):
-            return draw_integers(floor, np.full_like(serial, self.tracker.count), rng)
+        if strategy in (strategies.RANDOM, strategies.DESIRED):
+            return strategies.draw_integers(
+                floor, np.full_like(serial, self.tracker.count), rng
+            )
         trajectory, step, steps = self.find(serial)
         end = np.fromiter(map(len, steps), np.int64, len(steps))
         first = np.zeros_like(end)
-        if strategy not in LOOKING_AHEAD:
+        if strategy not in strategies.LOOKING_AHEAD:
             oldest = map(bisect_left, steps, (floor - trajectory).tolist())
             first = np.minimum(np.fromiter(oldest, np.int64, len(steps)), step)
-        chosen = choose_steps(strategy, step, first, end, rng)
+        chosen = strategies.choose_steps(strategy, step, first, end, rng)
         distance = map(getitem, steps, chosen.tolist())
         return trajectory + np.fromiter(distance, np.int64, len(steps))
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
         rings = torch.from_numpy(self._goals), torch.from_numpy(self._distance)
-        steps = {t: steps.tolist() for t, steps in self._steps.items()}
-        state = {"freed": self.freed, "rings": rings, "steps": steps}
+        state = {"freed": self.freed, "rings": rings}
+        state["steps"] = {t: steps.tolist() for t, steps in self._steps.items()}
         return copy.deepcopy({**state, "tracker": vars(self.tracker)})
 
     def load(self, state: dict[str, Any]) -> None:

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
@@ -20,12 +19,11 @@ from torch_panda.transforms.trajectories import Goals, Integers
 class HindsightRelabel(BufferTransform):
     """Gives sampled transitions goals that their trajectory achieved later.
 
-    Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): `extend`
-    notes to which trajectory every transition belongs and what it achieved; `sample`
-    relabels a random `her_ratio` of the rows. The others come out as they were stored.
-    Strategies are "future" (this step or a later one of the episode), "final" (its last
-    step), "episode" (any of its steps) and "random" (any stored transition), where the
-    goal is what the step achieved; and "desired", what any stored one was asked for.
+    Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): a random
+    `her_ratio` of the rows is relabelled; the others come out as they were stored.
+    Goals are what a step achieved, of the same episode: "future" (this step or later),
+    "final" (the last), "episode" (any); of any other: "random"; or "desired", what any
+    stored transition was asked for. README.md beside this file is a guide.
 
     Args:
         reward_fn: see `BufferTransform`, as for **options.
@@ -34,15 +32,10 @@ class HindsightRelabel(BufferTransform):
         unit: "row" draws a goal a row, "slice" one for all rows of a slice (that follow
             each other in the batch and in time), drawn for its last row: for learners
             on a `SliceSampler`, which puts stored ends back unless truncated_key=None.
-        capacity: transitions to remember where no buffer calls, which would tell.
+        capacity: transitions to remember where no buffer calls, which would tell it.
         goal_parts: sizes of the parts of a goal vector, e.g. (3, 3) for two objects.
             Every part is relabelled with probability her_ratio, with a goal drawn for
-            it alone (multi-criteria hindsight, Lanier et al. 2019, arXiv 1906.03710).
-
-    Raises:
-        ValueError: an argument, or the data, would make goals or rewards wrong.
-        KeyError: the data lack an entry, or were not noted.
-        RuntimeError: the buffer cannot be followed.
+            it alone (Lanier et al. 2019, arXiv 1906.03710).
     """
 
     def __init__(
@@ -77,11 +70,10 @@ class HindsightRelabel(BufferTransform):
             fits = tensordict.ndim in (ndim - 1, ndim) and buffer.dim_extend == ndim - 1
             if not fits or not issubclass(writer, RoundRobinWriter):
                 raise RuntimeError(
-                    "HindsightRelabel needs rows in order of time, written round-robin "
-                    f"(here: {writer.__name__}); got data of {list(tensordict.shape)} "
-                    f"for ndim={ndim}: extend with data.reshape(-1), or use a storage "
-                    "of several dimensions, ndim=2 for [num_envs, time] (as collectors "
-                    "with replay_buffer= write)."
+                    f"rows must be written round-robin (here: {writer.__name__}) in "
+                    f"order of time; got {list(tensordict.shape)} for ndim={ndim}: "
+                    "extend with data.reshape(-1), or use several dimensions, ndim=2 "
+                    "for [num_envs, time] (of collectors with replay_buffer=)."
                 )
             is_item = tensordict.ndim < ndim
         batch = tensordict.unsqueeze(-1) if is_item else tensordict
@@ -95,9 +87,9 @@ class HindsightRelabel(BufferTransform):
         return batch.squeeze(-1) if is_item else batch
 
     def _stored(self, buffer: ReplayBuffer | None) -> int:
-        count = self._memory.tracker.count
-        stored = min(count, self.capacity or count)
-        return stored if buffer is None else len(buffer.storage)
+        if buffer is not None:
+            return len(buffer.storage)
+        return min(count := self._memory.tracker.count, self.capacity or count)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled."""
@@ -128,13 +120,12 @@ class HindsightRelabel(BufferTransform):
         last, unit = serial, np.arange(len(serial))  # last rows; unit of every row
         if self.unit == "slice":
             trajectory, step, _ = self._memory.find(serial.clip(self._memory.freed))
-            # A padded slice repeats its last row.
-            goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
+                goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
             is_last = np.append(~goes_on, True)
             last, unit = serial[is_last], is_last.cumsum() - is_last
         parts = self.goal_parts or (1,)
         u = draw_uniform(len(parts) * len(last), self._generator)
-        chosen: NDArray[np.bool_] = u.reshape(len(parts), -1) < self.her_ratio
+        chosen: Any = np.less(u.reshape(len(parts), -1), self.her_ratio)
         chosen[:, unit[serial < self._memory.freed]] = False  # overwritten since
         rows = chosen.any(0)[unit].nonzero()[0]
         draws = []
@@ -154,10 +145,9 @@ class HindsightRelabel(BufferTransform):
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
         """Notes transitions that exist already: a data set, or a buffer's storage.
 
-        They are of any shape, in order of time, with trajectory ids; or [trajectories,
-        time]. Returns them flat and with a tag, for the `TensorStorage` of a buffer
-        with this transform. Memory-mapped entries are only read, and stay where they
-        are; `data` itself is left as it is.
+        They have trajectory ids and any shape, or are [trajectories, time]. Returns
+        them flat and with a tag, for the `TensorStorage` of a buffer with this
+        transform; `data` itself, which may be memory-mapped, is only read.
         """
         if self._memory.tracker.count:
             raise RuntimeError("prepare() must come before other transitions.")

@@ -34,8 +34,8 @@ class Rewriter:
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
         goals = [self.goal_key, self.next_goal_key, self.next_achieved_key]
         self._needed = [*goals, self.reward_key, _DONE]
-        self._needed += [self.success_key] if self.success_fn is not None else []
-        self._needed += [_TERMINATED] if self.terminated_fn is not None else []
+        self._needed += [self.success_key] if self.success_fn else []
+        self._needed += [_TERMINATED] if self.terminated_fn else []
 
     def check(self, batch: TensorDictBase) -> None:
         """Raises a KeyError that names the entries that are missing in the batch."""
@@ -47,11 +47,7 @@ class Rewriter:
     def rewrite(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor
     ) -> TensorDictBase:
-        """Returns a batch in which some rows have other goals, and what follows.
-
-        The rows, (n,), are numbers in the flattened batch; goals (n, *goal). The batch
-        itself, which may be the storage's own, is left as it is.
-        """
+        """Returns a copy in which (flat) rows, (n,), have other goals, (n, *goal)."""
         flat = batch if batch.ndim == 1 else batch.reshape(-1)
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
         old_goals = flat.get(self.goal_key)
@@ -64,7 +60,6 @@ class Rewriter:
             new[self.success_key] = evaluate(self.success_fn, achieved, goals, success)
         if self.terminated_fn is not None:
             done, terminated = flat.get(_DONE), flat.get(_TERMINATED)
-            # What ended without terminating was truncated.
             truncated = flat.get(("next", "truncated"), done & ~terminated)
             stays = terminated.index_select(0, rows)
             if stays.any():  # unless the old goal is why it ended: a failure, say

@@ -1,9 +1,8 @@
 """Goal strategies: which goal a transition is relabelled with.
 
-A strategy that follows the transition's own trajectory chooses a step of it: `step` is
-the transition's own, (n,); stored are the steps from `first` up to and without `end`,
-counted from the oldest that is known. The names are those of the paper (Andrychowicz
-et al. 2017, section 4.5); "desired", which mixes in the task's own goals, is not in it.
+One that follows the transition's trajectory chooses a step of it: `step`, (n,), is its
+own; stored are those from `first` up to and without `end`, counted from the oldest
+known. All but "desired" are those of Andrychowicz et al. 2017, section 4.5.
 """
 
 from __future__ import annotations
@@ -23,10 +22,8 @@ from torch_panda.transforms.trajectories import Integers
 Strategy = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
 Weights = dict[str | Strategy, float]
 
-RANDOM = "random"  # what any stored transition achieved
-DESIRED = "desired"  # what any stored transition was asked for
-# Look ahead only: what follows a stored transition is stored too.
-LOOKING_AHEAD = ("future", "final")
+RANDOM, DESIRED = "random", "desired"  # of any stored transition
+LOOKING_AHEAD = ("future", "final")  # what follows a stored transition is stored too
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
@@ -45,7 +42,6 @@ def parse_strategies(strategy: str | Strategy | Mapping[Any, float]) -> Weights:
 
 def draw_uniform(number: int, generator: Generator | None) -> NDArray[np.float64]:
     """Draws random numbers from 0 to 1, (number,), with a generator of the CPU's."""
-    # float32 would skip steps of trajectories longer than 2**24.
     u = torch.rand(number, generator=generator, dtype=torch.float64, device="cpu")
     return u.numpy()
 

@@ -12,15 +12,16 @@ from torch import Tensor
 
 Integers = NDArray[np.integer[Any]]
 Goals = NDArray[Any]  # (n, *goal)
+# Of transitions: ids, whether they are done, what they achieved and began with.
+Columns = tuple[Integers, NDArray[np.bool_], Goals, Goals | None]
 
 
 class TrajectoryTracker:
     """Follows trajectories from batch to batch; they are named by their first serial.
 
-    A row goes on with the trajectory of the row of its id before it, unless that one
-    was done, or had achieved another goal than this row begins with (ids begin anew
-    with every collector). If no row ever begins with the goal achieved before it, or
-    what it begins with is unknown, the ids alone decide.
+    A row goes on with the trajectory of the row of its id before it, unless that was
+    done, or got to another goal than this row begins with (as ids begin anew with every
+    collector). If no row ever begins where the one before got to, the ids decide.
     """
 
     def __init__(self) -> None:
@@ -37,13 +38,7 @@ class TrajectoryTracker:
         root: Goals | None,
         last_achieved: Callable[[Integers], Goals],
     ) -> tuple[Integers, Integers, Integers]:
-        """Finds the trajectories of a batch in which the rows of an id are in order.
-
-        Takes ids, (n,), whether a row is done, (n,), what it achieved and, if known,
-        began with, (n, *goal) each, and a function for what trajectories achieved last.
-        Returns the rows sorted by trajectory and time, (n,), how many of them follow
-        each other in one trajectory, (m,), and which it is, (m,).
-        """
+        """Returns rows by trajectory, (n,), lengths and names of their runs, (m,)."""
         if self._has_roots != (root is not None):
             self.open.clear()
             self._has_roots = root is not None
@@ -99,9 +94,8 @@ def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Integers:
     shape = tuple(batch.shape)
     if ids is not None:
         if ids.numel() != batch.numel():
-            raise ValueError(
-                f"expected ids {shape} at {key!r}, got {tuple(ids.shape)}."
-            )
+            got = tuple(ids.shape)
+            raise ValueError(f"expected ids {shape} at {key!r}, got {got}.")
         numbers: Integers = time_first(ids.reshape(batch.shape), batch.ndim)
         return numbers
     if batch.ndim < 2 and not single_env:
