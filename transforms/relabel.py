@@ -120,7 +120,7 @@ class HindsightRelabel(BufferTransform):
         last, unit = serial, np.arange(len(serial))  # last rows; unit of every row
         if self.unit == "slice":
             trajectory, step, _ = self._memory.find(serial.clip(self._memory.freed))
-                goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
+            goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
             is_last = np.append(~goes_on, True)
             last, unit = serial[is_last], is_last.cumsum() - is_last
         parts = self.goal_parts or (1,)
