@@ -8,9 +8,15 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torch_panda.transforms.base import SERIAL_KEY, BufferTransform, samples_slices
+from torch_panda.transforms.base import (
+    SERIAL_KEY,
+    BufferTransform,
+    find_buffer,
+    samples_slices,
+)
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import DESIRED, RANDOM
+from torch_panda.transforms.trajectories import Integers
 
 
 class HindsightAugment(BufferTransform):
@@ -34,11 +40,18 @@ class HindsightAugment(BufferTransform):
             goals = f"cannot draw {self.strategy!r} goals; HindsightRelabel can"
             raise ValueError(f"HindsightAugment sees one episode at a time: {goals}.")
         self.k = k
-        self._held: list[TensorDictBase] = []  # of open trajectories, in order
+        # Transitions of open trajectories: rows of a pool, and their serials, or -1.
+        self._pool: TensorDictBase | None = None
+        self._serials: Integers = np.zeros(0, dtype=np.int64)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Takes transitions in and returns those of the episodes that have ended."""
-        buffer = self._find_buffer()
+        """Takes transitions in and returns those of the episodes that have ended.
+
+        Raises:
+            ValueError: it is one transition, without a dimension of time.
+            RuntimeError: the buffer does not store rows one by one.
+        """
+        buffer = find_buffer()
         if not tensordict.ndim:
             raise ValueError("`add` takes many rows for one item: use `extend`.")
         if samples_slices(buffer) or (buffer is not None and buffer.storage.ndim > 1):
@@ -47,26 +60,46 @@ class HindsightAugment(BufferTransform):
                 'no slices but HindsightRelabel(unit="slice").'
             )
         self._rewriter.check(tensordict)
-        stored = self._memory.tracker.count
-        stored -= int(self._held[0].get(SERIAL_KEY)[0]) if self._held else stored
-        self._held.append(self._note(tensordict, stored, None).reshape(-1))
-        held = TensorDict.cat(self._held)
-        held = held[held.get(SERIAL_KEY).argsort()]  # in order of time
-        trajectory, *_ = self._memory.find(held.get(SERIAL_KEY).cpu().numpy())
-        still_open = [*self._memory.tracker.open.values()]
-        is_open = torch.from_numpy(np.isin(trajectory, still_open))
-        self._held = [held[is_open]] if is_open.any() else []
-        return None if is_open.all() else self._augment(held[~is_open])
+        with self._lock:
+            count = self._memory.tracker.count
+            oldest = self._serials[self._serials >= 0].min(initial=count)
+            batch = self._note(tensordict, int(count - oldest), None)
+            self._hold(batch.reshape(-1))
+            rows = (self._serials >= 0).nonzero()[0]
+            rows = rows[self._serials[rows].argsort()]  # in order of time
+            trajectory, _ = self._memory.find(self._serials[rows])
+            rows = rows[~np.isin(trajectory, [*self._memory.tracker.open.values()])]
+            return self._augment(rows) if len(rows) else None
 
-    def _augment(self, original: TensorDictBase) -> TensorDictBase:
-        """Returns transitions of whole episodes, then k relabelled copies of each."""
-        tag = original.get(SERIAL_KEY)
-        serial = tag.cpu().numpy().repeat(self.k)
-        drawn = self._memory.draw(serial, self._weights, 0, self._generator)
-        goals = torch.from_numpy(drawn).to(tag.device)
-        rows = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
-        every = torch.arange(len(rows), device=goals.device)
-        copies = self._rewriter.rewrite(original[rows], every, goals)
+    def _hold(self, batch: TensorDictBase) -> None:
+        """Copies transitions, (n,), into free rows of the pool, which may grow."""
+        free = (self._serials < 0).nonzero()[0]
+        missing = len(batch) - len(free)
+        if missing > 0:
+            missing = max(missing, len(self._serials))
+            parts = [batch[:1].expand(missing).clone()]
+            self._pool = TensorDict.cat(
+                [self._pool, *parts] if self._pool is not None else parts
+            )
+            self._serials = np.append(self._serials, np.full(missing, -1))
+            free = (self._serials < 0).nonzero()[0]
+        rows = free[: len(batch)]
+        self._pool[torch.from_numpy(rows)] = batch
+        self._serials[rows] = batch.get(SERIAL_KEY).numpy(force=True)
+
+    def _augment(self, rows: Integers) -> TensorDictBase:
+        """Takes rows of whole episodes, (n,), out of the pool; returns (n * (1 + k),).
+
+        They come first, in order, then k relabelled copies of each.
+        """
+        original = self._pool[torch.from_numpy(rows)]
+        serial = self._serials[rows].repeat(self.k)
+        self._serials[rows] = -1
+        drawn = self._memory.draw(serial, self._weights, self._generator)
+        goals = torch.from_numpy(drawn).to(original.get(SERIAL_KEY).device)
+        copied = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
+        every = torch.arange(len(copied), device=goals.device)
+        copies = self._rewriter.rewrite(original[copied], every, goals)
         return TensorDict.cat([original, copies]).exclude(SERIAL_KEY)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -76,14 +109,19 @@ class HindsightAugment(BufferTransform):
     def empty(self) -> None:
         """Drops the episodes held back, which the buffer's own `empty` does not."""
         super().empty()
-        self._held = []
+        self._serials = self._serials[:0]
+        self._pool = None
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the episodes held back and the generator, for `state_dict`."""
-        held = [part.to_dict() for part in self._held]
+        held = (self._serials >= 0).nonzero()[0]
+        pool = None if self._pool is None else self._pool[torch.from_numpy(held)]
+        held = {} if pool is None else pool.to_dict()
         return {**super().get_extra_state(), "held": held}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Takes what `get_extra_state` returned."""
         super().set_extra_state(state)
-        self._held = [TensorDict(p, [len(p[SERIAL_KEY])]) for p in state["held"]]
+        self._pool, self._serials = None, self._serials[:0]
+        if state["held"]:
+            self._hold(TensorDict(state["held"], [len(state["held"][SERIAL_KEY])]))

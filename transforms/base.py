@@ -102,21 +102,6 @@ class BufferTransform(envs.Transform):
                 options[option] = (env.is_success if value else None) if ends else value
         return cls(**options)
 
-    def _find_buffer(self) -> ReplayBuffer | None:
-        """Returns the buffer that calls, if any."""
-        # torchrl gives transforms no other handle on its size, layout and sampler.
-        frame = inspect.currentframe()
-        while frame is not None:
-            buffer = frame.f_locals.get("self")
-            if issubclass(type(buffer), ReplayBuffer):
-                if frame.f_code.co_name == "__setitem__":
-                    raise RuntimeError(
-                        "hindsight cannot follow rows that are replaced."
-                    )
-                return buffer
-            frame = frame.f_back
-        return None
-
     def _note(
         self, batch: TensorDictBase, stored: int, capacity: int | None
     ) -> TensorDictBase:
@@ -186,6 +171,28 @@ class BufferTransform(envs.Transform):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__({**state, "_lock": threading.Lock()})
+
+
+def find_buffer() -> ReplayBuffer | None:
+    """Returns the buffer that calls, if any; a RuntimeError if it replaces rows.
+
+    torchrl gives transforms no handle on their buffer, whose size, layout and sampler
+    decide what is right, and a transform may go from one to another: so the functions
+    that call are looked at (3 us, as most are ruled out by their module).
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").startswith("torchrl.data."):
+            buffer = frame.f_locals.get("self")
+            if isinstance(buffer, ReplayBuffer):
+                if frame.f_code.co_name == "__setitem__":
+                    raise RuntimeError(
+                        "hindsight cannot follow rows that are replaced: extend() the "
+                        "buffer instead of assigning to its rows."
+                    )
+                return buffer
+        frame = frame.f_back
+    return None
 
 
 def samples_slices(buffer: ReplayBuffer | None) -> bool:

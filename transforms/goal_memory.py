@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import copy
-from array import array
-from bisect import bisect_left
-from operator import getitem
 from typing import Any
 
 import numpy as np
@@ -16,58 +13,63 @@ from torch_panda.transforms import strategies
 from torch_panda.transforms.strategies import Strategy, Weights
 from torch_panda.transforms.trajectories import Columns, Goals, Integers
 from torch_panda.transforms.trajectories import TrajectoryTracker as Tracker
+from torch_panda.transforms.trajectory_table import TrajectoryTable
 
 
 class GoalMemory:
     """Finds the goal achieved at any stored step of a transition's trajectory.
 
-    Transitions are numbered in the order of writing. A round-robin buffer overwrites
-    its oldest rows, so it holds the last serials, and with a transition what lies ahead
-    of it. A ring holds the goals of every serial, and a growing array the serials of a
-    trajectory, which is named by its first one, as distances from it.
+    Transitions are numbered in the order of writing: their serials. A round-robin
+    buffer overwrites its oldest rows, so it holds the last serials, and with a
+    transition all that lies ahead of it. A ring holds the goals: the transition
+    `serial` is its row `serial % rows`. A table lists the rows of every trajectory.
     """
 
     def __init__(self, keeps_desired: bool = False) -> None:
         self._kinds = 2 if keeps_desired else 1
         self.tracker = Tracker()
         self.freed = 0  # serial of the oldest transition that is remembered
-        self._goals: Goals = np.zeros(0)  # (rows, achieved or desired, *goal)
-        self._distance = np.zeros(0, dtype=np.int32)  # from the first serial, (rows,)
-        self._steps: dict[int, array[int]] = {}  # trajectory -> distances, ascending
+        self._goals: Goals = np.zeros((self._kinds, 0))  # (kinds, rows, *goal)
+        self._table = TrajectoryTable()
 
     def write(
         self, columns: Columns, desired: Goals, stored: int, capacity: int | None
     ) -> Integers:
-        """Takes the goals of transitions and returns their serials, (n,)."""
+        """Takes transitions that are about to be stored.
+
+        Args:
+            columns: their ids, ends and achieved goals; see `Columns`.
+            desired: their desired goals, (n, *goal).
+            stored: how many transitions before them are still stored.
+            capacity: how many can be stored, if that is known.
+
+        Returns:
+            Their serials, (n,).
+        """
         head, achieved = self.tracker.count, columns[2]
         self._make_room(head, achieved, stored, capacity)
-        follow = self.tracker.follow
-        order, length, trajectory = follow(*columns, self._last_achieved)
-        serial = np.arange(head, head + len(order))
+        runs = self.tracker.follow(*columns, self._last_achieved)
+        serial = np.arange(head, head + len(achieved))
+        row = serial % self._goals.shape[1]
         for kind, goals in enumerate((achieved, desired)[: self._kinds]):
-            self._goals[serial % len(self._goals), kind] = goals
-        distance = head + order - trajectory.repeat(length)
-        self._distance[(head + order) % len(self._distance)] = distance
-        numbers, ends = distance.tolist(), length.cumsum()
-        starts = (ends - length).tolist()
-        for t, i, j in zip(trajectory.tolist(), starts, ends.tolist(), strict=True):
-            self._steps.setdefault(t, array("i")).extend(numbers[i:j])
+            self._goals[kind][row] = goals
+        self._table.append(runs.trajectory, runs.length, row[runs.order])
+        self.tracker.keep(runs)
         return serial
 
     def _last_achieved(self, trajectories: Integers) -> Goals:
-        last = (self._steps[t][-1] for t in trajectories.tolist())
-        return self._read(trajectories + np.fromiter(last, np.int64, len(trajectories)))
+        """Returns what the last transitions of trajectories achieved, (m, *goal)."""
+        return self._goals[0][self._table.rows[self._table.end[trajectories] - 1]]
 
     def _make_room(
         self, head: int, goals: Goals, stored: int, capacity: int | None
     ) -> None:
         """Makes the ring hold some more; the first goals tell their type."""
-        rows = len(self._distance)
-        if not rows:
-            self._goals = np.zeros((0, self._kinds, *goals.shape[1:]), goals.dtype)
-        end = head + len(goals)
+        if not self._goals.shape[1]:
+            self._goals = np.zeros((self._kinds, 0, *goals.shape[1:]), goals.dtype)
+        rows, end = self._goals.shape[1], head + len(goals)
         if end - self.freed > rows:
-            self._free(head - stored)
+            self.free(head - stored)
         if end - self.freed <= rows:
             return
         room = max(1024, 2 * rows)
@@ -75,94 +77,63 @@ class GoalMemory:
             room = min(room, capacity + max(256, capacity // 64))
         room = max(end - self.freed, room)
         serial = np.arange(self.freed, head)
-        distance = np.zeros(room, dtype=np.int32)
-        larger = np.zeros((room, *self._goals.shape[1:]), self._goals.dtype)
-        if len(serial):
-            old, new = serial % rows, serial % room
-            distance[new] = self._distance[old]
-            larger[new] = self._goals[old]
-        self._goals, self._distance = larger, distance
+        old, new = serial % max(rows, 1), serial % room
+        larger = np.zeros((self._kinds, room, *goals.shape[1:]), self._goals.dtype)
+        larger[:, new] = self._goals[:, old]
+        self._goals = larger
+        self._table.resize_ring(old, new, room)
 
-    def _free(self, floor: int) -> None:
+    def free(self, floor: int) -> None:
         """Forgets the transitions below a serial: they have been overwritten."""
-        gone = set()
-        overwritten = self._trajectory_of(np.arange(self.freed, floor))
-        for t in np.unique(overwritten).tolist():
-            steps = self._steps[t]
-            del steps[: bisect_left(steps, floor - t)]
-            if not steps:
-                del self._steps[t]
-                gone.add(t)
-        self.freed = max(self.freed, floor)
-        if not gone.isdisjoint(self.tracker.open.values()):
-            ids = self.tracker.open.items()
-            self.tracker.open = {i: t for i, t in ids if t not in gone}
+        if floor <= self.freed:
+            return
+        overwritten = np.arange(self.freed, floor) % self._goals.shape[1]
+        self.tracker.forget(self._table.overwrite(overwritten))
+        self.freed = floor
 
-    def _read(self, serial: Integers, kind: int = 0) -> Goals:
-        """Returns the achieved (0) or desired (1) goals of serials, (n, *goal)."""
-        return self._goals[serial % len(self._goals), kind]
+    def find(self, serial: Integers) -> tuple[Integers, Integers]:
+        """Returns trajectories of transitions and their places in the table, (n,)."""
+        place = self._table.places[serial % self._goals.shape[1]]
+        return self._table.slot_at(place), place
 
-    def _trajectory_of(self, serial: Integers) -> Integers:
-        return serial - self._distance[serial % len(self._distance)]
-
-    def find(self, serial: Integers) -> tuple[Integers, Integers, list[array[int]]]:
-        """Returns trajectory and step of transitions, (n,), and all their distances."""
-        trajectory = self._trajectory_of(serial)
-        steps = [*map(self._steps.__getitem__, trajectory.tolist())]
-        step = map(bisect_left, steps, (serial - trajectory).tolist())
-        return trajectory, np.fromiter(step, np.int64, len(serial)), steps
-
-    def draw(
-        self, serial: Integers, weights: Weights, floor: int, rng: Generator | None
-    ) -> Goals:
-        """Draws a goal for each serial; the oldest that is stored is `floor`."""
+    def draw(self, serial: Integers, weights: Weights, rng: Generator | None) -> Goals:
+        """Draws a goal for each serial, (n,), by strategies: (n, *goal)."""
         if len(weights) == 1:
             (strategy,) = weights
-            source = self._draw(serial, strategy, max(floor, self.freed), rng)
-            return self._read(source, kind=int(strategy == strategies.DESIRED))
+            kind = int(strategy == strategies.DESIRED)
+            return self._goals[kind].take(self._draw(serial, strategy, rng), axis=0)
         limits = np.cumsum([*weights.values()])[:-1]
-        which = limits.searchsorted(
-            strategies.draw_uniform(len(serial), rng), side="right"
-        )
+        u = strategies.draw_uniform(len(serial), rng)
+        which = limits.searchsorted(u, side="right")
         goals = np.empty((len(serial), *self._goals.shape[2:]), self._goals.dtype)
         for number, strategy in enumerate(weights):
             rows = (which == number).nonzero()[0]
-            goals[rows] = self.draw(serial[rows], {strategy: 1.0}, floor, rng)
+            goals[rows] = self.draw(serial[rows], {strategy: 1.0}, rng)
         return goals
 
     def _draw(
-        self,
-        serial: Integers,
-        strategy: str | Strategy,
-        floor: int,
-        rng: Generator | None,
+        self, serial: Integers, strategy: str | Strategy, rng: Generator | None
     ) -> Integers:
-        """Draws the serials of the transitions that goals are from, (n,)."""
+        """Draws the ring's rows of the transitions that goals are from, (n,)."""
+        rows, table = self._goals.shape[1], self._table
         if strategy in (strategies.RANDOM, strategies.DESIRED):
-            return strategies.draw_integers(
-                floor, np.full_like(serial, self.tracker.count), rng
-            )
-        trajectory, step, steps = self.find(serial)
-        end = np.fromiter(map(len, steps), np.int64, len(steps))
-        first = np.zeros_like(end)
-        if strategy not in strategies.LOOKING_AHEAD:
-            oldest = map(bisect_left, steps, (floor - trajectory).tolist())
-            first = np.minimum(np.fromiter(oldest, np.int64, len(steps)), step)
-        chosen = strategies.choose_steps(strategy, step, first, end, rng)
-        distance = map(getitem, steps, chosen.tolist())
-        return trajectory + np.fromiter(distance, np.int64, len(steps))
+            end = np.full(len(serial), self.tracker.count)
+            return strategies.draw_integers(self.freed, end, rng) % rows
+        trajectory, place = self.find(serial)
+        first, end = table.first.take(trajectory), table.end.take(trajectory)
+        return table.rows.take(
+            strategies.choose_steps(strategy, place, first, end, rng)
+        )
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
-        rings = torch.from_numpy(self._goals), torch.from_numpy(self._distance)
-        state = {"freed": self.freed, "rings": rings}
-        state["steps"] = {t: steps.tolist() for t, steps in self._steps.items()}
-        return copy.deepcopy({**state, "tracker": vars(self.tracker)})
+        state = {"freed": self.freed, "goals": torch.from_numpy(self._goals)}
+        state |= {"table": self._table.state(), "tracker": vars(self.tracker)}
+        return copy.deepcopy(state)
 
     def load(self, state: dict[str, Any]) -> None:
         """Takes the state that another memory returned."""
         state = copy.deepcopy(state)
-        self.freed = state["freed"]
-        self._goals, self._distance = (ring.numpy() for ring in state["rings"])
-        self._steps = {t: array("i", steps) for t, steps in state["steps"].items()}
+        self.freed, self._goals = state["freed"], state["goals"].numpy()
+        self._table.load(state["table"])
         self.tracker.load(state["tracker"])

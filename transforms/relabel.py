@@ -10,9 +10,14 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
-from torch_panda.transforms.base import SERIAL_KEY, BufferTransform, samples_slices
+from torch_panda.transforms.base import (
+    SERIAL_KEY,
+    BufferTransform,
+    find_buffer,
+    samples_slices,
+)
 from torch_panda.transforms.rewrite import GoalFunction
-from torch_panda.transforms.strategies import draw_uniform
+from torch_panda.transforms.strategies import LOOKING_AHEAD, draw_uniform
 from torch_panda.transforms.trajectories import Goals, Integers
 
 
@@ -59,11 +64,12 @@ class HindsightRelabel(BufferTransform):
             raise ValueError(f"goal_parts must be positive sizes, got {goal_parts!r}.")
         self.her_ratio, self.unit = her_ratio, unit
         self.capacity, self.goal_parts = capacity, goal_parts
+        self._looks_ahead = all(name in LOOKING_AHEAD for name in self._weights)
         self._is_first_sample = True
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        buffer = self._find_buffer()
+        buffer = find_buffer()
         is_item = not tensordict.ndim  # one step
         if buffer is not None:
             ndim, writer = buffer.storage.ndim, type(buffer.writer)
@@ -92,9 +98,13 @@ class HindsightRelabel(BufferTransform):
         return min(count := self._memory.tracker.count, self.capacity or count)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Relabels rows that a buffer has sampled."""
+        """Relabels rows that a buffer has sampled.
+
+        Raises:
+            KeyError, RuntimeError: the rows were stored without this transform.
+        """
         tag = tensordict.get(SERIAL_KEY, None)
-        buffer = self._find_buffer()
+        buffer = find_buffer()
         if self._is_first_sample and self.unit == "row" and samples_slices(buffer):
             cure = 'pass unit="slice" for one goal a slice'
             warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
@@ -106,41 +116,48 @@ class HindsightRelabel(BufferTransform):
                     "HindsightRelabel must be in the buffer before the first extend(), "
                     "or its rows be noted by prepare()."
                 )
+            if not self._looks_ahead:
+                self._memory.free(floor)
             self._check_data(tensordict)
-            rows, goals = self._draw(tag.cpu().numpy().reshape(-1), floor, tensordict)
+            rows, goals = self._draw(tag.numpy(force=True).reshape(-1), tensordict)
         if not len(rows):
             return tensordict.exclude(SERIAL_KEY)
         index, new = (torch.from_numpy(x).to(tag.device) for x in (rows, goals))
         return self._rewriter.rewrite(tensordict, index, new).del_(SERIAL_KEY)
 
-    def _draw(
-        self, serial: Integers, floor: int, batch: TensorDictBase
-    ) -> tuple[Integers, Goals]:
+    def _draw(self, serial: Integers, batch: TensorDictBase) -> tuple[Integers, Goals]:
         """Draws rows of a batch of serials, (n,), and their new goals, (n, *goal)."""
-        last, unit = serial, np.arange(len(serial))  # last rows; unit of every row
+        last, unit = serial, None  # the last rows of units; the unit of every row
         if self.unit == "slice":
-            trajectory, step, _ = self._memory.find(serial.clip(self._memory.freed))
-            goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(step), (0, 1))
+            trajectory, place = self._memory.find(serial.clip(self._memory.freed))
+            goes_on = (np.diff(trajectory) == 0) & np.isin(np.diff(place), (0, 1))
             is_last = np.append(~goes_on, True)
             last, unit = serial[is_last], is_last.cumsum() - is_last
-        parts = self.goal_parts or (1,)
-        u = draw_uniform(len(parts) * len(last), self._generator)
-        chosen: Any = np.less(u.reshape(len(parts), -1), self.her_ratio)
-        chosen[:, unit[serial < self._memory.freed]] = False  # overwritten since
-        rows = chosen.any(0)[unit].nonzero()[0]
-        draws = []
-        for mask in chosen:  # a goal for every chosen unit, then for all its rows
-            drawn = self._memory.draw(last[mask], self._weights, floor, self._generator)
-            mine = mask[unit[rows]]
-            draws.append((mine, drawn[(mask.cumsum() - 1)[unit[rows[mine]]]]))
         if self.goal_parts is None:
-            return rows, draws[0][1]
+            return self._draw_once(serial, last, unit)
         own = batch.get(self._rewriter.goal_key)
-        goals = own.reshape(-1, own.shape[-1]).cpu().numpy()[rows]
-        ends = np.cumsum(parts)
-        for end, size, (mine, drawn) in zip(ends, parts, draws, strict=True):
-            goals[mine, end - size : end] = drawn[:, end - size : end]
-        return rows, goals
+        goals = own.reshape(-1, own.shape[-1]).numpy(force=True).copy()
+        is_new = np.zeros(len(goals), dtype=bool)
+        for end, size in zip(np.cumsum(self.goal_parts), self.goal_parts, strict=True):
+            rows, drawn = self._draw_once(serial, last, unit)
+            goals[rows, end - size : end] = drawn[:, end - size : end]
+            is_new[rows] = True
+        return is_new.nonzero()[0], goals[is_new]
+
+    def _draw_once(
+        self, serial: Integers, last: Integers, unit: Integers | None
+    ) -> tuple[Integers, Goals]:
+        """Draws units, and a goal for each; returns their rows and the rows' goals."""
+        u = draw_uniform(len(last), self._generator)
+        chosen: Any = np.less(u, self.her_ratio)
+        overwritten = serial < self._memory.freed  # since they were sampled
+        chosen[overwritten if unit is None else unit[overwritten]] = False
+        units = chosen.nonzero()[0]
+        goals = self._memory.draw(last.take(units), self._weights, self._generator)
+        if unit is None:
+            return units, goals
+        rows = chosen[unit].nonzero()[0]
+        return rows, goals[(chosen.cumsum() - 1)[unit[rows]]]
 
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
         """Notes transitions that exist already: a data set, or a buffer's storage.

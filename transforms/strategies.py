@@ -66,15 +66,17 @@ def choose_steps(
         return end - 1
     if isinstance(strategy, str):
         return draw_integers(step if strategy == "future" else first, end, generator)
-    s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in (step, first, end))
-    chosen = strategy(s, f, e, generator)
+    numbers = step - first, np.zeros_like(first), end - first
+    chosen = strategy(
+        *(torch.from_numpy(x.astype(np.int32)) for x in numbers), generator
+    )
     must = "the strategy must return"
     if not isinstance(chosen, Tensor):
         raise ValueError(f"{must} a tensor, got {type(chosen).__name__}.")
     if chosen.shape != step.shape or chosen.is_floating_point():
         got = f"{chosen.dtype} of shape {tuple(chosen.shape)}"
         raise ValueError(f"{must} integer steps {tuple(step.shape)}, got {got}.")
-    goal_step: Integers = chosen.cpu().numpy()
+    goal_step: Integers = first + chosen.cpu().numpy()
     if ((goal_step < first) | (goal_step >= end)).any():
         raise ValueError(f"{must} steps from first up to end.")
     return goal_step

@@ -3,21 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from itertools import compress
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
+from torch import Tensor, bfloat16
 
 Integers = NDArray[np.integer[Any]]
 Goals = NDArray[Any]  # (n, *goal)
-# Of transitions: ids, whether they are done, what they achieved and began with.
+# Of transitions, n each: ids, whether they are done, goals they achieved and, unless
+# the data do not tell, had achieved before.
 Columns = tuple[Integers, NDArray[np.bool_], Goals, Goals | None]
 
 
+class Runs(NamedTuple):
+    """Rows of a batch, n, put in order: m runs, each of one trajectory.
+
+    Attributes:
+        order: the rows, run by run, (n,).
+        length: of the runs, (m,).
+        trajectory: which they belong to, (m,); -1 for a new one.
+        name: their ids, (m,).
+        is_open: whether the trajectory may go on in the next batch, (m,).
+    """
+
+    order: Integers
+    length: Integers
+    trajectory: Integers
+    name: Integers
+    is_open: NDArray[np.bool_]
+
+
 class TrajectoryTracker:
-    """Follows trajectories from batch to batch; they are named by their first serial.
+    """Follows trajectories from batch to batch.
 
     A row goes on with the trajectory of the row of its id before it, unless that was
     done, or got to another goal than this row begins with (as ids begin anew with every
@@ -37,38 +57,52 @@ class TrajectoryTracker:
         achieved: Goals,
         root: Goals | None,
         last_achieved: Callable[[Integers], Goals],
-    ) -> tuple[Integers, Integers, Integers]:
-        """Returns rows by trajectory, (n,), lengths and names of their runs, (m,)."""
+    ) -> Runs:
+        """Puts the rows of a batch, n, in order; `keep` then remembers the runs.
+
+        Args:
+            ids, done, achieved, root: see `Columns`.
+            last_achieved: what the last rows of trajectories, (m,), achieved.
+        """
         if self._has_roots != (root is not None):
             self.open.clear()
             self._has_roots = root is not None
         order = ids.argsort(kind="stable")
         names, ends = ids[order], done[order]
-        is_head = np.ones(len(order), dtype=bool)  # the first row of its id
-        is_head[1:] = names[1:] != names[:-1]
+        is_head = np.ones(len(order) + 1, dtype=bool)  # first row of its id; the end
+        is_head[1:-1] = names[1:] != names[:-1]
+        heads = is_head[:-1].nonzero()[0]
         known = np.full(len(order), -1)
-        known[is_head] = [self.open.pop(i, -1) for i in names[is_head].tolist()]
+        known[heads] = [self.open.pop(i, -1) for i in names[heads].tolist()]
         begins = known < 0
-        begins[1:] &= is_head[1:] | ends[:-1]
+        begins[1:] &= is_head[1:-1] | ends[:-1]
         if root is not None:
-            inner = (~begins & ~is_head).nonzero()[0]
+            before = np.empty_like(achieved)
+            before[1:] = achieved[order[:-1]]
             resumed = (known >= 0).nonzero()[0]
-            before = achieved[order[inner - 1]], last_achieved(known[resumed])
-            places = np.concatenate([inner, resumed])
-            same = np.concatenate(before) == root[order[places]]
-            follows = same.reshape(len(places), root[:1].size).all(1)
+            if len(resumed):
+                before[resumed] = last_achieved(known[resumed])
+            same = (before == root[order]).reshape(len(order), -1).all(1)
+            follows = same & ~begins
             self._links = self._links or bool(follows.any())
-            begins[places[~follows]] = self._links
-        start = (begins | is_head).nonzero()[0]
-        length = np.diff(start, append=len(order))
-        trajectory = np.where(begins, self.count + order, known)[start]
+            begins = ~follows if self._links else begins
+        edges = np.append(begins | is_head[:-1], True).nonzero()[0]
+        start, end = edges[:-1], edges[1:]
+        trajectory = np.where(begins[start], -1, known[start])
         self.count += len(order)
-        runs = (names[start], trajectory, ends[start + length - 1])
-        for name, t, end in zip(*(x.tolist() for x in runs), strict=True):
-            self.open[name] = t
-            if end:
-                del self.open[name]
-        return order, length, trajectory
+        is_open = is_head[end] & ~ends[end - 1]
+        return Runs(order, end - start, trajectory, names[start], is_open)
+
+    def keep(self, runs: Runs) -> None:
+        """Remembers which trajectories may go on, now that all of them have names."""
+        pairs = zip(runs.name.tolist(), runs.trajectory.tolist(), strict=True)
+        self.open.update(compress(pairs, runs.is_open.tolist()))
+
+    def forget(self, trajectories: set[int]) -> None:
+        """Ends trajectories that have been overwritten."""
+        if not trajectories.isdisjoint(self.open.values()):
+            pairs = self.open.items()
+            self.open = {i: t for i, t in pairs if t not in trajectories}
 
     def load(self, state: dict[str, Any]) -> None:
         """Takes another tracker's attributes."""
@@ -78,10 +112,16 @@ class TrajectoryTracker:
 
 
 def time_first(value: Tensor, batch_dims: int) -> Any:  # noqa: ANN401 (of any type)
-    """Flattens [*batch, time, ...] to (time * batch, ...), as storages fill up."""
+    """Flattens [*batch, time, ...] to (time * batch, ...), as storages fill up.
+
+    Raises:
+        ValueError: numpy does not know the type, of goals of bfloat16.
+    """
+    if value.dtype is bfloat16:
+        raise ValueError("hindsight cannot hold goals of bfloat16: use float32 ones.")
     if batch_dims > 1:
         value = value.movedim(batch_dims - 1, 0).flatten(0, batch_dims - 1)
-    return value.cpu().numpy()
+    return value.numpy(force=True)
 
 
 def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Integers:
