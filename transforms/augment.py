@@ -51,7 +51,7 @@ class HindsightAugment(BufferTransform):
             ValueError: it is one transition, without a dimension of time.
             RuntimeError: the buffer does not store rows one by one.
         """
-        buffer = find_buffer()
+        buffer, _ = find_buffer()
         if not tensordict.ndim:
             raise ValueError("`add` takes many rows for one item: use `extend`.")
         if samples_slices(buffer) or (buffer is not None and buffer.storage.ndim > 1):
@@ -99,7 +99,7 @@ class HindsightAugment(BufferTransform):
         goals = torch.from_numpy(drawn).to(original.get(SERIAL_KEY).device)
         copied = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
         every = torch.arange(len(copied), device=goals.device)
-        copies = self._rewriter.rewrite(original[copied], every, goals)
+        copies = self._rewriter.rewrite(original[copied], every, goals, is_own=True)
         return TensorDict.cat([original, copies]).exclude(SERIAL_KEY)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

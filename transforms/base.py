@@ -106,25 +106,29 @@ class BufferTransform(envs.Transform):
         self, batch: TensorDictBase, stored: int, capacity: int | None
     ) -> TensorDictBase:
         """Remembers transitions [*batch, time], and tags them with their serials."""
-        shape = batch.batch_size
         if _has_multi_step(self):
             raise RuntimeError(
                 "n-step rewards, of MultiStepTransform, are not known for other goals: "
                 'sample slices with HindsightRelabel(unit="slice") instead.'
             )
         self._check_data(batch)
-        keys = self._rewriter
+        keys, dims = self._rewriter, batch.ndim
+        done = batch.get(("next", "done"))
         root = batch.get(keys.achieved_goal_key, None)
         columns = (
             ids_of(batch, self.trajectory_key, self.single_env),
-            time_first(batch.get(("next", "done")).reshape(shape), len(shape)),
-            time_first(batch.get(keys.next_achieved_key), len(shape)),
-            None if root is None else time_first(root, len(shape)),
+            time_first(done if dims == 1 else done.reshape(batch.shape), dims).ravel(),
+            time_first(batch.get(keys.next_achieved_key), dims),
+            None if root is None else time_first(root, dims),
         )
-        desired = time_first(batch.get(keys.goal_key), len(shape))
+        goals = batch.get(keys.goal_key)
+        desired = time_first(goals, dims)
         serial = self._memory.write(columns, desired, stored, capacity)
-        tag = torch.from_numpy(serial).view(shape[-1], *shape[:-1]).movedim(0, -1)
-        return batch.set(SERIAL_KEY, tag.to(batch.get(keys.goal_key).device))
+        tag = torch.from_numpy(serial)
+        if dims > 1:  # back to [*batch, time]
+            shape = batch.batch_size
+            tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
+        return batch.set(SERIAL_KEY, tag.to(goals.device))
 
     def end_trajectories(self) -> None:
         """Ends all trajectories; what is written next begins new ones."""
@@ -173,8 +177,8 @@ class BufferTransform(envs.Transform):
         super().__setstate__({**state, "_lock": threading.Lock()})
 
 
-def find_buffer() -> ReplayBuffer | None:
-    """Returns the buffer that calls, if any; a RuntimeError if it replaces rows.
+def find_buffer() -> tuple[ReplayBuffer | None, str]:
+    """Returns the buffer that calls, if any, and its method; refuses `__setitem__`.
 
     torchrl gives transforms no handle on their buffer, whose size, layout and sampler
     decide what is right, and a transform may go from one to another: so the functions
@@ -185,14 +189,15 @@ def find_buffer() -> ReplayBuffer | None:
         if frame.f_globals.get("__name__", "").startswith("torchrl.data."):
             buffer = frame.f_locals.get("self")
             if isinstance(buffer, ReplayBuffer):
-                if frame.f_code.co_name == "__setitem__":
+                method = frame.f_code.co_name
+                if method == "__setitem__":
                     raise RuntimeError(
                         "hindsight cannot follow rows that are replaced: extend() the "
                         "buffer instead of assigning to its rows."
                     )
-                return buffer
+                return buffer, method
         frame = frame.f_back
-    return None
+    return None, ""
 
 
 def samples_slices(buffer: ReplayBuffer | None) -> bool:

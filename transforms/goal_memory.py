@@ -59,19 +59,21 @@ class GoalMemory:
 
     def _last_achieved(self, trajectories: Integers) -> Goals:
         """Returns what the last transitions of trajectories achieved, (m, *goal)."""
-        return self._goals[0][self._table.rows[self._table.end[trajectories] - 1]]
+        table = self._table
+        last = table.rows.take(table.end.take(trajectories) - 1)
+        return self._goals[0].take(last, axis=0)
 
     def _make_room(
         self, head: int, goals: Goals, stored: int, capacity: int | None
     ) -> None:
         """Makes the ring hold some more; the first goals tell their type."""
-        if not self._goals.shape[1]:
-            self._goals = np.zeros((self._kinds, 0, *goals.shape[1:]), goals.dtype)
         rows, end = self._goals.shape[1], head + len(goals)
         if end - self.freed > rows:
             self.free(head - stored)
         if end - self.freed <= rows:
             return
+        if not rows:
+            self._goals = np.zeros((self._kinds, 0, *goals.shape[1:]), goals.dtype)
         room = max(1024, 2 * rows)
         if capacity is not None:  # and a little more, so that freeing is rare
             room = min(room, capacity + max(256, capacity // 64))
@@ -93,7 +95,7 @@ class GoalMemory:
 
     def find(self, serial: Integers) -> tuple[Integers, Integers]:
         """Returns trajectories of transitions and their places in the table, (n,)."""
-        place = self._table.places[serial % self._goals.shape[1]]
+        place = self._table.places.take(serial % self._goals.shape[1])
         return self._table.slot_at(place), place
 
     def draw(self, serial: Integers, weights: Weights, rng: Generator | None) -> Goals:

@@ -69,7 +69,7 @@ class HindsightRelabel(BufferTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        buffer = find_buffer()
+        buffer, _ = find_buffer()
         is_item = not tensordict.ndim  # one step
         if buffer is not None:
             ndim, writer = buffer.storage.ndim, type(buffer.writer)
@@ -104,11 +104,12 @@ class HindsightRelabel(BufferTransform):
             KeyError, RuntimeError: the rows were stored without this transform.
         """
         tag = tensordict.get(SERIAL_KEY, None)
-        buffer = find_buffer()
-        if self._is_first_sample and self.unit == "row" and samples_slices(buffer):
-            cure = 'pass unit="slice" for one goal a slice'
-            warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
-        self._is_first_sample = False
+        buffer, method = find_buffer()
+        if self._is_first_sample:
+            self._is_first_sample = False
+            if self.unit == "row" and samples_slices(buffer):
+                cure = 'pass unit="slice" for one goal a slice'
+                warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
         with self._lock:
             floor = self._memory.tracker.count - self._stored(buffer)
             if tag is None or floor < 0:
@@ -123,7 +124,9 @@ class HindsightRelabel(BufferTransform):
         if not len(rows):
             return tensordict.exclude(SERIAL_KEY)
         index, new = (torch.from_numpy(x).to(tag.device) for x in (rows, goals))
-        return self._rewriter.rewrite(tensordict, index, new).del_(SERIAL_KEY)
+        is_own = method == "_sample"  # made for us; others may hand out their storage
+        batch = self._rewriter.rewrite(tensordict, index, new, is_own=is_own)
+        return batch.del_(SERIAL_KEY)
 
     def _draw(self, serial: Integers, batch: TensorDictBase) -> tuple[Integers, Goals]:
         """Draws rows of a batch of serials, (n,), and their new goals, (n, *goal)."""

@@ -45,9 +45,16 @@ class Rewriter:
             raise KeyError(f"hindsight needs {missing} in the data; found {found}.")
 
     def rewrite(
-        self, batch: TensorDictBase, rows: Tensor, goals: Tensor
+        self, batch: TensorDictBase, rows: Tensor, goals: Tensor, *, is_own: bool
     ) -> TensorDictBase:
-        """Returns a copy in which (flat) rows, (n,), have other goals, (n, *goal)."""
+        """Gives rows of a batch other goals, and what follows from these.
+
+        Args:
+            batch: transitions of any batch shape; their tensors are never written to.
+            rows: which, (n,), of the flattened batch.
+            goals: the other goals, (n, *goal).
+            is_own: entries of the batch itself may be exchanged, not of a copy.
+        """
         flat = batch if batch.ndim == 1 else batch.reshape(-1)
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
         old_goals = flat.get(self.goal_key)
@@ -68,10 +75,13 @@ class Rewriter:
             stays |= evaluate(self.terminated_fn, achieved, goals, terminated)
             new[_TERMINATED] = stays
             new[_DONE] = stays | truncated.index_select(0, rows)
-        result = batch.exclude(*new)  # a copy also of the tensordicts that hold these
+        # The copy is also of the nested tensordicts that hold these entries.
+        result = batch if is_own else batch.exclude(*new)
         for key, values in new.items():
             value = flat.get(key).index_copy(0, rows, values)
-            result.set(key, value.reshape(*batch.shape, *value.shape[1:]))
+            if batch.ndim != 1:
+                value = value.reshape(*batch.shape, *value.shape[1:])
+            result.set(key, value)
         return result
 
 

@@ -67,29 +67,33 @@ class TrajectoryTracker:
         if self._has_roots != (root is not None):
             self.open.clear()
             self._has_roots = root is not None
-        order = ids.argsort(kind="stable")
+        order, n = ids.argsort(kind="stable"), len(ids)
         names, ends = ids[order], done[order]
-        is_head = np.ones(len(order) + 1, dtype=bool)  # first row of its id; the end
-        is_head[1:-1] = names[1:] != names[:-1]
-        heads = is_head[:-1].nonzero()[0]
-        known = np.full(len(order), -1)
+        is_head = np.empty(n + 1, dtype=bool)  # the first row of its id, and the end
+        is_head[0] = is_head[n] = True
+        is_head[1:n] = names[1:] != names[:-1]
+        heads = is_head[:n].nonzero()[0]
+        known = np.empty(n, dtype=np.int64)  # the trajectory before an id's first row
         known[heads] = [self.open.pop(i, -1) for i in names[heads].tolist()]
-        begins = known < 0
-        begins[1:] &= is_head[1:-1] | ends[:-1]
+        begins = np.empty(n, dtype=bool)
+        begins[1:] = ends[:-1]
+        begins[heads] = known[heads] < 0
         if root is not None:
             before = np.empty_like(achieved)
-            before[1:] = achieved[order[:-1]]
-            resumed = (known >= 0).nonzero()[0]
+            before[1:] = achieved.take(order[:-1], axis=0)
+            resumed = heads[~begins[heads]]
             if len(resumed):
                 before[resumed] = last_achieved(known[resumed])
-            same = (before == root[order]).reshape(len(order), -1).all(1)
-            follows = same & ~begins
+            same = before.reshape(n, -1) == root.take(order, axis=0).reshape(n, -1)
+            follows = same.all(1) & ~begins
             self._links = self._links or bool(follows.any())
             begins = ~follows if self._links else begins
-        edges = np.append(begins | is_head[:-1], True).nonzero()[0]
-        start, end = edges[:-1], edges[1:]
-        trajectory = np.where(begins[start], -1, known[start])
-        self.count += len(order)
+        start = (begins | is_head[:n]).nonzero()[0]
+        trajectory = known[start]
+        trajectory[begins[start]] = -1
+        end = np.empty_like(start)
+        end[:-1], end[-1] = start[1:], n
+        self.count += n
         is_open = is_head[end] & ~ends[end - 1]
         return Runs(order, end - start, trajectory, names[start], is_open)
 
@@ -134,9 +138,11 @@ def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Integers:
     shape = tuple(batch.shape)
     if ids is not None:
         if ids.numel() != batch.numel():
-            got = tuple(ids.shape)
-            raise ValueError(f"expected ids {shape} at {key!r}, got {got}.")
-        numbers: Integers = time_first(ids.reshape(batch.shape), batch.ndim)
+            raise ValueError(
+                f"the ids of trajectories at {key!r} must have the shape of the batch, "
+                f"{shape}, got {tuple(ids.shape)}."
+            )
+        numbers: Integers = time_first(ids.reshape(shape), len(shape))
         return numbers
     if batch.ndim < 2 and not single_env:
         raise ValueError(

@@ -9,7 +9,8 @@ import torch
 
 from torch_panda.transforms.trajectories import Integers
 
-PAGE = 8  # places; the smallest region
+PAGE_BITS = 3
+PAGE = 1 << PAGE_BITS  # places; the smallest region
 
 
 class TrajectoryTable:
@@ -40,7 +41,7 @@ class TrajectoryTable:
 
     def slot_at(self, place: Integers) -> Integers:
         """Returns whose transitions are at places, (n,)."""
-        return self._owner[place // PAGE]
+        return self._owner.take(place >> PAGE_BITS)
 
     def append(self, slots: Integers, lengths: Integers, rows: Integers) -> None:
         """Appends `lengths`, (m,), of the rows, (n,), to the lists of slots, (m,).
