@@ -19,21 +19,13 @@ Columns = tuple[Integers, NDArray[np.bool_], Goals, Goals | None]
 
 
 class Runs(NamedTuple):
-    """Rows of a batch, n, put in order: m runs, each of one trajectory.
+    """Rows of a batch, (n,), put in order: m runs, each of one trajectory."""
 
-    Attributes:
-        order: the rows, run by run, (n,).
-        length: of the runs, (m,).
-        trajectory: which they belong to, (m,); -1 for a new one.
-        name: their ids, (m,).
-        is_open: whether the trajectory may go on in the next batch, (m,).
-    """
-
-    order: Integers
-    length: Integers
-    trajectory: Integers
-    name: Integers
-    is_open: NDArray[np.bool_]
+    order: Integers  # (n,), the rows run by run
+    length: Integers  # (m,), of the runs
+    trajectory: Integers  # (m,), which they belong to; -1 for a new one
+    name: Integers  # (m,), their ids
+    is_open: NDArray[np.bool_]  # (m,), whether the next batch may go on with them
 
 
 class TrajectoryTracker:

@@ -233,9 +233,8 @@ def test_memory_a_transition(capacity):
         rb.sample()
     serial = rb.storage[:]["hindsight_serial"]
     memory = rb.transform[0]._memory
-    arrays = [memory._goals, *vars(memory._table).values()]
-    own = sum(x.nbytes for x in arrays if isinstance(x, np.ndarray))
-    lists = sum(map(sys.getsizeof, memory._table._free_regions.values()))
-    total = own + lists + sys.getsizeof(memory._table._free_slots) + serial.nbytes
+    own = sum(x.nbytes for x in vars(memory).values() if isinstance(x, np.ndarray))
+    lists = sum(map(sys.getsizeof, memory._free_regions.values()))
+    total = own + lists + serial.nbytes
     print(f"{total / capacity:.1f} bytes a transition")
     assert total / capacity <= 3 * 4 + 24
