@@ -474,9 +474,7 @@ def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBu
         )
     elif args.her == "augment":
         k = round(args.her_ratio / (1 - args.her_ratio))
-        transform = HindsightAugment.from_env(
-            env, success_fn=None, k=k, seed=args.seed
-        )
+        transform = HindsightAugment.from_env(env, success_fn=None, k=k, seed=args.seed)
         capacity *= k + 1
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=args.device), transform=transform

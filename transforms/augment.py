@@ -8,18 +8,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torch_panda.transforms.base import (
-    SERIAL_KEY,
-    BufferTransform,
-    find_buffer,
-    samples_slices,
-)
+from torch_panda.transforms import base
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import DESIRED, RANDOM
 from torch_panda.transforms.trajectories import Integers
 
 
-class HindsightAugment(BufferTransform):
+class HindsightAugment(base.BufferTransform):
     """Stores every transition once more for each of k goals achieved in its episode.
 
     The paper's own way (Andrychowicz et al. 2017, arXiv 1707.01495, algorithm 1). An
@@ -29,7 +24,7 @@ class HindsightAugment(BufferTransform):
     Args:
         reward_fn: see `BufferTransform`; called once an `extend`.
         k: number of relabelled copies of a transition.
-        **options: see `BufferTransform`; no strategy of other episodes.
+        **options: as for `HindsightRelabel`; no strategy of other episodes.
     """
 
     def __init__(self, reward_fn: GoalFunction, *, k: int = 4, **options: Any) -> None:  # noqa: ANN401
@@ -41,7 +36,7 @@ class HindsightAugment(BufferTransform):
             raise ValueError(f"HindsightAugment sees one episode at a time: {goals}.")
         self.k = k
         # Transitions of open trajectories: rows of a pool, and their serials, or -1.
-        self._pool: TensorDictBase | None = None
+        self._pool: Any = None
         self._serials: Integers = np.zeros(0, dtype=np.int64)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
@@ -51,10 +46,12 @@ class HindsightAugment(BufferTransform):
             ValueError: it is one transition, without a dimension of time.
             RuntimeError: the buffer does not store rows one by one.
         """
-        buffer, _ = find_buffer()
+        buffer, _ = base.find_buffer()
         if not tensordict.ndim:
             raise ValueError("`add` takes many rows for one item: use `extend`.")
-        if samples_slices(buffer) or (buffer is not None and buffer.storage.ndim > 1):
+        if base.samples_slices(buffer) or (
+            buffer is not None and buffer.storage.ndim > 1
+        ):
             raise RuntimeError(
                 "HindsightAugment stores rows one by one: use ndim=1, and "
                 'no slices but HindsightRelabel(unit="slice").'
@@ -73,19 +70,16 @@ class HindsightAugment(BufferTransform):
 
     def _hold(self, batch: TensorDictBase) -> None:
         """Copies transitions, (n,), into free rows of the pool, which may grow."""
-        free = (self._serials < 0).nonzero()[0]
-        missing = len(batch) - len(free)
+        missing = len(batch) - int((self._serials < 0).sum())
         if missing > 0:
             missing = max(missing, len(self._serials))
-            parts = [batch[:1].expand(missing).clone()]
-            self._pool = TensorDict.cat(
-                [self._pool, *parts] if self._pool is not None else parts
-            )
+            more = batch[:1].expand(missing).clone()
+            pool = self._pool
+            self._pool = more if pool is None else TensorDict.cat([pool, more])
             self._serials = np.append(self._serials, np.full(missing, -1))
-            free = (self._serials < 0).nonzero()[0]
-        rows = free[: len(batch)]
+        rows = (self._serials < 0).nonzero()[0][: len(batch)]
         self._pool[torch.from_numpy(rows)] = batch
-        self._serials[rows] = batch.get(SERIAL_KEY).numpy(force=True)
+        self._serials[rows] = batch.get(base.SERIAL_KEY).numpy(force=True)
 
     def _augment(self, rows: Integers) -> TensorDictBase:
         """Takes rows of whole episodes, (n,), out of the pool; returns (n * (1 + k),).
@@ -96,11 +90,11 @@ class HindsightAugment(BufferTransform):
         serial = self._serials[rows].repeat(self.k)
         self._serials[rows] = -1
         drawn = self._memory.draw(serial, self._weights, self._generator)
-        goals = torch.from_numpy(drawn).to(original.get(SERIAL_KEY).device)
+        goals = torch.from_numpy(drawn).to(original.get(base.SERIAL_KEY).device)
         copied = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
         every = torch.arange(len(copied), device=goals.device)
         copies = self._rewriter.rewrite(original[copied], every, goals, is_own=True)
-        return TensorDict.cat([original, copies]).exclude(SERIAL_KEY)
+        return TensorDict.cat([original, copies]).exclude(base.SERIAL_KEY)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Leaves what is sampled as it is."""
@@ -109,19 +103,17 @@ class HindsightAugment(BufferTransform):
     def empty(self) -> None:
         """Drops the episodes held back, which the buffer's own `empty` does not."""
         super().empty()
-        self._serials = self._serials[:0]
-        self._pool = None
+        self._pool, self._serials = None, self._serials[:0]
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the episodes held back and the generator, for `state_dict`."""
         held = (self._serials >= 0).nonzero()[0]
-        pool = None if self._pool is None else self._pool[torch.from_numpy(held)]
-        held = {} if pool is None else pool.to_dict()
-        return {**super().get_extra_state(), "held": held}
+        rows = self._pool[torch.from_numpy(held)].to_dict() if len(held) else None
+        return {**super().get_extra_state(), "held": rows}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Takes what `get_extra_state` returned."""
         super().set_extra_state(state)
         self._pool, self._serials = None, self._serials[:0]
-        if state["held"]:
-            self._hold(TensorDict(state["held"], [len(state["held"][SERIAL_KEY])]))
+        if (held := state["held"]) is not None:
+            self._hold(TensorDict(held, [len(held[base.SERIAL_KEY])]))

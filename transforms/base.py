@@ -130,6 +130,11 @@ class BufferTransform(envs.Transform):
             tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
         return batch.set(SERIAL_KEY, tag.to(goals.device))
 
+    def __repr__(self) -> str:
+        names = ("strategy", "her_ratio", "unit", "goal_parts", "k")
+        options = [f"{n}={vars(self)[n]!r}" for n in names if n in vars(self)]
+        return f"{type(self).__name__}({', '.join(options)})"
+
     def end_trajectories(self) -> None:
         """Ends all trajectories; what is written next begins new ones."""
         with self._lock:

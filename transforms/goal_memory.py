@@ -42,6 +42,7 @@ class GoalMemory:
         # Of pages: their trajectory and, if that is the page itself, places of its
         # first transition and behind its last one, and the size of its region.
         self._pages = np.zeros((4, 64), dtype=np.int32)
+        self._begun = 0  # trajectories so far
         self._used = 0  # pages that were ever part of a region
         self._free_regions: dict[int, list[int]] = {}  # size -> first pages
 
@@ -84,8 +85,11 @@ class GoalMemory:
 
     def _move(self, trajectory: int, number: int) -> int:
         """Moves a trajectory, if not -1, to where a number more fit: its new name."""
-        rows = self._rows[:0]
-        if trajectory >= 0:
+        if trajectory < 0:
+            rows = self._rows[:0]
+            self._begun += 1  # one is taken to be as long as the mean of all
+            number = max(number, self.tracker.count // self._begun)
+        else:
             _, first, end, _ = self._pages[:, trajectory]
             rows = self._rows[first:end].copy()
             self._release(trajectory)
@@ -107,6 +111,7 @@ class GoalMemory:
         return new
 
     def _release(self, trajectory: int) -> None:
+        """Lets the region of a trajectory be used again."""
         self._free_regions[int(self._pages[3, trajectory])].append(trajectory)
 
     def _last_achieved(self, trajectory: Integers) -> Goals:
@@ -181,9 +186,8 @@ class GoalMemory:
             return drawn % len(self._places)
         trajectory, place = self.find(serial)
         first, end = self._pages[1:3].take(trajectory, axis=1)
-        return self._rows.take(
-            strategies.choose_steps(strategy, place, first, end, rng)
-        )
+        chosen = strategies.choose_steps(strategy, place, first, end, rng)
+        return self._rows.take(chosen)
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""

@@ -10,18 +10,13 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
-from torch_panda.transforms.base import (
-    SERIAL_KEY,
-    BufferTransform,
-    find_buffer,
-    samples_slices,
-)
+from torch_panda.transforms import base
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import LOOKING_AHEAD, draw_uniform
 from torch_panda.transforms.trajectories import Goals, Integers
 
 
-class HindsightRelabel(BufferTransform):
+class HindsightRelabel(base.BufferTransform):
     """Gives sampled transitions goals that their trajectory achieved later.
 
     Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): a random
@@ -31,7 +26,7 @@ class HindsightRelabel(BufferTransform):
     stored transition was asked for. README.md beside this file is a guide.
 
     Args:
-        reward_fn: see `BufferTransform`, as for **options.
+        reward_fn: maps (achieved_goal, desired_goal), (n, *goal) each, to (n, 1).
         her_ratio: fraction of the rows that are relabelled, in [0, 1]: k / (k + 1) for
             the k goals a transition of the paper.
         unit: "row" draws a goal a row, "slice" one for all rows of a slice (that follow
@@ -41,6 +36,20 @@ class HindsightRelabel(BufferTransform):
         goal_parts: sizes of the parts of a goal vector, e.g. (3, 3) for two objects.
             Every part is relabelled with probability her_ratio, with a goal drawn for
             it alone (Lanier et al. 2019, arXiv 1906.03710).
+        **options: strategy, success_fn, terminated_fn, goal_key, achieved_goal_key,
+            reward_key, success_key, trajectory_key, single_env, seed: see
+            `BufferTransform`.
+
+    Raises:
+        ValueError: an argument is none of what is accepted, which the message names.
+
+    Example:
+        >>> relabel = HindsightRelabel.from_env(env, strategy="future", her_ratio=0.8)
+        >>> rb = TensorDictReplayBuffer(
+        ...     storage=LazyTensorStorage(1_000_000), transform=relabel, batch_size=256
+        ... )
+        >>> rb.extend(data.reshape(-1))
+        >>> batch = rb.sample()
     """
 
     def __init__(
@@ -69,7 +78,7 @@ class HindsightRelabel(BufferTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        buffer, _ = find_buffer()
+        buffer, _ = base.find_buffer()
         is_item = not tensordict.ndim  # one step
         if buffer is not None:
             ndim, writer = buffer.storage.ndim, type(buffer.writer)
@@ -103,11 +112,11 @@ class HindsightRelabel(BufferTransform):
         Raises:
             KeyError, RuntimeError: the rows were stored without this transform.
         """
-        tag = tensordict.get(SERIAL_KEY, None)
-        buffer, method = find_buffer()
+        tag = tensordict.get(base.SERIAL_KEY, None)
+        buffer, method = base.find_buffer()
         if self._is_first_sample:
             self._is_first_sample = False
-            if self.unit == "row" and samples_slices(buffer):
+            if self.unit == "row" and base.samples_slices(buffer):
                 cure = 'pass unit="slice" for one goal a slice'
                 warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
         with self._lock:
@@ -122,11 +131,11 @@ class HindsightRelabel(BufferTransform):
             self._check_data(tensordict)
             rows, goals = self._draw(tag.numpy(force=True).reshape(-1), tensordict)
         if not len(rows):
-            return tensordict.exclude(SERIAL_KEY)
+            return tensordict.exclude(base.SERIAL_KEY)
         index, new = (torch.from_numpy(x).to(tag.device) for x in (rows, goals))
         is_own = method == "_sample"  # made for us; others may hand out their storage
         batch = self._rewriter.rewrite(tensordict, index, new, is_own=is_own)
-        return batch.del_(SERIAL_KEY)
+        return batch.del_(base.SERIAL_KEY)
 
     def _draw(self, serial: Integers, batch: TensorDictBase) -> tuple[Integers, Goals]:
         """Draws rows of a batch of serials, (n,), and their new goals, (n, *goal)."""
@@ -178,6 +187,6 @@ class HindsightRelabel(BufferTransform):
             noted.set(self.trajectory_key, trajectory)
         self._rewriter.check(noted)
         with self._lock:
-            tag = self._note(noted, 0, None).get(SERIAL_KEY)
+            tag = self._note(noted, 0, None).get(base.SERIAL_KEY)
         self.end_trajectories()
-        return flat.set(SERIAL_KEY, tag)
+        return flat.set(base.SERIAL_KEY, tag)

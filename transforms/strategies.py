@@ -61,15 +61,19 @@ def choose_steps(
     end: Integers,
     generator: Generator | None,
 ) -> Integers:
-    """Chooses steps, (n,); a ValueError if a user's own strategy returns no such."""
+    """Chooses steps, (n,), for transitions of steps `step` from `first` up to `end`.
+
+    Raises:
+        ValueError: a user's own strategy returns anything else.
+    """
     if strategy == "final":
         return end - 1
     if isinstance(strategy, str):
         return draw_integers(step if strategy == "future" else first, end, generator)
-    numbers = step - first, np.zeros_like(first), end - first
-    chosen = strategy(
-        *(torch.from_numpy(x.astype(np.int32)) for x in numbers), generator
-    )
+    zero = np.zeros_like(step)
+    numbers = (step - first, zero, end - first)
+    s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in numbers)
+    chosen = strategy(s, f, e, generator)
     must = "the strategy must return"
     if not isinstance(chosen, Tensor):
         raise ValueError(f"{must} a tensor, got {type(chosen).__name__}.")

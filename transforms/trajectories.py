@@ -53,7 +53,10 @@ class TrajectoryTracker:
         """Puts the rows of a batch, n, in order; `keep` then remembers the runs.
 
         Args:
-            ids, done, achieved, root: see `Columns`.
+            ids: of trajectories or environments, (n,).
+            done: whether a trajectory ends, (n,).
+            achieved: the goals that were achieved, (n, *goal).
+            root: those that had been achieved before, if the data tell.
             last_achieved: what the last rows of trajectories, (m,), achieved.
         """
         if self._has_roots != (root is not None):

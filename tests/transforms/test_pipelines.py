@@ -293,6 +293,61 @@ def test_replaced_rows_are_refused():
         rb[3:5] = envs.chunk(1).reshape(-1)
 
 
+def test_a_transform_that_moves_to_another_buffer_goes_by_that_one():
+    chain = Compose(HindsightRelabel(reward_fn, strategy="episode"))
+    first = buffer(chain)
+    first.extend(Envs(2, [4]).chunk(8).reshape(-1))
+    second = buffer(chain, ndim=2)
+    envs = Envs(3, [5], first_env=10)
+    chain[0].empty()
+    for _ in range(400):  # the second is written over
+        second.extend(envs.chunk(2))
+    check_batch(second.sample(), second.storage[:].reshape(-1), "episode")
+    with pytest.raises(RuntimeError, match="ndim=1"):
+        first.extend(envs.chunk(2))
+    writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
+    third = buffer(chain, writer=writer)
+    with pytest.raises(RuntimeError, match="round-robin"):
+        third.extend(envs.chunk(2).reshape(-1))
+
+
+def test_the_representation_names_the_options():
+    relabel = HindsightRelabel(reward_fn, strategy={"future": 1}, goal_parts=(3, 3))
+    assert repr(relabel) == (
+        "HindsightRelabel(strategy={'future': 1}, her_ratio=0.8, unit='row', "
+        "goal_parts=(3, 3))"
+    )
+    expected = "HindsightAugment(strategy='future', k=2)"
+    assert repr(HindsightAugment(reward_fn, k=2)) == expected
+
+
+def test_success_under_next_alone_is_rewritten():
+    data = Envs(3, [4]).chunk(8).reshape(-1)
+    data["next", "success"] = torch.zeros_like(data["next", "done"])
+    rb = buffer(
+        HindsightRelabel(reward_fn, success_fn=lambda a, d: (a == d).all(-1, True))
+    )
+    rb.extend(data)
+    batch = rb.sample()
+    same = (batch["next", "achieved_goal"] == batch["desired_goal"]).all(-1, True)
+    assert (batch["next", "success"] == same).all() and same.any()
+
+
+def test_without_success_fn_an_environment_is_as_its_reward_alone():
+    """Where success ends nothing (-v1): training is the same, bit for bit."""
+    env, batches = make("PandaPush-v1"), []
+    data = next(iter(collect(env, 50))).reshape(-1)
+    for relabel in (
+        HindsightRelabel.from_env(env, success_fn=None, seed=0),
+        HindsightRelabel(env.compute_reward, seed=0),
+    ):
+        rb = buffer(relabel)
+        rb.extend(data)
+        torch.manual_seed(0)
+        batches.append(rb.sample())
+    assert (batches[0] == batches[1]).all()
+
+
 # -- collectors that extend the buffer themselves -------------------------------------
 
 

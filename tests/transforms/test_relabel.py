@@ -194,6 +194,7 @@ def test_her_ratio_out_of_range_raises(her_ratio):
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("strategy", ["future", "episode"])
 def test_goals_are_uniform(finished, strategy):
+    torch.manual_seed(0)
     length = 10
     rb = make_buffer(1000, her_ratio=1.0, strategy=strategy, seed=1, batch_size=500)
     rb.extend(Envs(3, [length if finished else 99]).chunk(length).reshape(-1))
