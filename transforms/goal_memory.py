@@ -75,7 +75,9 @@ class GoalMemory:
         """
         _, _, end, size = self._pages
         full = end[trajectory] + length > trajectory * PAGE + size[trajectory]
-        for i in (full | (trajectory < 0)).nonzero()[0].tolist():
+        is_new = trajectory < 0
+        self._begun += int(is_new.sum())
+        for i in (full | is_new).nonzero()[0].tolist():
             trajectory[i] = self._move(int(trajectory[i]), int(length[i]))
         end = self._pages[2]
         places = (end[trajectory] + length - length.cumsum()).repeat(length)
@@ -87,8 +89,7 @@ class GoalMemory:
         """Moves a trajectory, if not -1, to where a number more fit: its new name."""
         if trajectory < 0:
             rows = self._rows[:0]
-            self._begun += 1  # one is taken to be as long as the mean of all
-            number = max(number, self.tracker.count // self._begun)
+            number = max(number, self.tracker.count // self._begun)  # the mean length
         else:
             _, first, end, _ = self._pages[:, trajectory]
             rows = self._rows[first:end].copy()
