@@ -117,8 +117,11 @@ class Learner:
         capacity = min(args.buffer_size, args.total_steps + args.batch_frames)
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(capacity),
-            transform=HindsightRelabel(
-                self.eval_env.compute_reward, her_ratio=args.her_ratio, seed=args.seed
+            transform=HindsightRelabel.from_env(
+                self.eval_env,
+                success_fn=None,
+                her_ratio=args.her_ratio,
+                seed=args.seed,
             ),
             batch_size=args.batch_size,
         )

@@ -184,8 +184,9 @@ class Run:
             demos = read_demos(args.demos, self.env)
             self.demos = TensorDictReplayBuffer(
                 storage=LazyTensorStorage(len(demos), device=args.device),
-                transform=HindsightRelabel(
-                    self.env.compute_reward,
+                transform=HindsightRelabel.from_env(
+                    self.env,
+                    success_fn=None,
                     her_ratio=args.demo_her_ratio,
                     strategy="final",
                     seed=args.seed,
@@ -468,12 +469,12 @@ def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBu
     capacity = min(args.buffer_size, args.total_steps + iteration)
     transform: HindsightRelabel | HindsightAugment | None = None
     if args.her == "relabel":
-        transform = HindsightRelabel(
-            env.compute_reward, her_ratio=args.her_ratio, seed=args.seed
+        transform = HindsightRelabel.from_env(
+            env, success_fn=None, her_ratio=args.her_ratio, seed=args.seed
         )
     elif args.her == "augment":
         k = round(args.her_ratio / (1 - args.her_ratio))
-        transform = HindsightAugment(env.compute_reward, k=k, seed=args.seed)
+        transform = HindsightAugment.from_env(env, success_fn=None, k=k, seed=args.seed)
         capacity *= k + 1
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=args.device), transform=transform

@@ -8,116 +8,94 @@ from dataclasses import dataclass
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-_DONE = ("next", "done")
-_TERMINATED = ("next", "terminated")
-_TRUNCATED = ("next", "truncated")
+_DONE, _TERMINATED = ("next", "done"), ("next", "terminated")
 
 GoalFunction = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass
 class Rewriter:
-    """Gives transitions another goal, reward and, if told how, another end.
-
-    Attributes:
-        reward_fn: maps (achieved_goal, desired_goal), (n, *goal) each, to (n, 1).
-        terminated_fn: the same for `terminated`, bool; None leaves the flags alone.
-        goal_key: the desired goal, in the root and under "next".
-        achieved_goal_key: the achieved goal, of which that under "next" is read here.
-        reward_key: the reward, from the root, e.g. ("next", "reward").
-    """
+    """Gives transitions another goal, reward and, if told how, success and end."""
 
     reward_fn: GoalFunction
+    success_fn: GoalFunction | None
     terminated_fn: GoalFunction | None
     goal_key: NestedKey
     achieved_goal_key: NestedKey
     reward_key: NestedKey
+    success_key: NestedKey
 
     def __post_init__(self) -> None:
         """Works out the keys under "next"."""
         self.goal_key = unravel_key(self.goal_key)
         self.reward_key = unravel_key(self.reward_key)
+        self.success_key = unravel_key(self.success_key)
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
+        goals = [self.goal_key, self.next_goal_key, self.next_achieved_key]
+        self._needed = [*goals, self.reward_key, _DONE]
+        self._needed += [self.success_key] if self.success_fn else []
+        self._needed += [_TERMINATED] if self.terminated_fn else []
 
     def check(self, batch: TensorDictBase) -> None:
         """Raises a KeyError that names the entries that are missing in the batch."""
-        needed = [
-            self.goal_key,
-            self.next_goal_key,
-            self.next_achieved_key,
-            self.reward_key,
-            _DONE,
-        ]
-        if self.terminated_fn is not None:
-            needed.append(_TERMINATED)
-        missing = [key for key in needed if batch.get(key, None) is None]
+        missing = [key for key in self._needed if batch.get(key, None) is None]
         if missing:
-            raise KeyError(
-                f"hindsight relabelling needs {missing} in the data; found "
-                f"{sorted(map(str, batch.keys(True, True)))}."
-            )
+            found = sorted(map(str, batch.keys(True, True)))
+            raise KeyError(f"hindsight needs {missing} in the data; found {found}.")
 
     def rewrite(
-        self, batch: TensorDictBase, rows: Tensor, goals: Tensor
+        self, batch: TensorDictBase, rows: Tensor, goals: Tensor, *, is_own: bool
     ) -> TensorDictBase:
-        """Returns a batch in which some rows have other goals, and what follows.
-
-        The batch itself, which may be the storage's own, is left as it is; what is the
-        same in both is shared.
+        """Gives rows of a batch other goals, and what follows from these.
 
         Args:
-            batch: transitions, any batch shape.
-            rows: which of them, as numbers in the flattened batch, (n,).
-            goals: their new goals, (n, *goal).
-
-        Raises:
-            ValueError: `reward_fn` or `terminated_fn` returned another shape, or
-                something else than a tensor.
+            batch: transitions of any batch shape; their tensors are never written to.
+            rows: which, (n,), of the flattened batch.
+            goals: the other goals, (n, *goal).
+            is_own: entries of the batch itself may be exchanged, not of a copy.
         """
         flat = batch if batch.ndim == 1 else batch.reshape(-1)
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
-        old = flat.get(self.goal_key)
-        if goals.dtype != old.dtype:
-            goals = goals.to(old.dtype)
-        next_old = flat.get(self.next_goal_key)
-        new = {
-            self.goal_key: old.index_copy(0, rows, goals),
-            self.next_goal_key: next_old.index_copy(0, rows, goals),
-        }
-        n = rows.shape[0]
+        old_goals = flat.get(self.goal_key)
+        goals = goals.to(old_goals.dtype)
+        new = {self.goal_key: goals, self.next_goal_key: goals}
         reward = flat.get(self.reward_key)
-        values = _check("reward_fn", self.reward_fn(achieved, goals), n, reward)
-        new[self.reward_key] = reward.index_copy(0, rows, values)
+        new[self.reward_key] = evaluate(self.reward_fn, achieved, goals, reward)
+        if self.success_fn is not None:
+            success = flat.get(self.success_key)
+            new[self.success_key] = evaluate(self.success_fn, achieved, goals, success)
         if self.terminated_fn is not None:
             done, terminated = flat.get(_DONE), flat.get(_TERMINATED)
-            truncated = flat.get(_TRUNCATED, None)
-            if truncated is None:  # what ended without terminating
-                truncated = done & ~terminated
-            values = self.terminated_fn(achieved, goals)
-            values = _check("terminated_fn", values, n, terminated)
-            new[_TERMINATED] = terminated.index_copy(0, rows, values)
-            values = values | truncated.index_select(0, rows)
-            new[_DONE] = done.index_copy(0, rows, values)
-        result = batch.exclude(*new)  # a copy also of the tensordicts that hold these
-        for key, value in new.items():
-            if flat is not batch:
+            truncated = flat.get(("next", "truncated"), done & ~terminated)
+            stays = terminated.index_select(0, rows)
+            if stays.any():  # unless the old goal is why it ended: a failure, say
+                old = old_goals.index_select(0, rows)
+                stays &= ~evaluate(self.terminated_fn, achieved, old, terminated)
+            stays |= evaluate(self.terminated_fn, achieved, goals, terminated)
+            new[_TERMINATED] = stays
+            new[_DONE] = stays | truncated.index_select(0, rows)
+        # The copy is also of the nested tensordicts that hold these entries.
+        result = batch if is_own else batch.exclude(*new)
+        for key, values in new.items():
+            value = flat.get(key).index_copy(0, rows, values)
+            if batch.ndim != 1:
                 value = value.reshape(*batch.shape, *value.shape[1:])
             result.set(key, value)
         return result
 
 
-def _check(function: str, values: Tensor, n: int, old: Tensor) -> Tensor:
-    """Returns what a function gave for n rows, in the type of the old values."""
-    expected = (n, *old.shape[1:])
-    if not isinstance(values, Tensor):
+def evaluate(
+    function: GoalFunction, achieved: Tensor, desired: Tensor, old: Tensor
+) -> Tensor:
+    """Returns what a function gives for goals, (n, *goal) each, in the old type."""
+    values = function(achieved, desired)
+    expected = (len(achieved), *old.shape[1:])
+    if not isinstance(values, Tensor) or values.shape != expected:
+        is_tensor = isinstance(values, Tensor)
+        got = tuple(values.shape) if is_tensor else type(values).__name__
         raise ValueError(
-            f"{function} must return a tensor of shape {expected}, got "
-            f"{type(values).__name__}."
+            "reward_fn, success_fn and terminated_fn map (achieved_goal, desired_goal),"
+            f" (n, *goal) each, to a tensor: {function} to {expected}, got {got}."
         )
-    if values.shape != expected:
-        raise ValueError(
-            f"{function} must map (achieved_goal, desired_goal) of {n} transitions to "
-            f"shape {expected}, got {tuple(values.shape)}."
-        )
-    return values if values.dtype == old.dtype else values.to(old.dtype)
+    return values.to(old.dtype)

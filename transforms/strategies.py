@@ -1,13 +1,15 @@
-"""Goal strategies: at which step of its trajectory a goal was achieved.
+"""Goal strategies: which goal a transition is relabelled with.
 
-`step` is the transition's own step, (n,); what is stored of its trajectory are the
-steps from `first` up to and without `end`, and the goal's step is one of them. The
-names are those of the paper (Andrychowicz et al. 2017, section 4.5).
+One that follows the transition's trajectory chooses a step of it: `step`, (n,), is its
+own; stored are those from `first` up to and without `end`, counted from the oldest
+known. All but "desired" are those of Andrychowicz et al. 2017, section 4.5.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from math import isfinite
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,51 +20,38 @@ from torch_panda.transforms.trajectories import Integers
 
 # A user's own: (step, first, end, generator) -> goal step, int32 tensors on the CPU.
 Strategy = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
+Weights = dict[str | Strategy, float]
 
-# (step, first, end, share) -> goal step, with random numbers from 0 to 1, float64:
-# float32 would skip steps of trajectories longer than 2**24.
-Shares = NDArray[np.float64]
-_BuiltIn = Callable[[Integers, Integers, Integers, Shares], Integers]
-
-# Looks ahead only: what follows a stored transition is stored too.
-LOOKING_AHEAD = ("future", "final")
-RANDOM = "random"  # any stored transition of any trajectory: no step of its own
+RANDOM, DESIRED = "random", "desired"  # of any stored transition
+LOOKING_AHEAD = ("future", "final")  # what follows a stored transition is stored too
+NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
-def uniform(low: Integers | int, end: Integers | int, share: Shares) -> Integers:
-    """Maps random numbers to integers from low up to and without end, (n,)."""
-    return low + (share * (end - low)).astype(np.int64)
+def parse_strategies(strategy: str | Strategy | Mapping[Any, float]) -> Weights:
+    """Returns strategies and weights that add up to 1; a ValueError if it cannot."""
+    weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
+    for name in weights or [strategy]:
+        if not callable(name) and name not in NAMES:
+            known = f"one of {[*NAMES]}, a callable, or a mapping of these to weights"
+            raise ValueError(f"strategy must be {known}, got {name!r}.")
+    if not all(weight > 0 and isfinite(weight) for weight in weights.values()):
+        raise ValueError(f"strategy must have positive weights, got {strategy!r}.")
+    total = sum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}
 
 
-def future(step: Integers, first: Integers, end: Integers, share: Shares) -> Integers:
-    """Draws this step or a later one."""
-    return uniform(step, end, share)
+def draw_uniform(number: int, generator: Generator | None) -> NDArray[np.float64]:
+    """Draws random numbers from 0 to 1, (number,), with a generator of the CPU's."""
+    u = torch.rand(number, generator=generator, dtype=torch.float64, device="cpu")
+    return u.numpy()
 
 
-def final(step: Integers, first: Integers, end: Integers, share: Shares) -> Integers:
-    """Takes the last step."""
-    return end - 1
-
-
-def episode(step: Integers, first: Integers, end: Integers, share: Shares) -> Integers:
-    """Draws any step of the trajectory."""
-    return uniform(first, end, share)
-
-
-STRATEGIES: dict[str, _BuiltIn] = {
-    "future": future,
-    "final": final,
-    "episode": episode,
-}
-
-
-def check_strategy(strategy: str | Strategy) -> None:
-    """Raises a ValueError if it is neither a strategy's name nor a function."""
-    if not callable(strategy) and strategy not in (*STRATEGIES, RANDOM):
-        raise ValueError(
-            f"strategy must be one of {[*STRATEGIES, RANDOM]} or a callable, "
-            f"got {strategy!r}."
-        )
+def draw_integers(
+    low: Integers | int, end: Integers, generator: Generator | None
+) -> Integers:
+    """Draws integers from low up to and without end, (n,)."""
+    u = draw_uniform(len(end), generator)
+    return low + (u * (end - low)).astype(np.int64)
 
 
 def choose_steps(
@@ -70,30 +59,28 @@ def choose_steps(
     step: Integers,
     first: Integers,
     end: Integers,
-    share: Shares,
     generator: Generator | None,
 ) -> Integers:
-    """Calls the strategy and checks what a user's own returns.
+    """Chooses steps, (n,), for transitions of steps `step` from `first` up to `end`.
 
     Raises:
-        ValueError: it is not one integer step a transition from first up to end.
+        ValueError: a user's own strategy returns anything else.
     """
+    if strategy == "final":
+        return end - 1
     if isinstance(strategy, str):
-        return STRATEGIES[strategy](step, first, end, share)
-    steps, firsts, ends = (
-        torch.from_numpy(x.astype(np.int32)) for x in (step, first, end)
-    )
-    goal_step = strategy(steps, firsts, ends, generator)
-    if not isinstance(goal_step, Tensor):
-        raise ValueError(
-            f"the strategy must return a tensor, got {type(goal_step).__name__}."
-        )
-    if goal_step.shape != step.shape or goal_step.is_floating_point():
-        raise ValueError(
-            f"the strategy must return integer steps of shape {tuple(step.shape)}, "
-            f"got {goal_step.dtype} of shape {tuple(goal_step.shape)}."
-        )
-    chosen = goal_step.cpu().numpy()
-    if ((chosen < first) | (chosen >= end)).any():
-        raise ValueError("the strategy must return steps from first up to end.")
-    return chosen
+        return draw_integers(step if strategy == "future" else first, end, generator)
+    zero = np.zeros_like(step)
+    numbers = (step - first, zero, end - first)
+    s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in numbers)
+    chosen = strategy(s, f, e, generator)
+    must = "the strategy must return"
+    if not isinstance(chosen, Tensor):
+        raise ValueError(f"{must} a tensor, got {type(chosen).__name__}.")
+    if chosen.shape != step.shape or chosen.is_floating_point():
+        got = f"{chosen.dtype} of shape {tuple(chosen.shape)}"
+        raise ValueError(f"{must} integer steps {tuple(step.shape)}, got {got}.")
+    goal_step: Integers = first + chosen.cpu().numpy()
+    if ((goal_step < first) | (goal_step >= end)).any():
+        raise ValueError(f"{must} steps from first up to end.")
+    return goal_step

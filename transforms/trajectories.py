@@ -1,133 +1,148 @@
-"""Which trajectory every transition of a batch belongs to."""
+"""Which trajectory every transition belongs to."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
+from torch import Tensor, bfloat16
 
 Integers = NDArray[np.integer[Any]]
-
-TRAJECTORY_KEY = ("collector", "traj_ids")
+Goals = NDArray[Any]  # (n, *goal)
+# Of transitions, n each: ids, whether they are done, goals they achieved and, unless
+# the data do not tell, had achieved before.
+Columns = tuple[Integers, NDArray[np.bool_], Goals, Goals | None]
 
 
 class Runs(NamedTuple):
-    """Consecutive steps of one trajectory each, found in a batch sorted by stream.
+    """Rows of a batch, (n,), put in order: m runs, each of one trajectory."""
 
-    Attributes:
-        start: first row of every run, shape (m,), int64.
-        length: number of rows of every run, shape (m,), int64.
-        stream: the stream of every run, m numbers.
-        ended: whether the run's last row ends its trajectory, shape (m,), bool.
+    order: Integers  # (n,), the rows run by run
+    length: Integers  # (m,), of the runs
+    trajectory: Integers  # (m,), which they belong to; -1 for a new one
+    name: Integers  # (m,), their ids
+    is_open: NDArray[np.bool_]  # (m,), whether the next batch may go on with them
+
+
+class TrajectoryTracker:
+    """Follows trajectories from batch to batch.
+
+    A row goes on with the trajectory of the row of its id before it, unless that was
+    done, or got to another goal than this row begins with (as ids begin anew with every
+    collector). If no row ever begins where the one before got to, the ids decide.
     """
 
-    start: Integers
-    length: Integers
-    stream: list[int]
-    ended: NDArray[np.bool_]
+    def __init__(self) -> None:
+        self.count = 0  # transitions so far: serial of the next one
+        self.open: dict[int, int] = {}  # id -> trajectory that may go on
+        self._has_roots = False
+        self._links = False  # whether a row ever began with the goal before it
+
+    def follow(
+        self,
+        ids: Integers,
+        done: NDArray[np.bool_],
+        achieved: Goals,
+        root: Goals | None,
+        last_achieved: Callable[[Integers], Goals],
+    ) -> Runs:
+        """Puts the rows of a batch, n, in order; `keep` then remembers the runs.
+
+        Args:
+            ids: of trajectories or environments, (n,).
+            done: whether a trajectory ends, (n,).
+            achieved: the goals that were achieved, (n, *goal).
+            root: those that had been achieved before, if the data tell.
+            last_achieved: what the last rows of trajectories, (m,), achieved.
+        """
+        if self._has_roots != (root is not None):
+            self.open.clear()
+            self._has_roots = root is not None
+        order, n = ids.argsort(kind="stable"), len(ids)
+        names, ends = ids[order], done[order]
+        is_head = np.empty(n + 1, dtype=bool)  # the first row of its id, and the end
+        is_head[0] = is_head[n] = True
+        is_head[1:n] = names[1:] != names[:-1]
+        heads = is_head[:n].nonzero()[0]
+        known = np.empty(n, dtype=np.int64)  # the trajectory before an id's first row
+        known[heads] = [self.open.pop(i, -1) for i in names[heads].tolist()]
+        begins = np.empty(n, dtype=bool)
+        begins[1:] = ends[:-1]
+        begins[heads] = known[heads] < 0
+        if root is not None:
+            before = np.empty_like(achieved)
+            before[1:] = achieved.take(order[:-1], axis=0)
+            resumed = heads[~begins[heads]]
+            if len(resumed):
+                before[resumed] = last_achieved(known[resumed])
+            same = before.reshape(n, -1) == root.take(order, axis=0).reshape(n, -1)
+            follows = same.all(1) & ~begins
+            self._links = self._links or bool(follows.any())
+            begins = ~follows if self._links else begins
+        start = (begins | is_head[:n]).nonzero()[0]
+        trajectory = known[start]
+        trajectory[begins[start]] = -1
+        end = np.empty_like(start)
+        end[:-1], end[-1] = start[1:], n
+        self.count += n
+        is_open = is_head[end] & ~ends[end - 1]
+        return Runs(order, end - start, trajectory, names[start], is_open)
+
+    def keep(self, runs: Runs) -> None:
+        """Remembers which trajectories may go on, now that all of them have names."""
+        pairs = zip(runs.name.tolist(), runs.trajectory.tolist(), strict=True)
+        self.open.update(compress(pairs, runs.is_open.tolist()))
+
+    def forget(self, trajectories: set[int]) -> None:
+        """Ends trajectories that have been overwritten."""
+        if not trajectories.isdisjoint(self.open.values()):
+            pairs = self.open.items()
+            self.open = {i: t for i, t in pairs if t not in trajectories}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Takes another tracker's attributes."""
+        vars(self).update(state)
+        if not self._links:  # nothing would show that an id is used again
+            self.open.clear()
 
 
-def split_runs(stream: Integers, done: NDArray[np.bool_]) -> Runs:
-    """Cuts a sorted batch into runs: where the stream changes, and after every done.
+def time_first(value: Tensor, batch_dims: int) -> Any:  # noqa: ANN401 (of any type)
+    """Flattens [*batch, time, ...] to (time * batch, ...), as storages fill up.
 
-    Args:
-        stream: what the transition comes from (a trajectory's or an environment's
-            number), shape (n,), sorted. Rows of one stream are in time order.
-        done: whether the transition ends its trajectory, shape (n,).
+    Raises:
+        ValueError: numpy does not know the type, of goals of bfloat16.
     """
-    last = done.copy()
-    last[-1] = True
-    last[:-1] |= stream[1:] != stream[:-1]
-    ends = last.nonzero()[0]
-    start = np.zeros_like(ends)
-    start[1:] = ends[:-1] + 1
-    return Runs(start, ends + 1 - start, stream[ends].tolist(), done[ends])
+    if value.dtype is bfloat16:
+        raise ValueError("hindsight cannot hold goals of bfloat16: use float32 ones.")
+    if batch_dims > 1:
+        value = value.movedim(batch_dims - 1, 0).flatten(0, batch_dims - 1)
+    return value.numpy(force=True)
 
 
-def find_strays(
-    order: Integers, before: Integers, achieved: Tensor, root: Tensor
-) -> Integers:
-    """Finds the rows after which the next one begins elsewhere than they got to.
-
-    Args:
-        order: a batch's rows, sorted, (n,).
-        before: places in `order` of the rows to look at, (m,).
-        achieved: what every row achieved, (n, *goal).
-        root: what was achieved before it, (n, *goal).
-
-    Returns:
-        Those of the places `before`, (k,).
-    """
-    rows, following = (
-        torch.from_numpy(order[x]).to(root.device) for x in (before, before + 1)
-    )
-    return before[differ(achieved[rows], root[following])]
-
-
-def differ(a: Tensor, b: Tensor) -> Integers:
-    """Returns the places, (m,), where goals, (n, *goal) each, are not the same."""
-    if torch.equal(a, b):  # as a rule, and much faster
-        return np.zeros(0, dtype=np.int64)
-    return (a != b).reshape(len(a), -1).any(1).cpu().numpy().nonzero()[0]
-
-
-def time_first(value: Tensor, batch_dims: int) -> Tensor:
-    """Flattens [*batch, time, ...] to (time * batch, ...), time slowest.
-
-    That is the order in which a multi-dimensional storage fills up. One-dimensional
-    data keep their order, a single transition becomes one row.
-    """
-    if batch_dims == 0:
-        return value.unsqueeze(0)
-    if batch_dims == 1:
-        return value
-    return value.movedim(batch_dims - 1, 0).flatten(0, batch_dims - 1)
-
-
-def time_last(value: Tensor, shape: torch.Size) -> Tensor:
-    """Undoes `time_first` for a batch of that shape: (n, ...) to (*shape, ...)."""
-    if not shape:
-        return value.squeeze(0)
-    if len(shape) == 1:
-        return value
-    value = value.view(shape[-1], *shape[:-1], *value.shape[1:])
-    return value.movedim(0, len(shape) - 1)
-
-
-def streams_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Tensor:
-    """Returns the stream of every transition, in the order of `time_first`, (n,).
-
-    Args:
-        batch: transitions of shape [*batch, time], or flattened.
-        key: where trajectory ids are; without them the leading dimensions number
-            the environments and the last one is time.
-        single_env: whether 1-d data without ids are one environment's steps.
+def ids_of(batch: TensorDictBase, key: NestedKey, single_env: bool) -> Integers:
+    """Returns ids, or environments, of [*batch, time] in `time_first` order, (n,).
 
     Raises:
         ValueError: the data do not tell which trajectory a transition belongs to.
     """
     ids = batch.get(key, None)
+    shape = tuple(batch.shape)
     if ids is not None:
-        if ids.ndim == 1 and ids.shape == batch.shape:
-            return ids
         if ids.numel() != batch.numel():
             raise ValueError(
-                f"expected one trajectory id a transition under {key!r}, got shape "
-                f"{tuple(ids.shape)} for a batch of {tuple(batch.shape)}."
+                f"the ids of trajectories at {key!r} must have the shape of the batch, "
+                f"{shape}, got {tuple(ids.shape)}."
             )
-        return time_first(ids.reshape(batch.shape), batch.ndim)
+        numbers: Integers = time_first(ids.reshape(shape), len(shape))
+        return numbers
     if batch.ndim < 2 and not single_env:
         raise ValueError(
-            f"cannot tell the trajectories of a batch of shape {tuple(batch.shape)} "
-            f"apart: it has no ids under {key!r}. Keep the collector's ids, name "
-            "another key with trajectory_key=, extend with [num_envs, time] data in "
-            "a fixed order of environments, or pass single_env=True if the rows are "
-            "consecutive steps of one environment."
+            f"cannot tell trajectories apart in a batch {shape} without ids at {key!r}:"
+            " keep the collector's ids, name others with trajectory_key=, extend with "
+            "[num_envs, time], or pass single_env=True for steps of one environment."
         )
-    envs = batch.shape[:-1].numel()
-    steps = batch.shape[-1] if batch.ndim else 1
-    return torch.arange(envs, device="cpu").repeat(steps)
+    return np.tile(np.arange(batch.shape[:-1].numel()), batch.shape[-1])

@@ -58,6 +58,15 @@ def test_nothing_is_stored_until_an_episode_ends():
     assert len(rb) == 2 * 6 * 2
 
 
+def test_what_is_held_back_takes_the_room_of_open_episodes():
+    rb, envs = make_buffer(k=1), Envs(4, [30])
+    for _ in range(200):
+        rb.extend(envs.chunk(1))
+        held = int((rb.transform[0]._serials >= 0).sum())
+        assert held == 4 * int(envs.step[0])
+    assert len(rb.transform[0]._pool) <= 2 * 4 * 30
+
+
 def test_future_goals_are_uniform():
     length, k = 6, 500
     rb = make_buffer(k=k, seed=0)

@@ -1,5 +1,8 @@
 """The README's pipelines without this package's environments, as they stand there."""
 
+import re
+from pathlib import Path
+
 import panda_gym  # noqa: F401, registers PandaPush-v3
 import torch
 from tensordict import TensorDict
@@ -56,3 +59,21 @@ def test_augment_of_random_walks():
     expected = reward(stored["next", "achieved_goal"], stored["desired_goal"])
     assert (stored["next", "reward"] == expected).all()
     assert (copies["next", "reward"] == 0).float().mean() > 1 / 50
+
+
+GUIDE = Path(__file__).parents[2] / "transforms" / "README.md"
+
+
+def test_guide():
+    """Its snippets run one after the other, as a reader would type them."""
+    text = GUIDE.read_text()
+    snippets = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names = {}
+    for snippet in snippets:
+        exec(compile(snippet, str(GUIDE), "exec"), names)
+    assert len(snippets) == 6
+    assert names["slices"].shape == (50, 5)
+    goals = names["slices"]["desired_goal"]
+    assert (goals == goals[:, :1]).all()
+    assert names["batch"].shape == (256,)
+    assert max(map(len, text.splitlines())) <= 120

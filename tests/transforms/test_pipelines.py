@@ -1,0 +1,567 @@
+"""Pipelines as people build them: hindsight is right in them, or says why not."""
+
+import functools
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    MultiStep,
+    ReplayBuffer,
+    SliceSampler,
+    TensorDictMaxValueWriter,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    DoubleToFloat,
+    ParallelEnv,
+    RewardScaling,
+    SerialEnv,
+    TransformedEnv,
+)
+
+import torch_panda
+from tests.transforms import toy
+from tests.transforms.identifiable import Envs, check_batch, relabelled, reward_fn
+from torch_panda.transforms import HindsightAugment, HindsightRelabel
+
+BOTH = pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
+
+
+def make(env_id="PandaPush-v1", num_envs=4):
+    return torch_panda.make(env_id, num_envs=num_envs, seed=0)
+
+
+def buffer(transform, **options):
+    ndim = options.pop("ndim", 1)
+    storage = LazyTensorStorage(1000, ndim=ndim)
+    return TensorDictReplayBuffer(
+        storage=storage, transform=transform, batch_size=64, **options
+    )
+
+
+def collect(env, steps=10, batches=3, **options):
+    count = env.batch_size.numel() * steps
+    return Collector(
+        env, frames_per_batch=count, total_frames=count * batches, **options
+    )
+
+
+# -- from_env -------------------------------------------------------------------------
+
+
+def success_worker():
+    return make("PandaReach-v3", 2)
+
+
+@pytest.mark.parametrize("nested", ["none", "transformed", "serial", "parallel"])
+def test_from_env_reads_what_belongs_together(nested):
+    env = {
+        "none": lambda: make("PandaReach-v3"),
+        "transformed": lambda: TransformedEnv(
+            TransformedEnv(make("PandaReach-v3"), DoubleToFloat()), Compose()
+        ),
+        "serial": lambda: TransformedEnv(SerialEnv(2, success_worker)),
+        "parallel": lambda: ParallelEnv(2, success_worker),
+    }[nested]()
+    rb = buffer(HindsightRelabel.from_env(env, strategy="final", her_ratio=1.0))
+    rules = torch_panda.make("PandaReach-v3")
+    for data in collect(env, steps=20):
+        rb.extend(data.reshape(-1))
+        batch = rb.sample()
+        after = batch["next"]
+        goals = after["achieved_goal"], batch["desired_goal"]
+        success = rules.is_success(*goals)
+        assert (after["reward"] == rules.compute_reward(*goals)).all()
+        assert (after["success"] == success).all()
+        assert (after["terminated"] == success).all()
+        assert (after["done"] == (success | after["truncated"])).all()
+        assert success.any() and not success.all()
+    env.close(raise_if_closed=False)
+
+
+def test_from_env_leaves_ends_alone_where_success_ends_nothing():
+    env = make("PandaReach-v1")
+    rb = buffer(HindsightRelabel.from_env(env, strategy="final", her_ratio=1.0))
+    for data in collect(env):
+        rb.extend(data.reshape(-1))
+    batch = rb.sample()
+    assert batch["next", "success"].any()
+    assert not batch["next", "terminated"].any()
+
+
+@BOTH
+def test_from_env_of_another_environment_raises(hindsight):
+    with pytest.raises(ValueError, match="no compute_reward: give reward_fn="):
+        hindsight.from_env(toy.make_env())
+    options = {"reward_fn": reward_fn, "success_fn": None}
+    with pytest.raises(ValueError, match="terminate_on_success: give terminated_fn="):
+        hindsight.from_env(toy.make_env(), **options)
+    hindsight.from_env(toy.make_env(), **options, terminated_fn=None)
+
+
+def test_augment_rewrites_success_too():
+    env = make("PandaReach-v3")
+    rb = buffer(HindsightAugment.from_env(env, k=2))
+    for data in collect(env, steps=50):
+        rb.extend(data)
+    stored = rb.storage[:]
+    goals = stored["next", "achieved_goal"], stored["desired_goal"]
+    assert (stored["next", "success"] == env.is_success(*goals)).all()
+
+
+@pytest.mark.parametrize("with_success", [True, False])
+def test_an_end_for_another_reason_stays(with_success):
+    def reached(achieved, desired):
+        return (achieved == desired).all(-1, keepdim=True)
+
+    data = Envs(3, [4]).chunk(8).reshape(-1)
+    data["next", "terminated"] = data["next", "done"].clone()  # failures
+    data["next", "success"] = torch.zeros_like(data["next", "done"])
+    functions = {"success_fn": reached} if with_success else {}
+    transform = HindsightRelabel(
+        reward_fn, terminated_fn=reached, strategy="random", her_ratio=1.0, **functions
+    )
+    rb = buffer(transform)
+    rb.extend(data)
+    batch, stored = rb.sample(2000), rb.storage[:]
+    success = reached(batch["next", "achieved_goal"], batch["desired_goal"])
+    failed = stored["next", "terminated"][batch["index"]]
+    assert (batch["next", "terminated"] == (success | failed)).all()
+    assert failed.any() and (success & ~failed).any()
+
+
+# -- what another goal would contradict -----------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("collector", [True, False])
+def test_copies_of_the_goal_are_refused(hindsight, collector):
+    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
+    env = TransformedEnv(make(), cat)
+    rb = buffer(hindsight.from_env(env))
+    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
+        for data in collect(env) if collector else [env.rollout(10)]:
+            if not collector:
+                data["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 10)
+            rb.extend(data.reshape(-1))
+
+
+def test_copies_made_in_the_buffer_before_hindsight_are_refused():
+    env = make()
+    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
+    rb = buffer(Compose(cat, HindsightRelabel.from_env(env)))
+    rb.extend(next(iter(collect(env))).reshape(-1))
+    with pytest.raises(ValueError, match=r"policy_input.*copy"):
+        rb.sample()
+
+
+def test_concatenating_after_hindsight_has_the_new_goal():
+    env = make()
+    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
+    rb = buffer(Compose(HindsightRelabel.from_env(env, her_ratio=1.0), cat))
+    rb.extend(next(iter(collect(env))).reshape(-1))
+    batch = rb.sample()
+    goal = batch["desired_goal"]
+    pieces = batch["policy_input"].unfold(1, 3, 1)
+    assert (pieces == goal[:, None]).all(-1).any(1).all()
+
+
+def test_observations_that_hold_the_achieved_goal_are_no_copies():
+    """Even where every row is asked for what it has, or goals are constants."""
+    for kind in ("achieved", "zeros"):
+        data = Envs(4, [5]).chunk(10).reshape(-1)
+        goal = data["achieved_goal"] if kind == "achieved" else torch.zeros(40, 3)
+        data["desired_goal"] = goal.clone()
+        data["next", "desired_goal"] = goal.clone()
+        data["observation"] = torch.cat([torch.zeros(40, 4), data["achieved_goal"]], 1)
+        goals = data["next", "achieved_goal"], goal
+        data["next", "reward"] = reward_fn(*goals)
+        rb = buffer(HindsightRelabel(reward_fn))
+        rb.extend(data)
+        rb.sample()
+
+
+@BOTH
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rewards_of_several_steps_are_refused(hindsight, n_steps):
+    env = make("PandaReach-v1")
+    rb = buffer(hindsight.from_env(env))
+    collector = collect(env, postproc=MultiStep(gamma=0.9, n_steps=n_steps))
+    if n_steps == 1:
+        for data in collector:
+            rb.extend(data.reshape(-1))
+        return
+    with pytest.raises(ValueError, match=r"several steps.*MultiStep.*slice"):
+        for data in collector:
+            rb.extend(data.reshape(-1))
+
+
+@BOTH
+@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaPushDense-v1"])
+@pytest.mark.parametrize("scaling", [(0.0, 10.0), (0.0, 0.1), (1.0, 2.0)])
+def test_scaled_rewards_are_refused(hindsight, env_id, scaling):
+    env = TransformedEnv(make(env_id, 8), RewardScaling(*scaling))
+    rb = buffer(hindsight.from_env(env))
+    with pytest.raises(ValueError, match=r"reward_fn's times.*RewardScaling.*after"):
+        for data in collect(env, 10, 30):
+            rb.extend(data.reshape(-1))
+
+
+@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaStackDense-v1"])
+def test_right_rewards_are_taken_in_silence(env_id):
+    env = make(env_id)
+    rb = buffer(HindsightRelabel.from_env(env))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="reward_fn gives other")
+        for data in collect(env):
+            rb.extend(data.reshape(-1))
+            rb.sample()
+
+
+def test_other_rewards_warn_once():
+    env = make("PandaPushDense-v1")
+    other = torch_panda.make("PandaPush-v1").compute_reward
+    rb = buffer(HindsightRelabel.from_env(env, reward_fn=other))
+    with pytest.warns(UserWarning, match="reward_fn gives other rewards") as caught:
+        for data in collect(env):
+            rb.extend(data.reshape(-1))
+    assert len([w for w in caught if "reward_fn gives" in str(w.message)]) == 1
+
+
+# -- buffers --------------------------------------------------------------------------
+
+
+def slices():
+    return SliceSampler(slice_len=4, traj_key=("collector", "traj_ids"))
+
+
+@pytest.mark.parametrize("unit", ["row", "slice"])
+def test_slices_with_goals_per_row_warn_once(unit):
+    rb = buffer(HindsightRelabel(reward_fn, unit=unit), sampler=slices())
+    rb.extend(Envs(1, [16]).chunk(64).reshape(-1))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rb.sample()
+        rb.sample()
+    messages = [str(w.message) for w in caught if "unit=" in str(w.message)]
+    assert len(messages) == (unit == "row")
+
+
+def test_augment_under_a_slice_sampler_is_refused():
+    rb = buffer(HindsightAugment(reward_fn), sampler=slices())
+    with pytest.raises(RuntimeError, match=r'unit="slice"'):
+        rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
+
+
+def test_augment_on_two_dimensions_is_refused():
+    rb = buffer(HindsightAugment(reward_fn), ndim=2)
+    with pytest.raises(RuntimeError, match="ndim=1"):
+        rb.extend(Envs(2, [4]).chunk(8))
+
+
+def test_chunks_into_one_dimension_are_refused_at_once():
+    rb = buffer(HindsightRelabel(reward_fn))
+    with pytest.raises(RuntimeError, match=r"\[2, 8\] for ndim=1.*reshape.*ndim=2"):
+        rb.extend(Envs(2, [4]).chunk(8))
+
+
+@pytest.mark.parametrize("kind", [TensorDictReplayBuffer, ReplayBuffer])
+@pytest.mark.parametrize("options", [{}, {"capacity": 1000}])
+def test_max_value_writer_is_refused(kind, options):
+    rb = kind(
+        storage=LazyTensorStorage(1000),
+        transform=HindsightRelabel(reward_fn, **options),
+        writer=TensorDictMaxValueWriter(rank_key=("next", "reward")),
+        batch_size=64,
+    )
+    with pytest.raises(RuntimeError, match=r"round-robin.*TensorDictMaxValueWriter"):
+        rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
+
+
+def test_replaced_rows_are_refused():
+    rb, envs = buffer(HindsightRelabel(reward_fn)), Envs(2, [4])
+    rb.extend(envs.chunk(8).reshape(-1))
+    with pytest.raises(RuntimeError, match="replaced"):
+        rb[3:5] = envs.chunk(1).reshape(-1)
+
+
+def test_a_transform_that_moves_to_another_buffer_goes_by_that_one():
+    chain = Compose(HindsightRelabel(reward_fn, strategy="episode"))
+    first = buffer(chain)
+    first.extend(Envs(2, [4]).chunk(8).reshape(-1))
+    second = buffer(chain, ndim=2)
+    envs = Envs(3, [5], first_env=10)
+    chain[0].empty()
+    for _ in range(400):  # the second is written over
+        second.extend(envs.chunk(2))
+    check_batch(second.sample(), second.storage[:].reshape(-1), "episode")
+    with pytest.raises(RuntimeError, match="ndim=1"):
+        first.extend(envs.chunk(2))
+    writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
+    third = buffer(chain, writer=writer)
+    with pytest.raises(RuntimeError, match="round-robin"):
+        third.extend(envs.chunk(2).reshape(-1))
+
+
+def test_the_representation_names_the_options():
+    relabel = HindsightRelabel(reward_fn, strategy={"future": 1}, goal_parts=(3, 3))
+    assert repr(relabel) == (
+        "HindsightRelabel(strategy={'future': 1}, her_ratio=0.8, unit='row', "
+        "goal_parts=(3, 3))"
+    )
+    expected = "HindsightAugment(strategy='future', k=2)"
+    assert repr(HindsightAugment(reward_fn, k=2)) == expected
+
+
+def test_success_under_next_alone_is_rewritten():
+    data = Envs(3, [4]).chunk(8).reshape(-1)
+    data["next", "success"] = torch.zeros_like(data["next", "done"])
+    rb = buffer(
+        HindsightRelabel(reward_fn, success_fn=lambda a, d: (a == d).all(-1, True))
+    )
+    rb.extend(data)
+    batch = rb.sample()
+    same = (batch["next", "achieved_goal"] == batch["desired_goal"]).all(-1, True)
+    assert (batch["next", "success"] == same).all() and same.any()
+
+
+def test_without_success_fn_an_environment_is_as_its_reward_alone():
+    """Where success ends nothing (-v1): training is the same, bit for bit."""
+    env, batches = make("PandaPush-v1"), []
+    data = next(iter(collect(env, 50))).reshape(-1)
+    for relabel in (
+        HindsightRelabel.from_env(env, success_fn=None, seed=0),
+        HindsightRelabel(env.compute_reward, seed=0),
+    ):
+        rb = buffer(relabel)
+        rb.extend(data)
+        torch.manual_seed(0)
+        batches.append(rb.sample())
+    assert (batches[0] == batches[1]).all()
+
+
+# -- collectors that extend the buffer themselves -------------------------------------
+
+
+def test_collector_with_the_buffer():
+    rb = buffer(HindsightRelabel(reward_fn), ndim=2)
+    collector = Collector(
+        toy.make_env,
+        None,
+        frames_per_batch=3 * 5,
+        total_frames=3 * 5 * 100,
+        replay_buffer=rb,
+    )
+    for _ in collector:
+        batch = rb.sample()
+        check_batch(batch, rb.storage[:].reshape(-1), "future")
+        assert relabelled(batch).any()
+    collector.shutdown()
+    assert rb.write_count > len(rb.storage) // 3  # it was written over
+
+
+def test_collector_with_a_flat_buffer_is_refused():
+    rb = buffer(HindsightRelabel(reward_fn))
+    collector = Collector(
+        toy.make_env, None, frames_per_batch=15, total_frames=30, replay_buffer=rb
+    )
+    with pytest.raises(RuntimeError, match=r"ndim=2.*replay_buffer="):
+        next(iter(collector))
+    collector.shutdown()
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_multi_process_collector_with_the_buffer_is_refused(ndim):
+    # A TensorDictReplayBuffer of ndim=2 fails at the first [num_envs, 1] by itself.
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(1000, ndim=ndim),
+        transform=HindsightRelabel(reward_fn),
+        batch_size=64,
+    )
+    message = "multi-process collector" if ndim == 2 else "replay_buffer="
+    with pytest.raises(RuntimeError, match=message):
+        MultiSyncCollector(
+            [toy.make_first, functools.partial(toy.make_env, 2)],
+            None,
+            frames_per_batch=30,
+            total_frames=60,
+            replay_buffer=rb,
+        )
+
+
+# -- strategies and parts -------------------------------------------------------------
+
+
+def goals_data(num_envs=4, steps=40):
+    """Desired goals that say whose they are: -1 - environment, -1 - episode, -9."""
+    data = Envs(num_envs, [5, 8]).chunk(steps)
+    goal = torch.stack(
+        [
+            -1 - data["achieved_goal"][..., 0],
+            -1 - data["achieved_goal"][..., 1],
+            torch.full((num_envs, steps), -9.0),
+        ],
+        -1,
+    )
+    data["desired_goal"], data["next", "desired_goal"] = goal.clone(), goal.clone()
+    data["next", "reward"] = reward_fn(data["next", "achieved_goal"], goal)
+    return data.reshape(-1)
+
+
+@pytest.mark.parametrize("weights", [{"future": 1, "desired": 1}, {"desired": 3.0}])
+def test_desired_goals_of_other_transitions(weights):
+    rb = buffer(HindsightRelabel(reward_fn, strategy=weights, her_ratio=0.5, seed=0))
+    data = goals_data(num_envs=16)
+    rb.extend(data)
+    batch = rb.sample(100_000)
+    goal = batch["desired_goal"]
+    own = data["desired_goal"][batch["index"]]
+    achieved = batch["next", "achieved_goal"]
+    is_future = goal[:, 2] > 0
+    assert (goal[is_future][:, :2] == achieved[is_future][:, :2]).all()
+    assert (goal[is_future][:, 2] >= achieved[is_future][:, 2]).all()
+    share = 0.5 * weights.get("future", 0) / sum(weights.values())
+    assert abs(is_future.float().mean() - share) < 0.01
+    asked = data["desired_goal"].unique(dim=0, return_counts=True)
+    is_desired = ~is_future & (goal != own).any(1)
+    # Drawn uniformly over rows: as often as the rows that were asked for it.
+    found, counts = goal[is_desired].unique(dim=0, return_counts=True)
+    assert len(found) == len(asked[0])
+    expected = asked[1] / len(data)
+    drawn = 0.5 - share
+    assert abs(is_desired.float().mean() - drawn * (1 - (expected**2).sum())) < 0.01
+    ratio = counts / counts.sum()
+    expected = expected * (1 - expected)
+    assert torch.allclose(ratio, expected / expected.sum(), atol=0.004)
+
+
+@pytest.mark.parametrize(
+    "strategy", [{}, {"future": 0.0}, {"future": -1}, {"past": 1}, {"final": 1e999}]
+)
+def test_bad_mixtures_raise(strategy):
+    with pytest.raises(ValueError, match="strategy must"):
+        HindsightRelabel(reward_fn, strategy=strategy)
+
+
+@pytest.mark.parametrize("strategy", ["desired", {"future": 1, "desired": 1}])
+def test_augment_refuses_desired(strategy):
+    with pytest.raises(ValueError, match="one episode at a time"):
+        HindsightAugment(reward_fn, strategy=strategy)
+
+
+@pytest.mark.parametrize("unit", ["row", "slice"])
+def test_parts_are_relabelled_on_their_own(unit):
+    sampler = slices() if unit == "slice" else None
+    data = goals_data()
+    transform = HindsightRelabel(
+        reward_fn, goal_parts=(2, 1), her_ratio=0.6, unit=unit, seed=0
+    )
+    rb = buffer(transform, sampler=sampler)
+    rb.extend(data)
+    batch = rb.sample(40_000)
+    goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
+    own = data["desired_goal"][batch["index"].reshape(len(batch), -1)[:, 0]]
+    first, second = (goal[:, :2] != own[:, :2]).all(1), goal[:, 2] != own[:, 2]
+    assert (goal[first][:, :2] == achieved[first][:, :2]).all()
+    assert (goal[second][:, 2] >= achieved[second][:, 2]).all()
+    assert (goal[~first][:, :2] == own[~first][:, :2]).all()
+    for part in (first, second, ~first):
+        ratio = 0.4 if part is not first and part is not second else 0.6
+        assert abs(part.float().mean() - ratio) < 0.02
+    both = (first & second).float().mean()
+    assert abs(both - 0.36) < 0.02  # independently
+    assert (batch["next", "desired_goal"] == goal).all()
+    expected = reward_fn(achieved, goal)
+    assert (batch["next", "reward"] == expected).all()
+
+
+@pytest.mark.parametrize("parts", [(3, 3), (2,)])
+def test_parts_that_do_not_add_up_raise(parts):
+    rb = buffer(HindsightRelabel(reward_fn, goal_parts=parts))
+    with pytest.raises(ValueError, match="goal_parts must add up to"):
+        rb.extend(goals_data())
+
+
+@pytest.mark.parametrize("parts", [(), (0, 3)])
+def test_bad_parts_raise(parts):
+    with pytest.raises(ValueError, match="goal_parts must be"):
+        HindsightRelabel(reward_fn, goal_parts=parts)
+
+
+def test_parts_drawn_from_the_same_steps_as_whole_goals():
+    """Of Stack: each cube's goal is its own later position, or as it was."""
+    env = make("PandaStack-v1")
+    rb = buffer(HindsightRelabel.from_env(env, goal_parts=(3, 3), her_ratio=0.7))
+    rb.extend(next(iter(collect(env, 100))).reshape(-1))
+    batch, stored = rb.sample(), rb.storage[:]
+    held = stored["next", "achieved_goal"]
+    for part in (slice(0, 3), slice(3, 6)):
+        goal = batch["desired_goal"][:, part]
+        kept = (goal == stored["desired_goal"][batch["index"]][:, part]).all(1)
+        known = (goal[:, None] == held[:, part]).all(-1).any(1)
+        assert (kept | known).all()
+        assert 0.1 < kept.float().mean() < 0.55
+    goals = batch["next", "achieved_goal"], batch["desired_goal"]
+    assert (batch["next", "reward"] == env.compute_reward(*goals)).all()
+
+
+# -- data that exist already ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", ["memory", "memmap"])
+@pytest.mark.parametrize("layout", ["ids", "trajectories"])
+def test_data_that_exist_already(storage, layout, tmp_path):
+    if layout == "ids":
+        data = Envs(4, [5, 9]).chunk(30).reshape(-1)
+    else:
+        data = Envs(20, [9]).chunk(9).exclude("collector")
+    if storage == "memmap":
+        data.memmap(tmp_path)
+        data = TensorDict.load_memmap(tmp_path)
+        for file in tmp_path.rglob("*.memmap"):
+            file.chmod(0o444)
+    before = data.clone()
+    relabel = HindsightRelabel(reward_fn, her_ratio=0.8)
+    prepared = relabel.prepare(data)
+    assert prepared.shape == (data.numel(),)
+    if storage == "memmap":
+        assert prepared["action"].data_ptr() == data["action"].data_ptr()
+    rb = TensorDictReplayBuffer(
+        storage=TensorStorage(prepared), transform=relabel, batch_size=256
+    )
+    for _ in range(20):
+        batch = rb.sample()
+        check_batch(batch, prepared, "future")
+        assert abs(relabelled(batch).float().mean() - 0.8) < 0.15
+    assert (data == before).all()
+    with pytest.raises(RuntimeError, match="before other"):
+        relabel.prepare(data)
+
+
+def test_storage_of_a_buffer_that_was_filled_without():
+    filled = TensorDictReplayBuffer(storage=LazyMemmapStorage(70), batch_size=8)
+    envs = Envs(4, [5, 9])
+    for _ in range(9):  # wrapped around
+        filled.extend(envs.chunk(3).reshape(-1))
+    relabel = HindsightRelabel(reward_fn, strategy="episode")
+    data = relabel.prepare(filled.storage[:])
+    rb = TensorDictReplayBuffer(
+        storage=TensorStorage(data), transform=relabel, batch_size=64
+    )
+    for _ in range(20):
+        check_batch(rb.sample(), data, "episode")
+    relabel = HindsightRelabel(reward_fn)
+    data = relabel.prepare(filled.storage[:])
+    rb = TensorDictReplayBuffer(
+        storage=TensorStorage(data), transform=relabel, batch_size=64
+    )
+    for _ in range(20):
+        check_batch(rb.sample(), data, "future")

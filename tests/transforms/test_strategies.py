@@ -1,0 +1,145 @@
+"""Mixtures of strategies and goals of several parts, on data that tell their origin."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from tests.transforms.identifiable import Envs, reward_fn
+from torch_panda.transforms import HindsightRelabel
+
+NAMES = ["future", "final", "episode", "random", "desired"]
+SAMPLE = 4000
+
+
+def chunk(envs, steps):
+    """Flat transitions that are asked for (-1 - environment, -1 - episode, -9)."""
+    data = envs.chunk(steps).reshape(-1)
+    goal = -1 - data["achieved_goal"]
+    goal[:, 2] = -9
+    data["desired_goal"], data["next", "desired_goal"] = goal, goal.clone()
+    data["next", "reward"] = reward_fn(data["next", "achieved_goal"], goal)
+    return data
+
+
+def sample(capacity, lengths, **options):
+    """Returns a sample, the desired goals as stored, and all that is stored."""
+    torch.manual_seed(0)
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity),
+        transform=HindsightRelabel(reward_fn, seed=0, **options),
+        batch_size=SAMPLE,
+    )
+    envs = Envs(4, lengths)
+    for _ in range(30):
+        rb.extend(chunk(envs, 5))
+    batch, stored = rb.sample(), rb.storage[:]
+    return batch, stored["desired_goal"][batch["index"]], stored
+
+
+def is_among(goals, others):
+    """Which goals, (n, 3), are among others, (m, 3)."""
+    return (goals[:, None] == others).all(-1).any(1)
+
+
+def is_near(mask, fraction):
+    error = (fraction * (1 - fraction) / len(mask)) ** 0.5
+    return abs(mask.float().mean() - fraction) <= 5 * error + 1e-6
+
+
+mixtures = st.dictionaries(
+    st.sampled_from(NAMES), st.floats(0.1, 10), min_size=1, max_size=len(NAMES)
+)
+layouts = {
+    "capacity": st.integers(50, 400),
+    "lengths": st.lists(st.integers(2, 30), min_size=1, max_size=3),
+    "her_ratio": st.floats(0, 1),
+}
+
+
+@settings(max_examples=40, deadline=None)
+@given(weights=mixtures, **layouts)
+def test_mixtures_draw_allowed_goals_in_their_proportions(
+    weights, capacity, lengths, her_ratio
+):
+    batch, own, stored = sample(
+        capacity, lengths, her_ratio=her_ratio, strategy=weights
+    )
+    goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
+    assert (batch["next", "desired_goal"] == goal).all()
+    assert (batch["next", "reward"] == reward_fn(achieved, goal)).all()
+    is_achieved = goal[:, 2] > 0
+    held = stored["next", "achieved_goal"]
+    assert is_among(goal[is_achieved], held).all()
+    assert is_among(goal[~is_achieved], stored["desired_goal"]).all()
+    total = sum(weights.values())
+    assert is_near(is_achieved, her_ratio * (1 - weights.get("desired", 0) / total))
+    if "desired" not in weights:
+        assert (goal == own)[~is_achieved].all()
+    if "random" not in weights:
+        of_own = (goal[:, :2] == achieved[:, :2]).all(1)
+        assert of_own[is_achieved].all()
+        if "episode" not in weights:
+            assert (goal[:, 2] >= achieved[:, 2])[is_achieved].all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    parts=st.sampled_from([(3,), (1, 2), (2, 1), (1, 1, 1)]),
+    strategy=st.sampled_from(["future", "final", "episode"]),
+    **layouts,
+)
+def test_parts_are_kept_or_achieved_at_allowed_steps(
+    parts, strategy, capacity, lengths, her_ratio
+):
+    batch, own, stored = sample(
+        capacity, lengths, her_ratio=her_ratio, strategy=strategy, goal_parts=parts
+    )
+    goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
+    assert (batch["next", "reward"] == reward_fn(achieved, goal)).all()
+    masks = []
+    for part in torch.arange(3).split(parts):
+        is_new = (goal[:, part] != own[:, part]).all(1)
+        assert (goal[:, part] == own[:, part])[~is_new].all()
+        assert is_near(is_new, her_ratio)
+        masks.append(is_new)
+    for column in (0, 1):  # of the same environment and episode
+        new = goal[:, column] != own[:, column]
+        assert (goal[:, column] == achieved[:, column])[new].all()
+    new = masks[-1]
+    step, own_step = goal[new, 2], achieved[new, 2]
+    held = stored["next", "achieved_goal"]
+    source = torch.cat([achieved[new, :2], step[:, None]], 1)
+    assert is_among(source, held).all()
+    if strategy != "episode":
+        assert (step >= own_step).all()
+    if strategy == "final":
+        source[:, 2] += 1
+        assert not is_among(source, held).any()
+    if len(masks) > 1:  # independently
+        assert is_near(masks[0] & masks[1], her_ratio**2)
+
+
+def test_the_users_own_strategy_in_a_mixture():
+    def own_step(step, first, end, generator):
+        return step
+
+    batch, _, _ = sample(200, [9], strategy={own_step: 1, "desired": 1})
+    goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
+    is_achieved = goal[:, 2] > 0
+    assert (goal == achieved)[is_achieved].all()
+    assert is_near(is_achieved, 0.4)
+
+
+@pytest.mark.parametrize("kind", ["goals", "achieved"])
+def test_goals_of_bfloat16_are_refused(kind):
+    data = chunk(Envs(2, [5]), 5)
+    keys = {"goals": ["desired_goal"], "achieved": [("next", "achieved_goal")]}[kind]
+    for key in keys:
+        data[key] = data[key].bfloat16()
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(99), transform=HindsightRelabel(reward_fn)
+    )
+    with pytest.raises(ValueError, match=r"bfloat16.*float32"):
+        rb.extend(data)

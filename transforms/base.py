@@ -1,0 +1,219 @@
+"""What the two transforms have in common: arguments, and the buffer they belong to."""
+
+from __future__ import annotations
+
+import inspect
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl import envs
+from torchrl.data import ReplayBuffer, SliceSampler
+from torchrl.data.replay_buffers.sample_units import Sequence
+from typing_extensions import Self
+
+from torch_panda.transforms.checks import DataCheck
+from torch_panda.transforms.goal_memory import GoalMemory
+from torch_panda.transforms.rewrite import GoalFunction, Rewriter
+from torch_panda.transforms.strategies import DESIRED, Strategy, parse_strategies
+from torch_panda.transforms.trajectories import ids_of, time_first
+
+SERIAL_KEY = "hindsight_serial"
+
+
+class BufferTransform(envs.Transform):
+    """A transform of a replay buffer that writes other goals into transitions.
+
+    Args:
+        reward_fn: maps (achieved_goal, desired_goal), each (n, *goal), to the reward,
+            (n, 1), a row's by that row only. The first batches are compared with it.
+        strategy: a name, a function `(step, first, end, generator) -> goal step` (see
+            `strategies`), or a mapping of these to weights, divided by their sum.
+        success_fn: the same for the success, bool: also `success_key` is rewritten.
+        terminated_fn: the same for tasks that end on success: also ("next",
+            "terminated") and ("next", "done") are. What ended otherwise stays so.
+        goal_key: the desired goal, as `achieved_goal_key` also under "next".
+        achieved_goal_key, reward_key, success_key: the others.
+        trajectory_key: ids of trajectories; data without are [*environments, time].
+        single_env: takes 1-d data without ids for one environment's steps.
+        seed: seeds a generator of its own. By default torch's is used.
+    """
+
+    requires_shared_write_state = True  # by all processes that share the buffer
+
+    def __init__(
+        self,
+        reward_fn: GoalFunction,
+        *,
+        strategy: str | Strategy | Mapping[Any, float] = "future",
+        success_fn: GoalFunction | None = None,
+        terminated_fn: GoalFunction | None = None,
+        goal_key: NestedKey = "desired_goal",
+        achieved_goal_key: NestedKey = "achieved_goal",
+        reward_key: NestedKey = ("next", "reward"),
+        success_key: NestedKey = ("next", "success"),
+        trajectory_key: NestedKey = ("collector", "traj_ids"),
+        single_env: bool = False,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        if not callable(reward_fn):
+            raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
+        self.strategy = strategy
+        self._weights = parse_strategies(strategy)
+        self.trajectory_key, self.single_env = trajectory_key, single_env
+        keys = goal_key, achieved_goal_key, reward_key, success_key
+        self._rewriter = Rewriter(reward_fn, success_fn, terminated_fn, *keys)
+        self._check_data = DataCheck(self._rewriter)
+        self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
+        self._generator: torch.Generator | None = None
+        if seed is not None:
+            self._generator = torch.Generator("cpu").manual_seed(seed)
+        self._lock = threading.Lock()  # a prefetching buffer samples in threads
+
+    @classmethod
+    def from_env(cls, env: envs.EnvBase, **options: Any) -> Self:  # noqa: ANN401
+        """Makes the transform that belongs to an environment, e.g. a `RobotTaskEnv`.
+
+        Its `compute_reward` and `is_success` become `reward_fn` and `success_fn`; the
+        latter also `terminated_fn` if it is `terminate_on_success`. What is neither an
+        option nor there is a ValueError. A `ParallelEnv` has one more worker made.
+        """
+        while isinstance(env, envs.TransformedEnv):
+            env = env.base_env
+        if isinstance(env, (envs.ParallelEnv, envs.SerialEnv)):
+            worker = env.create_env_fn[0](**env.create_env_kwargs[0])
+            try:
+                return cls.from_env(worker, **options)
+            finally:
+                worker.close(raise_if_closed=False)
+        for option, attribute in (
+            ("reward_fn", "compute_reward"),
+            ("success_fn", "is_success"),
+            ("terminated_fn", "terminate_on_success"),
+        ):
+            if option not in options:
+                value = getattr(env, attribute, None)
+                if value is None:
+                    raise ValueError(f"{env} has no {attribute}: give {option}=.")
+                ends = option == "terminated_fn"
+                options[option] = (env.is_success if value else None) if ends else value
+        return cls(**options)
+
+    def _note(
+        self, batch: TensorDictBase, stored: int, capacity: int | None
+    ) -> TensorDictBase:
+        """Remembers transitions [*batch, time], and tags them with their serials."""
+        if _has_multi_step(self):
+            raise RuntimeError(
+                "n-step rewards, of MultiStepTransform, are not known for other goals: "
+                'sample slices with HindsightRelabel(unit="slice") instead.'
+            )
+        self._check_data(batch)
+        keys, dims = self._rewriter, batch.ndim
+        done = batch.get(("next", "done"))
+        root = batch.get(keys.achieved_goal_key, None)
+        columns = (
+            ids_of(batch, self.trajectory_key, self.single_env),
+            time_first(done if dims == 1 else done.reshape(batch.shape), dims).ravel(),
+            time_first(batch.get(keys.next_achieved_key), dims),
+            None if root is None else time_first(root, dims),
+        )
+        goals = batch.get(keys.goal_key)
+        desired = time_first(goals, dims)
+        serial = self._memory.write(columns, desired, stored, capacity)
+        tag = torch.from_numpy(serial)
+        if dims > 1:  # back to [*batch, time]
+            shape = batch.batch_size
+            tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
+        return batch.set(SERIAL_KEY, tag.to(goals.device))
+
+    def __repr__(self) -> str:
+        names = ("strategy", "her_ratio", "unit", "goal_parts", "k")
+        options = [f"{n}={vars(self)[n]!r}" for n in names if n in vars(self)]
+        return f"{type(self).__name__}({', '.join(options)})"
+
+    def end_trajectories(self) -> None:
+        """Ends all trajectories; what is written next begins new ones."""
+        with self._lock:
+            self._memory.tracker.open.clear()
+
+    def empty(self) -> None:
+        """Forgets all transitions; a buffer's own `empty` does not tell transforms."""
+        with self._lock:
+            self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
+
+    def share_memory_(self) -> None:
+        """Is called for a buffer that several processes write to: a RuntimeError."""
+        raise RuntimeError(
+            "hindsight has no share_memory_: do not give the buffer to a multi-process "
+            "collector (replay_buffer=), but extend it with what the collector yields."
+        )
+
+    def set_container(self, container: envs.Transform | envs.EnvBase) -> None:
+        """Joins a buffer's chain of transforms; an environment's is a ValueError."""
+        if isinstance(container, envs.EnvBase) or container.parent is not None:
+            self._call(None)
+        super().set_container(container)
+
+    def _call(self, next_tensordict: TensorDictBase | None) -> TensorDictBase:
+        raise ValueError("hindsight is for replay buffers, not for environments.")
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns the memory and the generator, for `state_dict` and `dumps`."""
+        with self._lock:
+            rng = self._generator and self._generator.get_state()
+            return {"memory": self._memory.state(), "generator": rng}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Takes what `get_extra_state` returned."""
+        with self._lock:
+            self._memory.load(state["memory"])
+            if state["generator"] is not None:
+                self._generator = self._generator or torch.Generator("cpu")
+                self._generator.set_state(state["generator"])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in super().__getstate__().items() if k != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "_lock": threading.Lock()})
+
+
+def find_buffer() -> tuple[ReplayBuffer | None, str]:
+    """Returns the buffer that calls, if any, and its method; refuses `__setitem__`.
+
+    torchrl gives transforms no handle on their buffer, whose size, layout and sampler
+    decide what is right, and a transform may go from one to another: so the functions
+    that call are looked at (3 us, as most are ruled out by their module).
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").startswith("torchrl.data."):
+            buffer = frame.f_locals.get("self")
+            if isinstance(buffer, ReplayBuffer):
+                method = frame.f_code.co_name
+                if method == "__setitem__":
+                    raise RuntimeError(
+                        "hindsight cannot follow rows that are replaced: extend() the "
+                        "buffer instead of assigning to its rows."
+                    )
+                return buffer, method
+        frame = frame.f_back
+    return None, ""
+
+
+def samples_slices(buffer: ReplayBuffer | None) -> bool:
+    """Tells whether a buffer samples rows that follow each other in time."""
+    sampler, unit = getattr(buffer, "sampler", None), getattr(buffer, "_sample_unit", 0)
+    return isinstance(sampler, SliceSampler) or isinstance(unit, Sequence)
+
+
+def _has_multi_step(transform: envs.Transform | None) -> bool:
+    """Looks for a MultiStepTransform in the same chain, which may be nested."""
+    while transform is not None:
+        root, container = transform, transform.__dict__["_container"]
+        transform = container() if container is not None else None
+    return any(isinstance(t, envs.MultiStepTransform) for t in root.modules())
