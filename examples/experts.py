@@ -89,7 +89,7 @@ def pick_and_place(
 
 
 def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Carry the lower cube to its goal, then the upper one onto it; let go of both.
+    """Carry the lower cube to its goal, then the upper one onto it.
 
     A cube that leaves the fingers no room beside the lower one is pushed aside first.
     """
@@ -103,13 +103,10 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
         return torch.where(held, (error < 0.01) & (speed < 0.1), error < tolerance)
 
     placed = arrived(norm(lower - goal), lower_speed, lower_held, 0.025)
-    # What counts as success is not taken apart again.
-    good = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.04
-    placed = placed | good & ~lower_held
     stacked = arrived(norm(upper - top), upper_speed, upper_held, 0.02)
     to_lower, to_upper = norm(ee - lower), norm(ee - upper)
     leave = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
-    leave = leave | stacked & (ee[..., 2:] < 0.15)
+    leave = leave | placed & stacked & (ee[..., 2:] < 0.15)
     # Rising while the fingers open would take the cube along.
     upwards = torch.where((width < 0.02) | (width > 0.06), 1.0, 0.0)
     rise = torch.cat((0 * ee[..., :2], upwards, 0.4 + 0 * width), -1)
@@ -139,7 +136,11 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
     on_top = upper[..., 2:] > 0.03
     blocked = crowds(at) & ~(lower_held | upper_held | placed & on_top)
     action = torch.where(placed, finish, carry(ee, width, lower, goal))
-    return torch.where(blocked, torch.where(leave, rise, clear), action)
+    action = torch.where(blocked, torch.where(leave, rise, clear), action)
+    # What is as it should be, held or not, is not touched again.
+    done = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.03
+    hold = torch.cat((0 * ee, torch.where(upper_held, -1.0, 0.0)), -1)
+    return torch.where(done, hold, action)
 
 
 # How far the closed fingers reach along x and y from the end-effector, and the puck [m]
