@@ -1,0 +1,60 @@
+"""DDPG with hindsight on Reach in plain torchrl: at 100 % success in about a minute.
+
+python examples/first_steps.py
+"""
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import MLP, AdditiveGaussianModule, TanhModule
+from torchrl.objectives import DDPGLoss, SoftUpdate
+
+import torch_panda
+from torch_panda.transforms import HindsightRelabel
+
+torch.manual_seed(0)
+env = torch_panda.make("PandaReach-v1", num_envs=8, seed=0)
+test_env = torch_panda.make("PandaReach-v1", num_envs=50, seed=1)
+
+
+class Net(MLP):
+    """Sees the goal beside the observation, in decimetres: of the size of actions."""
+
+    def forward(self, observation: Tensor, goal: Tensor, *action: Tensor) -> Tensor:
+        """Concatenate the inputs, (..., 6), (..., 3) and, if given, (..., 3)."""
+        return super().forward(10 * observation, 10 * goal, *action)
+
+
+inputs = ["observation", "desired_goal"]
+net = Net(9, 3, depth=2, num_cells=256, activation_class=nn.ReLU)
+policy = TensorDictModule(net, inputs, ["action"])
+actor = TensorDictSequential(policy, TanhModule(in_keys=["action"]))
+value = Net(12, 1, depth=2, num_cells=256, activation_class=nn.ReLU)
+critic = TensorDictModule(value, [*inputs, "action"], ["state_action_value"])
+noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+
+loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
+loss.make_value_estimator(gamma=0.98)
+follow = SoftUpdate(loss, tau=0.05)  # the target networks
+optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+# 80 % of the rows that are sampled get a goal that their episode reached later.
+relabel = HindsightRelabel.from_env(env, her_ratio=0.8)
+storage = LazyTensorStorage(100_000)
+buffer = TensorDictReplayBuffer(storage=storage, transform=relabel, batch_size=256)
+explore = TensorDictSequential(actor, noise)
+for data in Collector(env, explore, frames_per_batch=400, total_frames=2_400):
+    buffer.extend(data.reshape(-1))
+    for _ in range(200):
+        batch = buffer.sample()
+        losses = loss(batch)
+        # Small actions are as good as large ones, but do not saturate the tanh.
+        penalty = actor(batch.select(*inputs))["action"].square().mean()
+        optimizer.zero_grad()
+        (losses["loss_actor"] + losses["loss_value"] + penalty).backward()
+        optimizer.step()
+        follow.step()
+    with torch.no_grad():
+        success = test_env.rollout(50, actor)["next", "success"][:, -1].float().mean()
+    print(f"{len(buffer)} steps: success at the end of 50 episodes {success:.0%}")
