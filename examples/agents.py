@@ -3,7 +3,8 @@
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
-from operator import itemgetter
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, Literal
 
@@ -461,7 +462,9 @@ def read(
     keys: Iterable[NestedKey],
     **options: Any,  # noqa: ANN401 (those of torch.load)
 ) -> Any:  # noqa: ANN401 (what was saved)
-    """Read a file that torch.save wrote.
+    """Read a file of tensors, numbers and dicts that torch.save wrote.
+
+    Nothing in it is run, so it may come from a stranger.
 
     Args:
         path: of the file.
@@ -475,8 +478,9 @@ def read(
     if not path.exists():
         raise ValueError(f"there is no file {path}")
     try:
-        content = torch.load(path, **options)
-        itemgetter(*keys)(content)
+        content = torch.load(path, weights_only=True, **options)
+        for key in keys:
+            reduce(getitem, key if isinstance(key, tuple) else (key,), content)
     except Exception as error:  # of almost any kind: it depends on the bytes
         raise ValueError(
             f"{path} does not hold {what}, or is damaged ({type(error).__name__})"

@@ -58,7 +58,7 @@ class Args:
     num_threads: int | None = None
     """threads that step them; None means one per core"""
     out: Path | None = None
-    """where to save the transitions, a TensorDict of shape (steps,)"""
+    """where to save the transitions, a nested dict of tensors of shape (steps, ...)"""
 
 
 # ---- tasks -----------------------------------------------------------------------
@@ -328,7 +328,7 @@ def main(args: Args) -> None:
         transitions["collector", "traj_ids"] = torch.arange(
             len(episodes)
         ).repeat_interleave(lengths)
-        torch.save(transitions, args.out)
+        torch.save(transitions.to_dict(), args.out)
         print(f"{len(transitions)} transitions in {args.out}")
 
 

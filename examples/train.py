@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -449,8 +449,11 @@ def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
     Raises:
         ValueError: the file holds none, or none of such an environment.
     """
-    demos = read(path, "demonstrations", STORED_KEYS, weights_only=False)
-    demos = demos.select(*STORED_KEYS)
+    content = read(path, "demonstrations", STORED_KEYS)
+    try:
+        demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
+    except RuntimeError as error:  # other lengths
+        raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
     for key in ("observation", "action", "desired_goal"):

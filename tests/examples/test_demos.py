@@ -74,7 +74,7 @@ def test_policy_comes_closer_to_demonstrations(env, algo):
 def test_demonstrations_are_given_the_goal_they_achieved(tmp_path, her_ratio):
     path = tmp_path / "demos.pt"
     experts.main(experts.Args("PandaSlide-v1", episodes=4, num_envs=4, out=path))
-    demos = torch.load(path, weights_only=False).reshape(4, -1)
+    demos = TensorDict(torch.load(path), [200]).reshape(4, -1)
     final = demos["next", "achieved_goal"][:, -1]
     assert (final - demos["desired_goal"][:, -1]).norm(dim=-1).max() > 0.05  # a miss
     args = Args(

@@ -90,8 +90,7 @@ def test_demonstrations_extend_a_replay_buffer(tmp_path):
         text=True,
     )
     assert "success at the end" in result.stdout
-    demonstrations = torch.load(out, weights_only=False)
-    assert isinstance(demonstrations, TensorDict)
+    demonstrations = TensorDict(torch.load(out)).auto_batch_size_(1)
     ids = demonstrations["collector", "traj_ids"]
     assert ids.unique().tolist() == list(range(6))
     last = demonstrations["next", "done"].squeeze(-1)
