@@ -15,10 +15,10 @@ from torchrl.data.replay_buffers.sample_units import Sequence
 from typing_extensions import Self
 
 from torch_panda.transforms.checks import DataCheck
+from torch_panda.transforms.columns import ids_of, time_first
 from torch_panda.transforms.goal_memory import GoalMemory
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
 from torch_panda.transforms.strategies import DESIRED, Strategy, parse_strategies
-from torch_panda.transforms.trajectories import ids_of, time_first
 
 SERIAL_KEY = "hindsight_serial"
 
@@ -138,7 +138,7 @@ class BufferTransform(envs.Transform):
     def end_trajectories(self) -> None:
         """Ends all trajectories; what is written next begins new ones."""
         with self._lock:
-            self._memory.tracker.open.clear()
+            self._memory.open.clear()
 
     def empty(self) -> None:
         """Forgets all transitions; a buffer's own `empty` does not tell transforms."""
