@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-from array import array
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,8 +20,9 @@ class GoalMemory:
     Transitions are numbered in the order of writing: their serials. A round-robin
     buffer overwrites its oldest rows, so it holds the last serials, and with a
     transition all that lies ahead of it. A ring holds the goals: the transition
-    `serial` is its row `serial % rows`. Every trajectory lists its rows of the ring in
-    order of time; a transition's step is its place in that list.
+    `serial` is its row `serial % rows`. Rows of one trajectory are listed, in order of
+    time, in a region of `_rows` that is a power of two long. A full one moves to a
+    larger region, and the old one is used again.
 
     A transition goes on with the trajectory of the one of its id before it, unless that
     was done, or got to another goal than this one begins with (as ids begin anew with
@@ -39,9 +38,14 @@ class GoalMemory:
         self._links = False  # whether one ever began with the goal before it
         self._goals: Goals = np.zeros((self._kinds, 0))  # (kinds, rows, *goal)
         self._index = np.zeros((2, 0), dtype=np.int32)  # trajectories and steps of rows
-        self._rows: list[array[int]] = []  # of trajectories
-        self._spans = np.zeros((2, 64), dtype=np.int32)  # their first step, and the end
-        self._unused: list[int] = []  # numbers of trajectories that were overwritten
+        # Of trajectories: their first step, the end, where in `_rows` step 0 would be, up
+        # to which step there is room, and where in `_rows` their region begins.
+        self._table = np.zeros((5, 64), dtype=np.int32)
+        self._begun = 0  # numbers of trajectories that were ever used
+        self._unused: list[int] = []  # those of trajectories that were overwritten
+        self._rows = np.zeros(1024, dtype=np.int32)  # of the ring
+        self._used = 0  # places that were ever part of a region
+        self._free_regions: dict[int, list[int]] = {}  # size -> where they begin
 
     def write(
         self, columns: Columns, desired: Goals, stored: int, capacity: int | None
@@ -61,13 +65,17 @@ class GoalMemory:
         for kind, goals in enumerate((achieved, desired)[: self._kinds]):
             self._goals[kind, row] = goals
         before = self._follow(ids, done, serial, root)
-        trajectories, index = self._index
+        trajectories, steps = self._index
         for i, b in zip(row.tolist(), before.tolist(), strict=True):
-            trajectory = self._begin() if b < 0 else trajectories[b]
-            rows = self._rows[trajectory]
-            trajectories[i], index[i] = trajectory, len(rows)
-            rows.append(i)
-        self._spans[1, trajectories[row]] = index[row] + 1  # the last one's stays
+            new = b < 0
+            trajectories[i] = self._begin() if new else trajectories[b]
+            steps[i] = 0 if new else steps[b] + 1
+        trajectory, step = self._index[:, row]
+        _, end, _, room, _ = self._table
+        end[trajectory] = step + 1  # of one's several steps the last one stays
+        for t in set(trajectory[step >= room[trajectory]].tolist()):
+            self._move(t)
+        self._rows[self._table[2, trajectory] + step] = row
         self.count += len(ids)
         return serial
 
@@ -103,10 +111,32 @@ class GoalMemory:
         """Returns the number of a new trajectory."""
         if self._unused:
             return self._unused.pop()
-        self._rows.append(array("i"))
-        if len(self._rows) > self._spans.shape[1]:
-            self._spans = np.pad(self._spans, ((0, 0), (0, len(self._rows))))
-        return len(self._rows) - 1
+        self._begun += 1
+        if self._begun > self._table.shape[1]:
+            self._table = np.pad(self._table, ((0, 0), (0, self._begun)))
+        return self._begun - 1
+
+    def _move(self, trajectory: int) -> None:
+        """Moves a trajectory to where its steps fit, and some more."""
+        first, end, base, room, _ = self._table[:, trajectory].tolist()
+        rows = self._rows[base + first : base + room].copy()
+        self._release(trajectory)
+        size = 1 << max(15, 9 * (end - first) // 8).bit_length()
+        free = self._free_regions.setdefault(size, [])
+        if not free:
+            free.append(self._used)
+            self._used += size
+            if (more := self._used - len(self._rows)) > 0:
+                self._rows = np.pad(self._rows, (0, max(more, len(self._rows))))
+        start = free.pop()
+        self._rows[start : start + len(rows)] = rows
+        self._table[2:, trajectory] = start - first, first + size, start
+
+    def _release(self, trajectory: int) -> None:
+        """Lets the region of a trajectory, if it has one, be used again."""
+        base, room, start = self._table[2:, trajectory].tolist()
+        if room:
+            self._free_regions[base + room - start].append(start)
 
     def _make_room(self, goals: Goals, stored: int, capacity: int | None) -> None:
         """Makes the ring hold some more; the first goals tell their type."""
@@ -126,9 +156,8 @@ class GoalMemory:
             serial = np.arange(self.freed, self.count)
             old, new = serial % rows, serial % room
             larger[:, new], index[:, new] = self._goals[:, old], self._index[:, old]
-            places = zip(*index[:, new].tolist(), new.tolist(), strict=True)
-            for trajectory, step, row in places:
-                self._rows[trajectory][step] = row
+            trajectory, step = index[:, new]
+            self._rows[self._table[2, trajectory] + step] = new
         self._goals, self._index = larger, index
 
     def free(self, floor: int) -> None:
@@ -136,15 +165,12 @@ class GoalMemory:
         if floor <= self.freed:
             return
         trajectory, step = self.find(np.arange(self.freed, floor))
-        first, end = self._spans
-        first[trajectory] = step + 1  # of one's several steps the last one stays
-        for t in set(trajectory[2 * first[trajectory] > end[trajectory]].tolist()):
-            rows, gone = self._rows[t], first[t]
-            del rows[:gone]
-            self._index[1, rows] -= gone
-            self._spans[:, t] -= gone
-            if not rows:
-                self._unused.append(t)
+        first, end = self._table[:2]
+        first[trajectory] = step + 1
+        for t in set(trajectory[first[trajectory] == end[trajectory]].tolist()):
+            self._release(t)
+            self._table[:, t] = 0
+            self._unused.append(t)
         self.open = {i: last for i, last in self.open.items() if last >= floor}
         self.freed = floor
 
@@ -181,18 +207,13 @@ class GoalMemory:
             drawn = strategies.draw_integers(self.freed, end, rng)
             return drawn % self._index.shape[1]
         trajectory, step = self.find(serial)
-        first, end = self._spans.take(trajectory, axis=1)
+        first, end, base = self._table[:3].take(trajectory, axis=1)
         chosen = strategies.choose_steps(strategy, step, first, end, rng)
-        rows, places = (
-            self._rows,
-            zip(trajectory.tolist(), chosen.tolist(), strict=True),
-        )
-        return np.array([rows[t][s] for t, s in places], dtype=np.int64)
+        return self._rows.take(base + chosen)
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
-        state = {**vars(self), "_spans": self._spans[:, : len(self._rows)]}
-        state["_rows"] = np.fromiter(chain(*self._rows), dtype=np.int32)
+        state = {**vars(self)}
         for name, value in state.items():
             if isinstance(value, np.ndarray):
                 state[name] = torch.from_numpy(value)
@@ -203,7 +224,5 @@ class GoalMemory:
         for name, value in copy.deepcopy(state).items():
             is_array = isinstance(value, torch.Tensor)
             setattr(self, name, value.numpy() if is_array else value)
-        rows = np.split(np.asarray(self._rows), self._spans[1].cumsum())
-        self._rows = [array("i", part.tobytes()) for part in rows[:-1]]
         if not self._links:  # nothing would show that an id is used again
             self.open.clear()
