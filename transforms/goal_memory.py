@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Generator
 
 from torch_panda.transforms import strategies
-from torch_panda.transforms.columns import Columns, Goals, Integers
-from torch_panda.transforms.strategies import Strategy, Weights
+from torch_panda.transforms.strategies import Integers, Strategy, Weights
+
+Goals = NDArray[Any]  # (n, *goal)
 
 
 class GoalMemory:
@@ -29,7 +31,7 @@ class GoalMemory:
     every collector). If none ever begins where the one before got to, ids decide.
     """
 
-    def __init__(self, keeps_desired: bool = False) -> None:
+    def __init__(self, keeps_desired: bool) -> None:
         self._kinds = 2 if keeps_desired else 1
         self.count = 0  # transitions so far: serial of the next one
         self.freed = 0  # serial of the oldest transition that is remembered
@@ -37,9 +39,9 @@ class GoalMemory:
         self._has_roots = False
         self._links = False  # whether one ever began with the goal before it
         self._goals: Goals = np.zeros((self._kinds, 0))  # (kinds, rows, *goal)
-        self._index = np.zeros((2, 0), dtype=np.int32)  # trajectories and steps of rows
-        # Of trajectories: their first step, the end, where in `_rows` step 0 would be, up
-        # to which step there is room, and where in `_rows` their region begins.
+        self._index = np.zeros((2, 0), dtype=np.int32)  # trajectories, steps
+        # Of trajectories: their first step, the end, where in `_rows` step 0 would be,
+        # up to which step there is room, and where in `_rows` their region begins.
         self._table = np.zeros((5, 64), dtype=np.int32)
         self._begun = 0  # numbers of trajectories that were ever used
         self._unused: list[int] = []  # those of trajectories that were overwritten
@@ -48,29 +50,39 @@ class GoalMemory:
         self._free_regions: dict[int, list[int]] = {}  # size -> where they begin
 
     def write(
-        self, columns: Columns, desired: Goals, stored: int, capacity: int | None
+        self,
+        ids: Integers,
+        done: NDArray[np.bool_],
+        root: Goals | None,
+        achieved: Goals,
+        desired: Goals,
+        *,
+        stored: int,
+        capacity: int | None,
     ) -> Integers:
         """Takes transitions that are about to be stored; returns their serials, (n,).
 
         Args:
-            columns: their ids, ends and achieved goals; see `Columns`.
-            desired: their desired goals, (n, *goal).
+            ids: of their trajectories, or environments, (n,).
+            done: whether these end, (n,).
+            root: goals that had been achieved before them, (n, *goal), if known.
+            achieved: goals that they achieved.
+            desired: goals that they were asked for.
             stored: how many transitions before them are still stored.
             capacity: how many can be stored, if that is known.
         """
-        ids, done, achieved, root = columns
         self._make_room(achieved, stored, capacity)
         serial = np.arange(self.count, self.count + len(ids))
         row = serial % self._index.shape[1]
         for kind, goals in enumerate((achieved, desired)[: self._kinds]):
             self._goals[kind, row] = goals
-        before = self._follow(ids, done, serial, root)
-        trajectories, steps = self._index
-        for i, b in zip(row.tolist(), before.tolist(), strict=True):
-            new = b < 0
-            trajectories[i] = self._begin() if new else trajectories[b]
-            steps[i] = 0 if new else steps[b] + 1
-        trajectory, step = self._index[:, row]
+        before = self._follow(ids, done, root, serial)
+        placed: dict[int, list[int]] = {}  # row -> trajectory and step
+        known = self._index[:, before].T.tolist()
+        for i, b, last in zip(row.tolist(), before.tolist(), known, strict=True):
+            t, s = placed.get(b, last) if b >= 0 else (self._begin(), -1)
+            placed[i] = [t, s + 1]
+        self._index[:, row] = trajectory, step = np.array([*placed.values()]).T
         _, end, _, room, _ = self._table
         end[trajectory] = step + 1  # of one's several steps the last one stays
         for t in set(trajectory[step >= room[trajectory]].tolist()):
@@ -80,12 +92,9 @@ class GoalMemory:
         return serial
 
     def _follow(
-        self, ids: Integers, done: Goals, serial: Integers, root: Goals | None
+        self, ids: Integers, done: Goals, root: Goals | None, serial: Integers
     ) -> Integers:
-        """Returns the rows of the transitions before each, (n,), -1 where one begins.
-
-        `root` are the goals that had been achieved before, if the data tell.
-        """
+        """Returns rows of the transitions before, (n,); -1 where a trajectory begins."""
         if self._has_roots != (root is not None):
             self.open.clear()
             self._has_roots = root is not None

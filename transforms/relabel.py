@@ -11,9 +11,9 @@ from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
 from torch_panda.transforms import base
-from torch_panda.transforms.columns import Goals, Integers
+from torch_panda.transforms.goal_memory import Goals
 from torch_panda.transforms.rewrite import GoalFunction
-from torch_panda.transforms.strategies import LOOKING_AHEAD, draw_uniform
+from torch_panda.transforms.strategies import LOOKING_AHEAD, Integers, draw_uniform
 
 
 class HindsightRelabel(base.BufferTransform):

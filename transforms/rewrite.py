@@ -32,8 +32,10 @@ class Rewriter:
         self.success_key = unravel_key(self.success_key)
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
-        goals = [self.goal_key, self.next_goal_key, self.next_achieved_key]
-        self._needed = [*goals, self.reward_key, _DONE]
+        # Achieved before and by a transition, and desired; the first may be missing.
+        own = unravel_key(self.achieved_goal_key)
+        self.goal_keys = own, self.next_achieved_key, self.goal_key
+        self._needed = [*self.goal_keys[1:], self.next_goal_key, self.reward_key, _DONE]
         self._needed += [self.success_key] if self.success_fn else []
         self._needed += [_TERMINATED] if self.terminated_fn else []
 
