@@ -55,34 +55,29 @@ class HindsightAugment(base.BufferTransform):
             )
         self._rewriter.check(tensordict)
         with self._lock:
-            held = self._held[0].get(base.SERIAL_KEY).min() if self._held else None
-            count = self._memory.count
-            stored = count - int(held) if held is not None else 0
+            stored = 0
+            if self._held:
+                oldest = self._held[0].get(base.SERIAL_KEY).min()
+                stored = self._memory.count - int(oldest)
             batch = self._note(tensordict, stored, None)
             self._held.append(batch.reshape(-1).clone())
             serials = [b.get(base.SERIAL_KEY).numpy(force=True) for b in self._held]
             is_open = self._memory.is_open(np.concatenate(serials))
             if is_open.all():
                 return None
-            every, stays = torch.cat(self._held), torch.from_numpy(is_open)
-            self._held = [every[stays]] if is_open.any() else []
-            return self._augment(every[~stays])
-
-    def _augment(self, ended: TensorDictBase) -> TensorDictBase:
-        """Returns transitions of whole episodes, (n,), in order of time.
-
-        After them come k relabelled copies of each: (n * (1 + k),).
-        """
-        ended = ended[ended.get(base.SERIAL_KEY).argsort()]
-        copies = ended[torch.arange(len(ended), device="cpu").repeat_interleave(self.k)]
-        serial = copies.get(base.SERIAL_KEY)
-        drawn = self._memory.draw(
-            serial.numpy(force=True), self._weights, self._generator
-        )
+            held, stays = TensorDict.cat(self._held), torch.from_numpy(is_open)
+            self._held = [held[stays]] if is_open.any() else []
+            ended = held[~stays]
+            ended = ended[ended.get(base.SERIAL_KEY).argsort()]  # in order of time
+            number = torch.arange(len(ended), device="cpu")
+            copies = ended[number.repeat_interleave(self.k)]
+            serial = copies.get(base.SERIAL_KEY)
+            tags = serial.numpy(force=True)
+            drawn = self._memory.draw(tags, self._weights, self._generator)
         goals = torch.from_numpy(drawn).to(serial.device)
-        every = torch.arange(len(serial), device=serial.device)
-        copies = self._rewriter.rewrite(copies, every, goals, is_own=True)
-        return torch.cat([ended, copies]).exclude(base.SERIAL_KEY)
+        rows = torch.arange(len(serial), device=serial.device)
+        copies = self._rewriter.rewrite(copies, rows, goals, is_own=True)
+        return TensorDict.cat([ended, copies]).exclude(base.SERIAL_KEY)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Leaves what is sampled as it is."""
@@ -95,7 +90,7 @@ class HindsightAugment(base.BufferTransform):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the episodes held back and the generator, for `state_dict`."""
-        held = torch.cat(self._held).to_dict() if self._held else None
+        held = TensorDict.cat(self._held).to_dict() if self._held else None
         return {**super().get_extra_state(), "held": held}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

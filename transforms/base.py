@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl import envs
 from torchrl.data import ReplayBuffer, SliceSampler
 from torchrl.data.replay_buffers.sample_units import Sequence
@@ -70,7 +70,8 @@ class BufferTransform(envs.Transform):
         self._weights = parse_strategies(strategy)
         self.trajectory_key, self.single_env = trajectory_key, single_env
         keys = goal_key, achieved_goal_key, reward_key, success_key
-        self._rewriter = Rewriter(reward_fn, success_fn, terminated_fn, *keys)
+        functions = reward_fn, success_fn, terminated_fn
+        self._rewriter = Rewriter(*functions, *map(unravel_key, keys))
         self._check_data = DataCheck(self._rewriter)
         self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
         self._generator: torch.Generator | None = None
@@ -121,17 +122,18 @@ class BufferTransform(envs.Transform):
         if batch.ndim > 1:  # as storages fill up, in order of time
             read = [self.trajectory_key, ("next", "done"), *keys.goal_keys]
             flat = batch.select(*read, strict=False).movedim(-1, 0).reshape(-1)
-        goals = [flat.get(key, None) for key in keys.goal_keys]
-        if any(goal is not None and goal.dtype is torch.bfloat16 for goal in goals):
+        goals: list[Any] = [flat.get(key, None) for key in keys.goal_keys]
+        if torch.bfloat16 in {goal.dtype for goal in goals if goal is not None}:
             raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
-        serial = self._memory.write(
-            self._ids(flat, shape),
-            flat.get(("next", "done")).reshape(-1).numpy(force=True),
-            *(goal if goal is None else goal.numpy(force=True) for goal in goals),
-            stored=stored,
-            capacity=capacity,
+        root, achieved, desired = (
+            goal if goal is None else goal.numpy(force=True) for goal in goals
         )
-        tag = torch.from_numpy(serial).view(shape[-1], *shape[:-1]).movedim(0, -1)
+        done = flat.get(("next", "done")).reshape(-1).numpy(force=True)
+        columns = self._ids(flat, shape), done, root, achieved, desired
+        serial = self._memory.write(*columns, stored=stored, capacity=capacity)
+        tag = torch.from_numpy(serial)
+        if batch.ndim > 1:
+            tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
         return batch.set(SERIAL_KEY, tag.to(batch.get(keys.goal_key).device))
 
     def _ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
@@ -140,17 +142,14 @@ class BufferTransform(envs.Transform):
         if ids is None:
             if len(shape) < 2 and not self.single_env:
                 raise ValueError(
-                    f"cannot tell trajectories apart in a batch {tuple(shape)} without "
-                    f"ids at {key!r}: keep the collector's ids, name others with "
-                    "trajectory_key=, extend with [num_envs, time], or pass "
-                    "single_env=True for steps of one environment."
+                    f"whose are the rows? There are no ids at {key!r}: keep the "
+                    "collector's, name others (trajectory_key=), extend with [num_envs,"
+                    " time], or pass single_env=True for steps of one environment."
                 )
             return np.arange(len(flat)) % shape[:-1].numel()
         if ids.numel() != len(flat):
-            raise ValueError(
-                f"the ids of trajectories at {key!r} must have the shape of the batch, "
-                f"{tuple(shape)}, got {tuple(ids.shape)} for {len(flat)} rows."
-            )
+            got = f"got {tuple(ids.shape)} for {tuple(shape)}"
+            raise ValueError(f"{key!r} must hold one id a transition, {got}.")
         return ids.reshape(-1).numpy(force=True)
 
     def __repr__(self) -> str:

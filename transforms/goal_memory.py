@@ -43,8 +43,7 @@ class GoalMemory:
         # Of trajectories: their first step, the end, where in `_rows` step 0 would be,
         # up to which step there is room, and where in `_rows` their region begins.
         self._table = np.zeros((5, 64), dtype=np.int32)
-        self._begun = 0  # numbers of trajectories that were ever used
-        self._unused: list[int] = []  # those of trajectories that were overwritten
+        self._unused = [*range(64)]  # numbers of no trajectory that is remembered
         self._rows = np.zeros(1024, dtype=np.int32)  # of the ring
         self._used = 0  # places that were ever part of a region
         self._free_regions: dict[int, list[int]] = {}  # size -> where they begin
@@ -94,14 +93,13 @@ class GoalMemory:
     def _follow(
         self, ids: Integers, done: Goals, root: Goals | None, serial: Integers
     ) -> Integers:
-        """Returns rows of the transitions before, (n,); -1 where a trajectory begins."""
+        """Returns the rows of the transitions before, (n,); -1 where one begins."""
         if self._has_roots != (root is not None):
             self.open.clear()
             self._has_roots = root is not None
         previous = []
-        for name, own, ends in zip(
-            ids.tolist(), serial.tolist(), done.tolist(), strict=True
-        ):
+        rows = zip(ids.tolist(), serial.tolist(), done.tolist(), strict=True)
+        for name, own, ends in rows:
             previous.append(self.open.pop(name, -1))
             if not ends:
                 self.open[name] = own
@@ -118,12 +116,11 @@ class GoalMemory:
 
     def _begin(self) -> int:
         """Returns the number of a new trajectory."""
-        if self._unused:
-            return self._unused.pop()
-        self._begun += 1
-        if self._begun > self._table.shape[1]:
-            self._table = np.pad(self._table, ((0, 0), (0, self._begun)))
-        return self._begun - 1
+        if not self._unused:
+            number = self._table.shape[1]
+            self._table = np.pad(self._table, ((0, 0), (0, number)))
+            self._unused = [*range(number, 2 * number)]
+        return self._unused.pop()
 
     def _move(self, trajectory: int) -> None:
         """Moves a trajectory to where its steps fit, and some more."""
@@ -223,7 +220,7 @@ class GoalMemory:
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
         state = {**vars(self)}
-        for name, value in state.items():
+        for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 state[name] = torch.from_numpy(value)
         return copy.deepcopy(state)

@@ -180,13 +180,13 @@ class HindsightRelabel(base.BufferTransform):
         """
         if self._memory.count:
             raise RuntimeError("prepare() must come before other transitions.")
-        flat = data.reshape(-1).copy()
+        flat = data.reshape(-1)
         noted = flat.copy()
         if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
-            trajectory = torch.arange(len(flat), device="cpu") // data.shape[-1]
-            noted.set(self.trajectory_key, trajectory)
+            row = torch.arange(len(flat), device="cpu") // data.shape[-1]
+            noted.set(self.trajectory_key, row)
         self._rewriter.check(noted)
         with self._lock:
             tag = self._note(noted, 0, None).get(base.SERIAL_KEY)
         self.end_trajectories()
-        return flat.set(base.SERIAL_KEY, tag)
+        return flat.copy().set(base.SERIAL_KEY, tag)
