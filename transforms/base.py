@@ -122,15 +122,15 @@ class BufferTransform(envs.Transform):
         if batch.ndim > 1:  # as storages fill up, in order of time
             read = [self.trajectory_key, ("next", "done"), *keys.goal_keys]
             flat = batch.select(*read, strict=False).movedim(-1, 0).reshape(-1)
-        goals: list[Any] = [flat.get(key, None) for key in keys.goal_keys]
+        goals = [flat.get(key, None) for key in keys.goal_keys]
         if torch.bfloat16 in {goal.dtype for goal in goals if goal is not None}:
             raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
-        root, achieved, desired = (
-            goal if goal is None else goal.numpy(force=True) for goal in goals
-        )
+        arrays: list[Any] = [g if g is None else g.numpy(force=True) for g in goals]
         done = flat.get(("next", "done")).reshape(-1).numpy(force=True)
-        columns = self._ids(flat, shape), done, root, achieved, desired
-        serial = self._memory.write(*columns, stored=stored, capacity=capacity)
+        ids = self._ids(flat, shape)
+        serial = self._memory.write(
+            ids, done, *arrays, stored=stored, capacity=capacity
+        )
         tag = torch.from_numpy(serial)
         if batch.ndim > 1:
             tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
