@@ -11,7 +11,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch_panda.transforms import base
 from torch_panda.transforms.rewrite import GoalFunction
 from torch_panda.transforms.strategies import DESIRED, RANDOM
-from torch_panda.transforms.trajectories import Integers
 
 
 class HindsightAugment(base.BufferTransform):
@@ -35,9 +34,7 @@ class HindsightAugment(base.BufferTransform):
             goals = f"cannot draw {self.strategy!r} goals; HindsightRelabel can"
             raise ValueError(f"HindsightAugment sees one episode at a time: {goals}.")
         self.k = k
-        # Transitions of open trajectories: rows of a pool, and their serials, or -1.
-        self._pool: Any = None
-        self._serials: Integers = np.zeros(0, dtype=np.int64)
+        self._held: list[TensorDictBase] = []  # batches; the first has the oldest row
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Takes transitions in and returns those of the episodes that have ended.
@@ -58,43 +55,29 @@ class HindsightAugment(base.BufferTransform):
             )
         self._rewriter.check(tensordict)
         with self._lock:
-            count = self._memory.tracker.count
-            oldest = self._serials[self._serials >= 0].min(initial=count)
-            batch = self._note(tensordict, int(count - oldest), None)
-            self._hold(batch.reshape(-1))
-            rows = (self._serials >= 0).nonzero()[0]
-            rows = rows[self._serials[rows].argsort()]  # in order of time
-            trajectory, _ = self._memory.find(self._serials[rows])
-            rows = rows[~np.isin(trajectory, [*self._memory.tracker.open.values()])]
-            return self._augment(rows) if len(rows) else None
-
-    def _hold(self, batch: TensorDictBase) -> None:
-        """Copies transitions, (n,), into free rows of the pool, which may grow."""
-        missing = len(batch) - int((self._serials < 0).sum())
-        if missing > 0:
-            missing = max(missing, len(self._serials))
-            more = batch[:1].expand(missing).clone()
-            pool = self._pool
-            self._pool = more if pool is None else TensorDict.cat([pool, more])
-            self._serials = np.append(self._serials, np.full(missing, -1))
-        rows = (self._serials < 0).nonzero()[0][: len(batch)]
-        self._pool[torch.from_numpy(rows)] = batch
-        self._serials[rows] = batch.get(base.SERIAL_KEY).numpy(force=True)
-
-    def _augment(self, rows: Integers) -> TensorDictBase:
-        """Takes rows of whole episodes, (n,), out of the pool; returns (n * (1 + k),).
-
-        They come first, in order, then k relabelled copies of each.
-        """
-        original = self._pool[torch.from_numpy(rows)]
-        serial = self._serials[rows].repeat(self.k)
-        self._serials[rows] = -1
-        drawn = self._memory.draw(serial, self._weights, self._generator)
-        goals = torch.from_numpy(drawn).to(original.get(base.SERIAL_KEY).device)
-        copied = torch.arange(len(original), device="cpu").repeat_interleave(self.k)
-        every = torch.arange(len(copied), device=goals.device)
-        copies = self._rewriter.rewrite(original[copied], every, goals, is_own=True)
-        return TensorDict.cat([original, copies]).exclude(base.SERIAL_KEY)
+            stored = 0
+            if self._held:
+                oldest = self._held[0].get(base.SERIAL_KEY).min()
+                stored = self._memory.count - int(oldest)
+            batch = self._note(tensordict, stored, None)
+            self._held.append(batch.reshape(-1).clone())
+            serials = [b.get(base.SERIAL_KEY).numpy(force=True) for b in self._held]
+            is_open = self._memory.is_open(np.concatenate(serials))
+            if is_open.all():
+                return None
+            held, stays = TensorDict.cat(self._held), torch.from_numpy(is_open)
+            self._held = [held[stays]] if is_open.any() else []
+            ended = held[~stays]
+            ended = ended[ended.get(base.SERIAL_KEY).argsort()]  # in order of time
+            number = torch.arange(len(ended), device="cpu")
+            copies = ended[number.repeat_interleave(self.k)]
+            serial = copies.get(base.SERIAL_KEY)
+            tags = serial.numpy(force=True)
+            drawn = self._memory.draw(tags, self._weights, self._generator)
+        goals = torch.from_numpy(drawn).to(serial.device)
+        rows = torch.arange(len(serial), device=serial.device)
+        copies = self._rewriter.rewrite(copies, rows, goals, is_own=True)
+        return TensorDict.cat([ended, copies]).exclude(base.SERIAL_KEY)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Leaves what is sampled as it is."""
@@ -103,17 +86,15 @@ class HindsightAugment(base.BufferTransform):
     def empty(self) -> None:
         """Drops the episodes held back, which the buffer's own `empty` does not."""
         super().empty()
-        self._pool, self._serials = None, self._serials[:0]
+        self._held = []
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the episodes held back and the generator, for `state_dict`."""
-        held = (self._serials >= 0).nonzero()[0]
-        rows = self._pool[torch.from_numpy(held)].to_dict() if len(held) else None
-        return {**super().get_extra_state(), "held": rows}
+        held = TensorDict.cat(self._held).to_dict() if self._held else None
+        return {**super().get_extra_state(), "held": held}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Takes what `get_extra_state` returned."""
         super().set_extra_state(state)
-        self._pool, self._serials = None, self._serials[:0]
-        if (held := state["held"]) is not None:
-            self._hold(TensorDict(held, [len(held[base.SERIAL_KEY])]))
+        held = state["held"]
+        self._held = [TensorDict(held, [len(held[base.SERIAL_KEY])])] if held else []

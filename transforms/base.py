@@ -7,8 +7,9 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl import envs
 from torchrl.data import ReplayBuffer, SliceSampler
 from torchrl.data.replay_buffers.sample_units import Sequence
@@ -17,8 +18,12 @@ from typing_extensions import Self
 from torch_panda.transforms.checks import DataCheck
 from torch_panda.transforms.goal_memory import GoalMemory
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
-from torch_panda.transforms.strategies import DESIRED, Strategy, parse_strategies
-from torch_panda.transforms.trajectories import ids_of, time_first
+from torch_panda.transforms.strategies import (
+    DESIRED,
+    Integers,
+    Strategy,
+    parse_strategies,
+)
 
 SERIAL_KEY = "hindsight_serial"
 
@@ -65,7 +70,8 @@ class BufferTransform(envs.Transform):
         self._weights = parse_strategies(strategy)
         self.trajectory_key, self.single_env = trajectory_key, single_env
         keys = goal_key, achieved_goal_key, reward_key, success_key
-        self._rewriter = Rewriter(reward_fn, success_fn, terminated_fn, *keys)
+        functions = reward_fn, success_fn, terminated_fn
+        self._rewriter = Rewriter(*functions, *map(unravel_key, keys))
         self._check_data = DataCheck(self._rewriter)
         self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
         self._generator: torch.Generator | None = None
@@ -112,23 +118,39 @@ class BufferTransform(envs.Transform):
                 'sample slices with HindsightRelabel(unit="slice") instead.'
             )
         self._check_data(batch)
-        keys, dims = self._rewriter, batch.ndim
-        done = batch.get(("next", "done"))
-        root = batch.get(keys.achieved_goal_key, None)
-        columns = (
-            ids_of(batch, self.trajectory_key, self.single_env),
-            time_first(done if dims == 1 else done.reshape(batch.shape), dims).ravel(),
-            time_first(batch.get(keys.next_achieved_key), dims),
-            None if root is None else time_first(root, dims),
+        keys, shape, flat = self._rewriter, batch.batch_size, batch
+        if batch.ndim > 1:  # as storages fill up, in order of time
+            read = [self.trajectory_key, ("next", "done"), *keys.goal_keys]
+            flat = batch.select(*read, strict=False).movedim(-1, 0).reshape(-1)
+        goals = [flat.get(key, None) for key in keys.goal_keys]
+        if torch.bfloat16 in {goal.dtype for goal in goals if goal is not None}:
+            raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
+        arrays: list[Any] = [g if g is None else g.numpy(force=True) for g in goals]
+        done = flat.get(("next", "done")).reshape(-1).numpy(force=True)
+        ids = self._ids(flat, shape)
+        serial = self._memory.write(
+            ids, done, *arrays, stored=stored, capacity=capacity
         )
-        goals = batch.get(keys.goal_key)
-        desired = time_first(goals, dims)
-        serial = self._memory.write(columns, desired, stored, capacity)
         tag = torch.from_numpy(serial)
-        if dims > 1:  # back to [*batch, time]
-            shape = batch.batch_size
+        if batch.ndim > 1:
             tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
-        return batch.set(SERIAL_KEY, tag.to(goals.device))
+        return batch.set(SERIAL_KEY, tag.to(batch.get(keys.goal_key).device))
+
+    def _ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
+        """Returns ids of trajectories, or numbers of environments, (n,)."""
+        key, ids = self.trajectory_key, flat.get(self.trajectory_key, None)
+        if ids is None:
+            if len(shape) < 2 and not self.single_env:
+                raise ValueError(
+                    f"whose are the rows? There are no ids at {key!r}: keep the "
+                    "collector's, name others (trajectory_key=), extend with [num_envs,"
+                    " time], or pass single_env=True for steps of one environment."
+                )
+            return np.arange(len(flat)) % shape[:-1].numel()
+        if ids.numel() != len(flat):
+            got = f"got {tuple(ids.shape)} for {tuple(shape)}"
+            raise ValueError(f"{key!r} must hold one id a transition, {got}.")
+        return ids.reshape(-1).numpy(force=True)
 
     def __repr__(self) -> str:
         names = ("strategy", "her_ratio", "unit", "goal_parts", "k")
@@ -138,7 +160,7 @@ class BufferTransform(envs.Transform):
     def end_trajectories(self) -> None:
         """Ends all trajectories; what is written next begins new ones."""
         with self._lock:
-            self._memory.tracker.open.clear()
+            self._memory.open.clear()
 
     def empty(self) -> None:
         """Forgets all transitions; a buffer's own `empty` does not tell transforms."""
@@ -211,9 +233,9 @@ def samples_slices(buffer: ReplayBuffer | None) -> bool:
     return isinstance(sampler, SliceSampler) or isinstance(unit, Sequence)
 
 
-def _has_multi_step(transform: envs.Transform | None) -> bool:
+def _has_multi_step(transform: Any) -> bool:  # noqa: ANN401 (a transform or None)
     """Looks for a MultiStepTransform in the same chain, which may be nested."""
     while transform is not None:
         root, container = transform, transform.__dict__["_container"]
-        transform = container() if container is not None else None
+        transform = container and container()
     return any(isinstance(t, envs.MultiStepTransform) for t in root.modules())

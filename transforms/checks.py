@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-import torch
 from tensordict import TensorDictBase
 
 from torch_panda.transforms.rewrite import Rewriter, evaluate
@@ -71,12 +70,13 @@ class DataCheck:
         values = evaluate(keys.reward_fn, batch.get(keys.next_achieved_key), goals, old)
         stored, expected = old.flatten().double(), values.flatten().double()
         # Goals may have been more precise: 1 / 1000, and 5 % of the rows, may differ.
-        tolerance = 1e-3 * float(expected.abs().max()) + 1e-6
+        precision = 1e-3 * float(expected.abs().max()) + 1e-6
 
-        def differ(other: torch.Tensor, tolerance: float) -> bool:
-            return bool(((stored - other).abs() > tolerance).double().mean() > 0.05)
+        def differs(factor: float, constant: float) -> bool:
+            error = (stored - factor * expected - constant).abs()
+            return float((error > precision * abs(factor)).double().mean()) > 0.05
 
-        if self._has_warned or not differ(expected, tolerance):
+        if self._has_warned or not differs(1.0, 0.0):
             return
         low, high = expected.min(), expected.max()
         at_low, at_high = (stored[expected == x].median() for x in (low, high))
@@ -84,7 +84,7 @@ class DataCheck:
         if low == high:  # as long as nothing succeeds: likelier than a constant
             factor = float(at_low / low) if low else 0.0
         constant = float(at_low) - factor * float(low)
-        if factor and not differ(factor * expected + constant, tolerance * abs(factor)):
+        if factor and not differs(factor, constant):
             raise ValueError(
                 f"the rewards are reward_fn's times {factor:.4g} plus {constant:.4g} "
                 "(RewardScaling?): scale in the buffer, after this transform."

@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Generator
 
 from torch_panda.transforms import strategies
-from torch_panda.transforms.strategies import Strategy, Weights
-from torch_panda.transforms.trajectories import Columns, Goals, Integers
-from torch_panda.transforms.trajectories import TrajectoryTracker as Tracker
+from torch_panda.transforms.strategies import Integers, Strategy, Weights
 
-PAGE_BITS = 4
-PAGE = 1 << PAGE_BITS  # places
+Goals = NDArray[Any]  # (n, *goal)
 
 
 class GoalMemory:
@@ -24,143 +22,172 @@ class GoalMemory:
     Transitions are numbered in the order of writing: their serials. A round-robin
     buffer overwrites its oldest rows, so it holds the last serials, and with a
     transition all that lies ahead of it. A ring holds the goals: the transition
-    `serial` is its row `serial % rows`.
+    `serial` is its row `serial % rows`. Rows of one trajectory are listed, in order of
+    time, in a region of `_rows` that is a power of two long. A full one moves to a
+    larger region, and the old one is used again.
 
-    Rows of one trajectory are listed, in order of time, in a region of `_rows` that is
-    a power of two pages long. A full one moves to a larger region, the old one is used
-    again. So to append to many lists or draw from many takes a few calls of numpy, and
-    nothing for each row. A trajectory is named by the first page of its region.
+    A transition goes on with the trajectory of the one of its id before it, unless that
+    was done, or got to another goal than this one begins with (as ids begin anew with
+    every collector). If none ever begins where the one before got to, ids decide.
     """
 
-    def __init__(self, keeps_desired: bool = False) -> None:
+    def __init__(self, keeps_desired: bool) -> None:
         self._kinds = 2 if keeps_desired else 1
-        self.tracker = Tracker()
+        self.count = 0  # transitions so far: serial of the next one
         self.freed = 0  # serial of the oldest transition that is remembered
+        self.open: dict[int, int] = {}  # id -> last serial of what may go on
+        self._has_roots = False
+        self._links = False  # whether one ever began with the goal before it
         self._goals: Goals = np.zeros((self._kinds, 0))  # (kinds, rows, *goal)
-        self._places = np.zeros(0, dtype=np.int32)  # in `_rows`, of the ring's rows
-        self._rows = np.zeros(64 * PAGE, dtype=np.int32)  # the ring's, at places
-        # Of pages: their trajectory and, if that is the page itself, places of its
-        # first transition and behind its last one, and the size of its region.
-        self._pages = np.zeros((4, 64), dtype=np.int32)
-        self._begun = 0  # trajectories so far
-        self._used = 0  # pages that were ever part of a region
-        self._free_regions: dict[int, list[int]] = {}  # size -> first pages
+        self._index = np.zeros((2, 0), dtype=np.int32)  # trajectories, steps
+        # Of trajectories: their first step, the end, where in `_rows` step 0 would be,
+        # up to which step there is room, and where in `_rows` their region begins.
+        self._table = np.zeros((5, 64), dtype=np.int32)
+        self._unused = [*range(64)]  # numbers of no trajectory that is remembered
+        self._rows = np.zeros(1024, dtype=np.int32)  # of the ring
+        self._used = 0  # places that were ever part of a region
+        self._free_regions: dict[int, list[int]] = {}  # size -> where they begin
 
     def write(
-        self, columns: Columns, desired: Goals, stored: int, capacity: int | None
+        self,
+        ids: Integers,
+        done: NDArray[np.bool_],
+        root: Goals | None,
+        achieved: Goals,
+        desired: Goals,
+        *,
+        stored: int,
+        capacity: int | None,
     ) -> Integers:
         """Takes transitions that are about to be stored; returns their serials, (n,).
 
         Args:
-            columns: their ids, ends and achieved goals; see `Columns`.
-            desired: their desired goals, (n, *goal).
+            ids: of their trajectories, or environments, (n,).
+            done: whether these end, (n,).
+            root: goals that had been achieved before them, (n, *goal), if known.
+            achieved: goals that they achieved.
+            desired: goals that they were asked for.
             stored: how many transitions before them are still stored.
             capacity: how many can be stored, if that is known.
         """
-        head, achieved = self.tracker.count, columns[2]
-        self._make_room(head, achieved, stored, capacity)
-        runs = self.tracker.follow(*columns, self._last_achieved)
-        serial = np.arange(head, head + len(achieved))
-        row = serial % len(self._places)
+        self._make_room(achieved, stored, capacity)
+        serial = np.arange(self.count, self.count + len(ids))
+        row = serial % self._index.shape[1]
         for kind, goals in enumerate((achieved, desired)[: self._kinds]):
-            self._goals[kind][row] = goals
-        self._append(runs.trajectory, runs.length, row[runs.order])
-        self.tracker.keep(runs)
+            self._goals[kind, row] = goals
+        before = self._follow(ids, done, root, serial)
+        placed: dict[int, list[int]] = {}  # row -> trajectory and step
+        known = self._index[:, before].T.tolist()
+        for i, b, last in zip(row.tolist(), before.tolist(), known, strict=True):
+            t, s = placed.get(b, last) if b >= 0 else (self._begin(), -1)
+            placed[i] = [t, s + 1]
+        self._index[:, row] = trajectory, step = np.array([*placed.values()]).T
+        _, end, _, room, _ = self._table
+        end[trajectory] = step + 1  # of one's several steps the last one stays
+        for t in set(trajectory[step >= room[trajectory]].tolist()):
+            self._move(t)
+        self._rows[self._table[2, trajectory] + step] = row
+        self.count += len(ids)
         return serial
 
-    def _append(self, trajectory: Integers, length: Integers, rows: Integers) -> None:
-        """Appends rows, (n,), to trajectories, (m,), `length` of them to each.
+    def _follow(
+        self, ids: Integers, done: Goals, root: Goals | None, serial: Integers
+    ) -> Integers:
+        """Returns the rows of the transitions before, (n,); -1 where one begins."""
+        if self._has_roots != (root is not None):
+            self.open.clear()
+            self._has_roots = root is not None
+        previous = []
+        rows = zip(ids.tolist(), serial.tolist(), done.tolist(), strict=True)
+        for name, own, ends in rows:
+            previous.append(self.open.pop(name, -1))
+            if not ends:
+                self.open[name] = own
+        before = np.array(previous)
+        begins = before < 0
+        before %= self._index.shape[1]
+        if root is not None:
+            same = self._goals[0].take(before, axis=0) == root
+            follows = same.reshape(len(ids), -1).all(1) & ~begins
+            self._links = self._links or bool(follows.any())
+            begins = ~follows if self._links else begins
+        before[begins] = -1
+        return before
 
-        Those that are new, -1, or move get another name, in `trajectory` itself.
-        """
-        _, _, end, size = self._pages
-        full = end[trajectory] + length > trajectory * PAGE + size[trajectory]
-        is_new = trajectory < 0
-        self._begun += int(is_new.sum())
-        for i in (full | is_new).nonzero()[0].tolist():
-            trajectory[i] = self._move(int(trajectory[i]), int(length[i]))
-        end = self._pages[2]
-        places = (end[trajectory] + length - length.cumsum()).repeat(length)
-        places += np.arange(len(rows))
-        self._rows[places], self._places[rows] = rows, places
-        end[trajectory] += length
+    def _begin(self) -> int:
+        """Returns the number of a new trajectory."""
+        if not self._unused:
+            number = self._table.shape[1]
+            self._table = np.pad(self._table, ((0, 0), (0, number)))
+            self._unused = [*range(number, 2 * number)]
+        return self._unused.pop()
 
-    def _move(self, trajectory: int, number: int) -> int:
-        """Moves a trajectory, if not -1, to where a number more fit: its new name."""
-        if trajectory < 0:
-            rows = self._rows[:0]
-            number = max(number, self.tracker.count // self._begun)  # the mean length
-        else:
-            _, first, end, _ = self._pages[:, trajectory]
-            rows = self._rows[first:end].copy()
-            self._release(trajectory)
-            number = 3 * (len(rows) + number) // 2  # moves become ever rarer
-        size = 1 << max(number - 1, PAGE - 1).bit_length()
+    def _move(self, trajectory: int) -> None:
+        """Moves a trajectory to where its steps fit, and some more."""
+        first, end, base, room, _ = self._table[:, trajectory].tolist()
+        rows = self._rows[base + first : base + room].copy()
+        self._release(trajectory)
+        size = 1 << max(15, 9 * (end - first) // 8).bit_length()
         free = self._free_regions.setdefault(size, [])
         if not free:
             free.append(self._used)
-            self._used += size // PAGE
-            if (more := self._used - self._pages.shape[1]) > 0:
-                more = max(more, self._pages.shape[1])
-                self._pages = np.pad(self._pages, ((0, 0), (0, more)))
-                self._rows = np.pad(self._rows, (0, more * PAGE))
-        new = free.pop()
-        self._pages[0, new : new + size // PAGE] = new
-        start, end = new * PAGE, new * PAGE + len(rows)
-        self._pages[1:, new] = start, end, size
-        self._rows[start:end], self._places[rows] = rows, np.arange(start, end)
-        return new
+            self._used += size
+            if (more := self._used - len(self._rows)) > 0:
+                self._rows = np.pad(self._rows, (0, max(more, len(self._rows))))
+        start = free.pop()
+        self._rows[start : start + len(rows)] = rows
+        self._table[2:, trajectory] = start - first, first + size, start
 
     def _release(self, trajectory: int) -> None:
-        """Lets the region of a trajectory be used again."""
-        self._free_regions[int(self._pages[3, trajectory])].append(trajectory)
+        """Lets the region of a trajectory, if it has one, be used again."""
+        base, room, start = self._table[2:, trajectory].tolist()
+        if room:
+            self._free_regions[base + room - start].append(start)
 
-    def _last_achieved(self, trajectory: Integers) -> Goals:
-        """Returns what the last transitions of trajectories achieved, (m, *goal)."""
-        row = self._rows.take(self._pages[2].take(trajectory) - 1)
-        return self._goals[0].take(row, axis=0)
-
-    def _make_room(
-        self, head: int, goals: Goals, stored: int, capacity: int | None
-    ) -> None:
+    def _make_room(self, goals: Goals, stored: int, capacity: int | None) -> None:
         """Makes the ring hold some more; the first goals tell their type."""
-        rows, end = len(self._places), head + len(goals)
+        rows, end = self._index.shape[1], self.count + len(goals)
         if end - self.freed > rows:
-            self.free(head - stored)
+            self.free(self.count - stored)
         if end - self.freed <= rows:
             return
         room = max(1024, 2 * rows)
         if capacity is not None:  # and a little more, so that freeing is rare
             room = min(room, capacity + max(256, capacity // 64))
         room = max(end - self.freed, room)
-        larger = np.zeros((self._kinds, room, *goals.shape[1:]), goals.dtype)
-        places = np.zeros(room, dtype=np.int32)
+        dtype = self._goals.dtype if rows else goals.dtype
+        larger = np.zeros((self._kinds, room, *goals.shape[1:]), dtype)
+        index = np.zeros((2, room), dtype=np.int32)
         if rows:
-            larger = larger.astype(self._goals.dtype)
-            serial = np.arange(self.freed, head)
+            serial = np.arange(self.freed, self.count)
             old, new = serial % rows, serial % room
-            larger[:, new], places[new] = self._goals[:, old], self._places[old]
-            self._rows[places[new]] = new
-        self._goals, self._places = larger, places
+            larger[:, new], index[:, new] = self._goals[:, old], self._index[:, old]
+            trajectory, step = index[:, new]
+            self._rows[self._table[2, trajectory] + step] = new
+        self._goals, self._index = larger, index
 
     def free(self, floor: int) -> None:
         """Forgets the transitions below a serial: they have been overwritten."""
         if floor <= self.freed:
             return
-        places = self._places[np.arange(self.freed, floor) % len(self._places)]
-        owner, first, end, _ = self._pages
-        trajectory = owner[places >> PAGE_BITS]
-        first[trajectory] = places + 1  # of one's several places the last one stays
-        gone = set(trajectory[first[trajectory] == end[trajectory]].tolist())
-        for t in gone:
+        trajectory, step = self.find(np.arange(self.freed, floor))
+        first, end = self._table[:2]
+        first[trajectory] = step + 1
+        for t in set(trajectory[first[trajectory] == end[trajectory]].tolist()):
             self._release(t)
-        self.tracker.forget(gone)
+            self._table[:, t] = 0
+            self._unused.append(t)
+        self.open = {i: last for i, last in self.open.items() if last >= floor}
         self.freed = floor
 
-    def find(self, serial: Integers) -> tuple[Integers, Integers]:
-        """Returns trajectories of transitions, (n,), and numbers that count steps."""
-        place = self._places.take(serial % len(self._places))
-        return self._pages[0].take(place >> PAGE_BITS), place
+    def find(self, serial: Integers) -> Integers:
+        """Returns trajectories and steps of transitions, (2, n)."""
+        return self._index.take(serial % self._index.shape[1], axis=1)
+
+    def is_open(self, serial: Integers) -> Any:  # noqa: ANN401 (booleans)
+        """Tells which transitions' trajectories may go on, (n,)."""
+        last = np.array([*self.open.values()], dtype=np.int64)
+        return np.isin(self.find(serial)[0], self.find(last)[0])
 
     def draw(self, serial: Integers, weights: Weights, rng: Generator | None) -> Goals:
         """Draws a goal for each serial, (n,), by strategies: (n, *goal)."""
@@ -182,26 +209,26 @@ class GoalMemory:
     ) -> Integers:
         """Draws the ring's rows of the transitions that goals are from, (n,)."""
         if strategy in (strategies.RANDOM, strategies.DESIRED):
-            end = np.full(len(serial), self.tracker.count)
+            end = np.full(len(serial), self.count)
             drawn = strategies.draw_integers(self.freed, end, rng)
-            return drawn % len(self._places)
-        trajectory, place = self.find(serial)
-        first, end = self._pages[1:3].take(trajectory, axis=1)
-        chosen = strategies.choose_steps(strategy, place, first, end, rng)
-        return self._rows.take(chosen)
+            return drawn % self._index.shape[1]
+        trajectory, step = self.find(serial)
+        first, end, base = self._table[:3].take(trajectory, axis=1)
+        chosen = strategies.choose_steps(strategy, step, first, end, rng)
+        return self._rows.take(base + chosen)
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
-        state = {**vars(self), "tracker": vars(self.tracker)}
-        for name, value in state.items():
+        state = {**vars(self)}
+        for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 state[name] = torch.from_numpy(value)
         return copy.deepcopy(state)
 
     def load(self, state: dict[str, Any]) -> None:
         """Takes the state that another memory returned."""
-        state = copy.deepcopy(state)
-        self.tracker.load(state.pop("tracker"))
-        for name, value in state.items():
+        for name, value in copy.deepcopy(state).items():
             is_array = isinstance(value, torch.Tensor)
             setattr(self, name, value.numpy() if is_array else value)
+        if not self._links:  # nothing would show that an id is used again
+            self.open.clear()

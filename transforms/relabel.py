@@ -11,9 +11,9 @@ from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
 from torch_panda.transforms import base
+from torch_panda.transforms.goal_memory import Goals
 from torch_panda.transforms.rewrite import GoalFunction
-from torch_panda.transforms.strategies import LOOKING_AHEAD, draw_uniform
-from torch_panda.transforms.trajectories import Goals, Integers
+from torch_panda.transforms.strategies import LOOKING_AHEAD, Integers, draw_uniform
 
 
 class HindsightRelabel(base.BufferTransform):
@@ -104,7 +104,7 @@ class HindsightRelabel(base.BufferTransform):
     def _stored(self, buffer: ReplayBuffer | None) -> int:
         if buffer is not None:
             return len(buffer.storage)
-        return min(count := self._memory.tracker.count, self.capacity or count)
+        return min(count := self._memory.count, self.capacity or count)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels rows that a buffer has sampled.
@@ -120,7 +120,7 @@ class HindsightRelabel(base.BufferTransform):
                 cure = 'pass unit="slice" for one goal a slice'
                 warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
         with self._lock:
-            floor = self._memory.tracker.count - self._stored(buffer)
+            floor = self._memory.count - self._stored(buffer)
             if tag is None or floor < 0:
                 raise (KeyError if tag is None else RuntimeError)(
                     "HindsightRelabel must be in the buffer before the first extend(), "
@@ -178,15 +178,15 @@ class HindsightRelabel(base.BufferTransform):
         them flat and with a tag, for the `TensorStorage` of a buffer with this
         transform; `data` itself, which may be memory-mapped, is only read.
         """
-        if self._memory.tracker.count:
+        if self._memory.count:
             raise RuntimeError("prepare() must come before other transitions.")
-        flat = data.reshape(-1).copy()
+        flat = data.reshape(-1)
         noted = flat.copy()
         if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
-            trajectory = torch.arange(len(flat), device="cpu") // data.shape[-1]
-            noted.set(self.trajectory_key, trajectory)
+            row = torch.arange(len(flat), device="cpu") // data.shape[-1]
+            noted.set(self.trajectory_key, row)
         self._rewriter.check(noted)
         with self._lock:
             tag = self._note(noted, 0, None).get(base.SERIAL_KEY)
         self.end_trajectories()
-        return flat.set(base.SERIAL_KEY, tag)
+        return flat.copy().set(base.SERIAL_KEY, tag)

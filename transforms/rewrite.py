@@ -27,13 +27,11 @@ class Rewriter:
 
     def __post_init__(self) -> None:
         """Works out the keys under "next"."""
-        self.goal_key = unravel_key(self.goal_key)
-        self.reward_key = unravel_key(self.reward_key)
-        self.success_key = unravel_key(self.success_key)
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
-        goals = [self.goal_key, self.next_goal_key, self.next_achieved_key]
-        self._needed = [*goals, self.reward_key, _DONE]
+        # Achieved before and by a transition, and desired; the first may be missing.
+        self.goal_keys = self.achieved_goal_key, self.next_achieved_key, self.goal_key
+        self._needed = [*self.goal_keys[1:], self.next_goal_key, self.reward_key, _DONE]
         self._needed += [self.success_key] if self.success_fn else []
         self._needed += [_TERMINATED] if self.terminated_fn else []
 
@@ -59,9 +57,8 @@ class Rewriter:
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
         old_goals = flat.get(self.goal_key)
         goals = goals.to(old_goals.dtype)
-        new = {self.goal_key: goals, self.next_goal_key: goals}
-        reward = flat.get(self.reward_key)
-        new[self.reward_key] = evaluate(self.reward_fn, achieved, goals, reward)
+        reward = evaluate(self.reward_fn, achieved, goals, flat.get(self.reward_key))
+        new = {self.goal_key: goals, self.next_goal_key: goals, self.reward_key: reward}
         if self.success_fn is not None:
             success = flat.get(self.success_key)
             new[self.success_key] = evaluate(self.success_fn, achieved, goals, success)
@@ -91,9 +88,9 @@ def evaluate(
     """Returns what a function gives for goals, (n, *goal) each, in the old type."""
     values = function(achieved, desired)
     expected = (len(achieved), *old.shape[1:])
-    if not isinstance(values, Tensor) or values.shape != expected:
-        is_tensor = isinstance(values, Tensor)
-        got = tuple(values.shape) if is_tensor else type(values).__name__
+    is_tensor = isinstance(values, Tensor)
+    got = tuple(values.shape) if is_tensor else type(values).__name__
+    if got != expected:
         raise ValueError(
             "reward_fn, success_fn and terminated_fn map (achieved_goal, desired_goal),"
             f" (n, *goal) each, to a tensor: {function} to {expected}, got {got}."

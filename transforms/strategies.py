@@ -16,8 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from torch_panda.transforms.trajectories import Integers
-
+Integers = NDArray[np.integer[Any]]
 # A user's own: (step, first, end, generator) -> goal step, int32 tensors on the CPU.
 Strategy = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
 Weights = dict[str | Strategy, float]

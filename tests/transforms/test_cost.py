@@ -235,6 +235,7 @@ def test_memory_a_transition(capacity):
     memory = rb.transform[0]._memory
     own = sum(x.nbytes for x in vars(memory).values() if isinstance(x, np.ndarray))
     lists = sum(map(sys.getsizeof, memory._free_regions.values()))
+    lists += sys.getsizeof(memory._unused)
     total = own + lists + serial.nbytes
     print(f"{total / capacity:.1f} bytes a transition")
     assert total / capacity <= 3 * 4 + 24
