@@ -1,7 +1,5 @@
 """Hindsight goals at write time, as a transform of a replay buffer."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -53,7 +51,6 @@ class HindsightAugment(base.BufferTransform):
                 "HindsightAugment stores rows one by one: use ndim=1, and "
                 'no slices but HindsightRelabel(unit="slice").'
             )
-        self._rewriter.check(tensordict)
         with self._lock:
             stored = 0
             if self._held:

@@ -1,10 +1,7 @@
 """What the two transforms have in common: arguments, and the buffer they belong to."""
 
-from __future__ import annotations
-
 import inspect
 import threading
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,12 +15,7 @@ from typing_extensions import Self
 from torch_panda.transforms.checks import DataCheck
 from torch_panda.transforms.goal_memory import GoalMemory
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
-from torch_panda.transforms.strategies import (
-    DESIRED,
-    Integers,
-    Strategy,
-    parse_strategies,
-)
+from torch_panda.transforms.strategies import DESIRED, Integers, Weighted, parse
 
 SERIAL_KEY = "hindsight_serial"
 
@@ -47,12 +39,13 @@ class BufferTransform(envs.Transform):
     """
 
     requires_shared_write_state = True  # by all processes that share the buffer
+    goal_parts: tuple[int, ...] | None = None
 
     def __init__(
         self,
         reward_fn: GoalFunction,
         *,
-        strategy: str | Strategy | Mapping[Any, float] = "future",
+        strategy: Weighted = "future",
         success_fn: GoalFunction | None = None,
         terminated_fn: GoalFunction | None = None,
         goal_key: NestedKey = "desired_goal",
@@ -67,7 +60,7 @@ class BufferTransform(envs.Transform):
         if not callable(reward_fn):
             raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
         self.strategy = strategy
-        self._weights = parse_strategies(strategy)
+        self._weights = parse(strategy)
         self.trajectory_key, self.single_env = trajectory_key, single_env
         keys = goal_key, achieved_goal_key, reward_key, success_key
         functions = reward_fn, success_fn, terminated_fn
@@ -77,6 +70,7 @@ class BufferTransform(envs.Transform):
         self._generator: torch.Generator | None = None
         if seed is not None:
             self._generator = torch.Generator("cpu").manual_seed(seed)
+        self._is_chain_checked = False
         self._lock = threading.Lock()  # a prefetching buffer samples in threads
 
     @classmethod
@@ -95,42 +89,45 @@ class BufferTransform(envs.Transform):
                 return cls.from_env(worker, **options)
             finally:
                 worker.close(raise_if_closed=False)
-        for option, attribute in (
-            ("reward_fn", "compute_reward"),
-            ("success_fn", "is_success"),
-            ("terminated_fn", "terminate_on_success"),
-        ):
-            if option not in options:
-                value = getattr(env, attribute, None)
-                if value is None:
-                    raise ValueError(f"{env} has no {attribute}: give {option}=.")
-                ends = option == "terminated_fn"
-                options[option] = (env.is_success if value else None) if ends else value
+        names = {"reward_fn": "compute_reward", "success_fn": "is_success"}
+        names["terminated_fn"] = "terminate_on_success"
+        for option, name in names.items():
+            value = options.get(option, getattr(env, name, None))
+            if value is None and option not in options:
+                raise ValueError(f"{env} has no {name}: give {option}=.")
+            if isinstance(value, bool):  # whether success ends an episode
+                value = env.is_success if value else None
+            options[option] = value
         return cls(**options)
 
     def _note(
         self, batch: TensorDictBase, stored: int, capacity: int | None
     ) -> TensorDictBase:
         """Remembers transitions [*batch, time], and tags them with their serials."""
-        if _has_multi_step(self):
+        if not self._is_chain_checked and _has_multi_step(self):
             raise RuntimeError(
                 "n-step rewards, of MultiStepTransform, are not known for other goals: "
                 'sample slices with HindsightRelabel(unit="slice") instead.'
             )
-        self._check_data(batch)
+        self._is_chain_checked = True
         keys, shape, flat = self._rewriter, batch.batch_size, batch
+        needed = (keys.next_achieved_key, ("next", "done"))
+        if not self._memory.count or any(batch.get(k, None) is None for k in needed):
+            keys.check(batch)
+            size = batch.get(keys.goal_key).shape[-1]
+            if self.goal_parts is not None and sum(self.goal_parts) != size:
+                raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}")
+        self._check_data(batch)
         if batch.ndim > 1:  # as storages fill up, in order of time
             read = [self.trajectory_key, ("next", "done"), *keys.goal_keys]
             flat = batch.select(*read, strict=False).movedim(-1, 0).reshape(-1)
         goals = [flat.get(key, None) for key in keys.goal_keys]
         if torch.bfloat16 in {goal.dtype for goal in goals if goal is not None}:
             raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
-        arrays: list[Any] = [g if g is None else g.numpy(force=True) for g in goals]
+        arrays: Any = [g if g is None else g.numpy(force=True) for g in goals]
         done = flat.get(("next", "done")).reshape(-1).numpy(force=True)
         ids = self._ids(flat, shape)
-        serial = self._memory.write(
-            ids, done, *arrays, stored=stored, capacity=capacity
-        )
+        serial = self._memory.write(ids, done, tuple(arrays), stored, capacity)
         tag = torch.from_numpy(serial)
         if batch.ndim > 1:
             tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
@@ -167,6 +164,11 @@ class BufferTransform(envs.Transform):
         with self._lock:
             self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
 
+    def empty_cache(self) -> None:
+        """Is called when the chain changes: n-step rewards are looked for again."""
+        super().empty_cache()
+        self._is_chain_checked = False
+
     def share_memory_(self) -> None:
         """Is called for a buffer that several processes write to: a RuntimeError."""
         raise RuntimeError(
@@ -179,6 +181,7 @@ class BufferTransform(envs.Transform):
         if isinstance(container, envs.EnvBase) or container.parent is not None:
             self._call(None)
         super().set_container(container)
+        self.empty_cache()
 
     def _call(self, next_tensordict: TensorDictBase | None) -> TensorDictBase:
         raise ValueError("hindsight is for replay buffers, not for environments.")

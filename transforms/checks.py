@@ -1,7 +1,5 @@
 """Looking at the first batches for what another goal would contradict."""
 
-from __future__ import annotations
-
 import warnings
 
 from tensordict import TensorDictBase
@@ -50,9 +48,9 @@ class DataCheck:
         size = goals.shape[1]
         if len(goals.unique(dim=0)) < max(2, MIN_NUMBERS / size):
             return
-        for key, entry in batch.exclude("next", "action").items(True, True):
-            is_own = key in (keys.goal_key, keys.achieved_goal_key)
-            if is_own or entry.ndim != 2 or entry.shape[1] < size:
+        other = batch.exclude("next", "action", keys.goal_key, keys.achieved_goal_key)
+        for key, entry in other.items(True, True):
+            if entry.ndim != 2 or entry.shape[1] < size:
                 continue
             windows = entry[is_open].to(goals.dtype).unfold(1, size, 1)
             column = (windows == goals[:, None]).all(-1).all(0).nonzero()

@@ -1,7 +1,5 @@
 """The goals of the transitions that a buffer holds."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 
@@ -52,10 +50,7 @@ class GoalMemory:
         self,
         ids: Integers,
         done: NDArray[np.bool_],
-        root: Goals | None,
-        achieved: Goals,
-        desired: Goals,
-        *,
+        goals: tuple[Goals | None, Goals, Goals],
         stored: int,
         capacity: int | None,
     ) -> Integers:
@@ -64,17 +59,17 @@ class GoalMemory:
         Args:
             ids: of their trajectories, or environments, (n,).
             done: whether these end, (n,).
-            root: goals that had been achieved before them, (n, *goal), if known.
-            achieved: goals that they achieved.
-            desired: goals that they were asked for.
+            goals: that had been achieved before them, if known; that they achieved; and
+                that they were asked for, (n, *goal) each.
             stored: how many transitions before them are still stored.
             capacity: how many can be stored, if that is known.
         """
+        root, achieved, _ = goals
         self._make_room(achieved, stored, capacity)
         serial = np.arange(self.count, self.count + len(ids))
         row = serial % self._index.shape[1]
-        for kind, goals in enumerate((achieved, desired)[: self._kinds]):
-            self._goals[kind, row] = goals
+        for kind in range(self._kinds):
+            self._goals[kind, row] = goals[1 + kind]
         before = self._follow(ids, done, root, serial)
         placed: dict[int, list[int]] = {}  # row -> trajectory and step
         known = self._index[:, before].T.tolist()
@@ -219,10 +214,8 @@ class GoalMemory:
 
     def state(self) -> dict[str, Any]:
         """Returns a copy of everything, as tensors, numbers, lists and dicts."""
-        state = {**vars(self)}
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                state[name] = torch.from_numpy(value)
+        own, array = vars(self).items(), np.ndarray
+        state = {k: torch.from_numpy(v) if isinstance(v, array) else v for k, v in own}
         return copy.deepcopy(state)
 
     def load(self, state: dict[str, Any]) -> None:

@@ -1,7 +1,5 @@
 """Hindsight goals at sample time, as a transform of a replay buffer."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any, Literal
 
@@ -42,14 +40,6 @@ class HindsightRelabel(base.BufferTransform):
 
     Raises:
         ValueError: an argument is none of what is accepted, which the message names.
-
-    Example:
-        >>> relabel = HindsightRelabel.from_env(env, strategy="future", her_ratio=0.8)
-        >>> rb = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(1_000_000), transform=relabel, batch_size=256
-        ... )
-        >>> rb.extend(data.reshape(-1))
-        >>> batch = rb.sample()
     """
 
     def __init__(
@@ -92,10 +82,6 @@ class HindsightRelabel(base.BufferTransform):
                 )
             is_item = tensordict.ndim < ndim
         batch = tensordict.unsqueeze(-1) if is_item else tensordict
-        self._rewriter.check(batch)
-        size = batch.get(self._rewriter.goal_key).shape[-1]
-        if self.goal_parts is not None and sum(self.goal_parts) != size:
-            raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}.")
         capacity = self.capacity if buffer is None else buffer.storage.max_size
         with self._lock:
             batch = self._note(batch, self._stored(buffer), capacity)
@@ -185,7 +171,6 @@ class HindsightRelabel(base.BufferTransform):
         if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
             row = torch.arange(len(flat), device="cpu") // data.shape[-1]
             noted.set(self.trajectory_key, row)
-        self._rewriter.check(noted)
         with self._lock:
             tag = self._note(noted, 0, None).get(base.SERIAL_KEY)
         self.end_trajectories()

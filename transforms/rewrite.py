@@ -1,7 +1,5 @@
 """Writing another goal into transitions, and what follows from it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

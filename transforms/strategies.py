@@ -5,8 +5,6 @@ own; stored are those from `first` up to and without `end`, counted from the old
 known. All but "desired" are those of Andrychowicz et al. 2017, section 4.5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from math import isfinite
 from typing import Any
@@ -20,13 +18,14 @@ Integers = NDArray[np.integer[Any]]
 # A user's own: (step, first, end, generator) -> goal step, int32 tensors on the CPU.
 Strategy = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
 Weights = dict[str | Strategy, float]
+Weighted = str | Strategy | Mapping[Any, float]  # as users give them
 
 RANDOM, DESIRED = "random", "desired"  # of any stored transition
 LOOKING_AHEAD = ("future", "final")  # what follows a stored transition is stored too
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
-def parse_strategies(strategy: str | Strategy | Mapping[Any, float]) -> Weights:
+def parse(strategy: Weighted) -> Weights:
     """Returns strategies and weights that add up to 1; a ValueError if it cannot."""
     weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
     for name in weights or [strategy]:
