@@ -3,7 +3,7 @@
 ``-v1`` is the world of the paper (Gallouédec et al. 2021, arXiv 2106.13687, June 2021)
 and, where it gives no number, of panda-gym 1.1.0 (29 June 2021), the release of its
 month, whose ids these are. ``-v3`` is panda-gym 3.0.7 (2023). A pair is (-v1, -v3);
-the first is also the default of the class's argument.
+a task's argument has the first by default.
 
 Lateral friction of a contact is the product of both bodies'. Bullet's own is 0.5, which
 panda-gym 3.0.7 leaves where it sets none. Flip came after 1.1.0: its -v1 has 3.0.7's
