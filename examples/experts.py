@@ -28,7 +28,6 @@ from flip_expert import flip
 from limits import check_limits
 from moves import (
     CUBE,
-    ROUGH,
     carry,
     drag_to,
     go_over,
@@ -72,7 +71,7 @@ def reach(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
 def push(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Push the cube to the goal."""
     ee, velocity = observation[..., :3], observation[..., 12:14]
-    return push_to(ee, achieved_goal, velocity, desired_goal, ROUGH)
+    return push_to(ee, achieved_goal, velocity, desired_goal)
 
 
 def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
@@ -131,7 +130,7 @@ def stack(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> T
         torch.where(along_x, y, side[..., 1:]),
     )
     aside = torch.cat((x, y, z), -1)
-    clear = push_to(ee, upper, observation[..., 25:27], aside, ROUGH)
+    clear = push_to(ee, upper, observation[..., 25:27], aside)
     clear = torch.cat((clear, 0 * width - 1), -1)
     on_top = upper[..., 2:] > 0.03
     blocked = crowds(at) & ~(lower_held | upper_held | placed & on_top)
@@ -160,8 +159,6 @@ DEVIATION = {
     "": -0.0092, "xx": 1.5458, "xy": -4.1378, "xn": 3.2703, "yy": 1.8564,
     "yn": -2.3399, "nn": 0.4009, "xyn": 8.9578, "xnn": -3.859, "ynn": 3.1839,
 }  # fmt: skip
-
-
 OVERSHOOT = 0.006  # [m], of such strikes at the median
 
 

@@ -49,9 +49,7 @@ def go_over(
     return move(torch.cat((offset[..., :2] * free, rise), -1), limit)
 
 
-def push_to(
-    ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor, deceleration: float
-) -> Tensor:
+def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     """Get behind a cube, seen from the goal, and push until it will slide there.
 
     Args:
@@ -59,7 +57,6 @@ def push_to(
         cube: its position, (..., 3).
         velocity: of the cube along x and y [m/s], (..., 2).
         goal: where to push it, (..., 3).
-        deceleration: of the cube when it slides [m/s^2].
     """
     offset, beside, height = (goal - cube)[..., :2], (ee - cube)[..., :2], cube[..., 2:]
     distance, direction = norm(offset), unit(offset)
@@ -67,7 +64,7 @@ def push_to(
     lateral = beside - along * direction
     behind = torch.cat((cube[..., :2] - 0.06 * direction, height), -1)
     pushing = (along < -0.02) & (norm(lateral) < 0.02) & (ee[..., 2:] < height + 0.02)
-    left = distance - velocity.square().sum(-1, keepdim=True) / (2 * deceleration)
+    left = distance - velocity.square().sum(-1, keepdim=True) / (2 * ROUGH)
     step = (0.5 * left).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
     # A cube within 3 cm is left alone: another approach would disturb it.

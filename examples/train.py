@@ -452,7 +452,7 @@ def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
     content = read(path, "demonstrations", STORED_KEYS)
     try:
         demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
-    except RuntimeError as error:  # other lengths
+    except (RuntimeError, TypeError) as error:  # other lengths, or no tensors
         raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
