@@ -35,12 +35,7 @@ class HindsightAugment(base.BufferTransform):
         self._held: list[TensorDictBase] = []  # batches; the first has the oldest row
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Takes transitions in and returns those of the episodes that have ended.
-
-        Raises:
-            ValueError: it is one transition, without a dimension of time.
-            RuntimeError: the buffer does not store rows one by one.
-        """
+        """Takes transitions in and returns those of the episodes that have ended."""
         buffer, _ = base.find_buffer()
         if not tensordict.ndim:
             raise ValueError("`add` takes many rows for one item: use `extend`.")
@@ -54,9 +49,8 @@ class HindsightAugment(base.BufferTransform):
         with self._lock:
             stored = 0
             if self._held:
-                oldest = self._held[0].get(base.SERIAL_KEY).min()
-                stored = self._memory.count - int(oldest)
-            batch = self._note(tensordict, stored, None)
+                stored = self._memory.count - int(self._held[0][base.SERIAL_KEY].min())
+            batch = self._note(tensordict, stored)
             self._held.append(batch.reshape(-1).clone())
             serials = [b.get(base.SERIAL_KEY).numpy(force=True) for b in self._held]
             is_open = self._memory.is_open(np.concatenate(serials))

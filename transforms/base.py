@@ -66,11 +66,11 @@ class BufferTransform(envs.Transform):
         functions = reward_fn, success_fn, terminated_fn
         self._rewriter = Rewriter(*functions, *map(unravel_key, keys))
         self._check_data = DataCheck(self._rewriter)
-        self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
+        self._memory = GoalMemory()
         self._generator: torch.Generator | None = None
         if seed is not None:
             self._generator = torch.Generator("cpu").manual_seed(seed)
-        self._is_chain_checked = False
+        self._is_checked = False
         self._lock = threading.Lock()  # a prefetching buffer samples in threads
 
     @classmethod
@@ -100,38 +100,45 @@ class BufferTransform(envs.Transform):
             options[option] = value
         return cls(**options)
 
-    def _note(
-        self, batch: TensorDictBase, stored: int, capacity: int | None
-    ) -> TensorDictBase:
+    def _note(self, batch: TensorDictBase, stored: int) -> TensorDictBase:
         """Remembers transitions [*batch, time], and tags them with their serials."""
-        if not self._is_chain_checked and _has_multi_step(self):
+        if not self._is_checked:
+            self._check_first(batch)
+            self._is_checked = True
+        self._check_data(batch)
+        keys, shape, flat = self._rewriter, batch.batch_size, batch
+        read = (*keys.goal_keys, ("next", "done"))
+        if batch.ndim > 1:  # as storages fill up, in order of time
+            flat = batch.select(self.trajectory_key, *read, strict=False)
+            flat = flat.movedim(-1, 0).reshape(-1)
+        root, achieved, desired, done = (flat.get(key, None) for key in read)
+        if achieved is None or desired is None or done is None:
+            keys.check(batch)
+        goals: Any = [achieved.numpy(force=True)]
+        if DESIRED in self._weights:
+            goals.append(desired.numpy(force=True))
+        root = None if root is None else root.numpy(force=True)
+        ends = done.numpy(force=True).reshape(-1)
+        serial = self._memory.write(self._ids(flat, shape), ends, root, goals, stored)
+        tag = torch.from_numpy(serial)
+        if batch.ndim > 1:
+            tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
+        return batch.set(SERIAL_KEY, tag.to(desired.device))
+
+    def _check_first(self, batch: TensorDictBase) -> None:
+        """Refuses a chain of transforms, or data, that hindsight cannot be right in."""
+        if _has_multi_step(self):
             raise RuntimeError(
                 "n-step rewards, of MultiStepTransform, are not known for other goals: "
                 'sample slices with HindsightRelabel(unit="slice") instead.'
             )
-        self._is_chain_checked = True
-        keys, shape, flat = self._rewriter, batch.batch_size, batch
-        needed = (keys.next_achieved_key, ("next", "done"))
-        if not self._memory.count or any(batch.get(k, None) is None for k in needed):
-            keys.check(batch)
-            size = batch.get(keys.goal_key).shape[-1]
-            if self.goal_parts is not None and sum(self.goal_parts) != size:
-                raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}")
-        self._check_data(batch)
-        if batch.ndim > 1:  # as storages fill up, in order of time
-            read = [self.trajectory_key, ("next", "done"), *keys.goal_keys]
-            flat = batch.select(*read, strict=False).movedim(-1, 0).reshape(-1)
-        goals = [flat.get(key, None) for key in keys.goal_keys]
-        if torch.bfloat16 in {goal.dtype for goal in goals if goal is not None}:
+        self._rewriter.check(batch)
+        goals = [batch.get(key) for key in self._rewriter.goal_keys[1:]]
+        size = goals[0].shape[-1]
+        if self.goal_parts is not None and sum(self.goal_parts) != size:
+            raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}")
+        if torch.bfloat16 in (goals[0].dtype, goals[1].dtype):
             raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
-        arrays: Any = [g if g is None else g.numpy(force=True) for g in goals]
-        done = flat.get(("next", "done")).reshape(-1).numpy(force=True)
-        ids = self._ids(flat, shape)
-        serial = self._memory.write(ids, done, tuple(arrays), stored, capacity)
-        tag = torch.from_numpy(serial)
-        if batch.ndim > 1:
-            tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
-        return batch.set(SERIAL_KEY, tag.to(batch.get(keys.goal_key).device))
 
     def _ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
         """Returns ids of trajectories, or numbers of environments, (n,)."""
@@ -147,7 +154,7 @@ class BufferTransform(envs.Transform):
         if ids.numel() != len(flat):
             got = f"got {tuple(ids.shape)} for {tuple(shape)}"
             raise ValueError(f"{key!r} must hold one id a transition, {got}.")
-        return ids.reshape(-1).numpy(force=True)
+        return ids.numpy(force=True).reshape(-1)
 
     def __repr__(self) -> str:
         names = ("strategy", "her_ratio", "unit", "goal_parts", "k")
@@ -162,12 +169,12 @@ class BufferTransform(envs.Transform):
     def empty(self) -> None:
         """Forgets all transitions; a buffer's own `empty` does not tell transforms."""
         with self._lock:
-            self._memory = GoalMemory(keeps_desired=DESIRED in self._weights)
+            self._memory, self._is_checked = GoalMemory(), False
 
     def empty_cache(self) -> None:
         """Is called when the chain changes: n-step rewards are looked for again."""
         super().empty_cache()
-        self._is_chain_checked = False
+        self._is_checked = False
 
     def share_memory_(self) -> None:
         """Is called for a buffer that several processes write to: a RuntimeError."""

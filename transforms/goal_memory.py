@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from torch import Generator
 
 from torch_panda.transforms import strategies
-from torch_panda.transforms.strategies import Integers, Strategy, Weights
+from torch_panda.transforms.strategies import Integers, Weights
 
 Goals = NDArray[Any]  # (n, *goal)
+_NEW = (-1, 0, b"")
 
 
 class GoalMemory:
@@ -19,30 +20,28 @@ class GoalMemory:
 
     Transitions are numbered in the order of writing: their serials. A round-robin
     buffer overwrites its oldest rows, so it holds the last serials, and with a
-    transition all that lies ahead of it. A ring holds the goals: the transition
-    `serial` is its row `serial % rows`. Rows of one trajectory are listed, in order of
-    time, in a region of `_rows` that is a power of two long. A full one moves to a
-    larger region, and the old one is used again.
+    transition all that lies ahead of it. A ring holds their trajectories and steps. The
+    goals of one trajectory lie, in order of time, in a region of `_goals` that is a
+    power of two long. A full one moves to a larger region; the old one is used again.
 
-    A transition goes on with the trajectory of the one of its id before it, unless that
-    was done, or got to another goal than this one begins with (as ids begin anew with
-    every collector). If none ever begins where the one before got to, ids decide.
+    A transition goes on with the trajectory of its id, unless that was done, or got to
+    another goal than this one begins with (as ids begin anew with every collector). If
+    none ever begins where the one before got to, ids decide.
     """
 
-    def __init__(self, keeps_desired: bool) -> None:
-        self._kinds = 2 if keeps_desired else 1
+    def __init__(self) -> None:
         self.count = 0  # transitions so far: serial of the next one
         self.freed = 0  # serial of the oldest transition that is remembered
-        self.open: dict[int, int] = {}  # id -> last serial of what may go on
-        self._has_roots = False
+        # What may go on: id -> trajectory, its next step, and the goal it got to.
+        self.open: dict[int, tuple[int, int, bytes]] = {}
         self._links = False  # whether one ever began with the goal before it
-        self._goals: Goals = np.zeros((self._kinds, 0))  # (kinds, rows, *goal)
-        self._index = np.zeros((2, 0), dtype=np.int32)  # trajectories, steps
-        # Of trajectories: their first step, the end, where in `_rows` step 0 would be,
-        # up to which step there is room, and where in `_rows` their region begins.
-        self._table = np.zeros((5, 64), dtype=np.int32)
+        self._ring = np.zeros((0, 2), dtype=np.int32)  # their trajectories and steps
+        # Of trajectories: their first step, the end, where in `_goals` step 0 would be,
+        # up to which step there is room, and where in `_goals` their region begins.
+        self._table = np.zeros((64, 5), dtype=np.int32)
         self._unused = [*range(64)]  # numbers of no trajectory that is remembered
-        self._rows = np.zeros(1024, dtype=np.int32)  # of the ring
+        # Achieved and, if kept, desired: (places, kinds, *goal).
+        self._goals: Goals = np.zeros((0, 1), dtype=np.float32)
         self._used = 0  # places that were ever part of a region
         self._free_regions: dict[int, list[int]] = {}  # size -> where they begin
 
@@ -50,172 +49,147 @@ class GoalMemory:
         self,
         ids: Integers,
         done: NDArray[np.bool_],
-        goals: tuple[Goals | None, Goals, Goals],
+        root: Goals | None,
+        goals: list[Goals],
         stored: int,
-        capacity: int | None,
     ) -> Integers:
         """Takes transitions that are about to be stored; returns their serials, (n,).
 
         Args:
             ids: of their trajectories, or environments, (n,).
             done: whether these end, (n,).
-            goals: that had been achieved before them, if known; that they achieved; and
-                that they were asked for, (n, *goal) each.
+            root: goals that had been achieved before them, if known, (n, *goal).
+            goals: that they achieved and, to draw "desired" ones, were asked for.
             stored: how many transitions before them are still stored.
-            capacity: how many can be stored, if that is known.
         """
-        root, achieved, _ = goals
-        self._make_room(achieved, stored, capacity)
+        if not self.count:
+            self._goals = np.zeros((0, len(goals), *goals[0].shape[1:]), goals[0].dtype)
+        self._make_room(len(ids), stored)
         serial = np.arange(self.count, self.count + len(ids))
-        row = serial % self._index.shape[1]
-        for kind in range(self._kinds):
-            self._goals[kind, row] = goals[1 + kind]
-        before = self._follow(ids, done, root, serial)
-        placed: dict[int, list[int]] = {}  # row -> trajectory and step
-        known = self._index[:, before].T.tolist()
-        for i, b, last in zip(row.tolist(), before.tolist(), known, strict=True):
-            t, s = placed.get(b, last) if b >= 0 else (self._begin(), -1)
-            placed[i] = [t, s + 1]
-        self._index[:, row] = trajectory, step = np.array([*placed.values()]).T
-        _, end, _, room, _ = self._table
+        trajectory, step = self._place(ids, done, root, goals[0])
+        row = serial % len(self._ring)
+        self._ring[row, 0], self._ring[row, 1] = trajectory, step
+        _, end, base, room, _ = self._table.T
         end[trajectory] = step + 1  # of one's several steps the last one stays
-        for t in set(trajectory[step >= room[trajectory]].tolist()):
+        for t in set(trajectory[step >= room.take(trajectory)].tolist()):
             self._move(t)
-        self._rows[self._table[2, trajectory] + step] = row
+        place = base.take(trajectory) + step
+        for kind, values in enumerate(goals):
+            self._goals[place, kind] = values
         self.count += len(ids)
         return serial
 
-    def _follow(
-        self, ids: Integers, done: Goals, root: Goals | None, serial: Integers
+    def _place(
+        self, ids: Integers, done: Goals, root: Goals | None, achieved: Goals
     ) -> Integers:
-        """Returns the rows of the transitions before, (n,); -1 where one begins."""
-        if self._has_roots != (root is not None):
-            self.open.clear()
-            self._has_roots = root is not None
-        previous = []
-        rows = zip(ids.tolist(), serial.tolist(), done.tolist(), strict=True)
-        for name, own, ends in rows:
-            previous.append(self.open.pop(name, -1))
+        """Returns the trajectories and steps of transitions, (2, n)."""
+        before = [b""] * len(ids) if root is None else _as_bytes(root)
+        after = before if root is None else _as_bytes(achieved)
+        trajectories, steps = [], []
+        rows = zip(ids.tolist(), done.tolist(), before, after, strict=True)
+        for i, ends, b, a in rows:
+            t, s, goal = self.open.pop(i, _NEW)
+            self._links = self._links or goal == b != b""
+            if t < 0 or (self._links and goal != b):
+                t, s = self._begin(), 0
             if not ends:
-                self.open[name] = own
-        before = np.array(previous)
-        begins = before < 0
-        before %= self._index.shape[1]
-        if root is not None:
-            same = self._goals[0].take(before, axis=0) == root
-            follows = same.reshape(len(ids), -1).all(1) & ~begins
-            self._links = self._links or bool(follows.any())
-            begins = ~follows if self._links else begins
-        before[begins] = -1
-        return before
+                self.open[i] = t, s + 1, a
+            trajectories.append(t)
+            steps.append(s)
+        return np.array([trajectories, steps], dtype=np.int32)
 
     def _begin(self) -> int:
         """Returns the number of a new trajectory."""
         if not self._unused:
-            number = self._table.shape[1]
-            self._table = np.pad(self._table, ((0, 0), (0, number)))
-            self._unused = [*range(number, 2 * number)]
+            number = len(self._table)
+            self._table = _grow(self._table, 2 * number)
+            self._unused = [*range(number, len(self._table))]
         return self._unused.pop()
 
     def _move(self, trajectory: int) -> None:
         """Moves a trajectory to where its steps fit, and some more."""
-        first, end, base, room, _ = self._table[:, trajectory].tolist()
-        rows = self._rows[base + first : base + room].copy()
+        first, end, base, room, _ = self._table[trajectory].tolist()
+        goals = self._goals[base + first : base + room].copy()
         self._release(trajectory)
         size = 1 << max(15, 9 * (end - first) // 8).bit_length()
         free = self._free_regions.setdefault(size, [])
         if not free:
             free.append(self._used)
             self._used += size
-            if (more := self._used - len(self._rows)) > 0:
-                self._rows = np.pad(self._rows, (0, max(more, len(self._rows))))
+            self._goals = _grow(self._goals, self._used)
         start = free.pop()
-        self._rows[start : start + len(rows)] = rows
-        self._table[2:, trajectory] = start - first, first + size, start
+        self._goals[start : start + len(goals)] = goals
+        self._table[trajectory, 2:] = start - first, first + size, start
 
     def _release(self, trajectory: int) -> None:
         """Lets the region of a trajectory, if it has one, be used again."""
-        base, room, start = self._table[2:, trajectory].tolist()
+        base, room, start = self._table[trajectory, 2:].tolist()
         if room:
             self._free_regions[base + room - start].append(start)
 
-    def _make_room(self, goals: Goals, stored: int, capacity: int | None) -> None:
-        """Makes the ring hold some more; the first goals tell their type."""
-        rows, end = self._index.shape[1], self.count + len(goals)
-        if end - self.freed > rows:
-            self.free(self.count - stored)
+    def _make_room(self, number: int, stored: int) -> None:
+        """Makes the ring hold more transitions, and a few, so that freeing is rare."""
+        rows, end = len(self._ring), self.count + number
         if end - self.freed <= rows:
             return
-        room = max(1024, 2 * rows)
-        if capacity is not None:  # and a little more, so that freeing is rare
-            room = min(room, capacity + max(256, capacity // 64))
-        room = max(end - self.freed, room)
-        dtype = self._goals.dtype if rows else goals.dtype
-        larger = np.zeros((self._kinds, room, *goals.shape[1:]), dtype)
-        index = np.zeros((2, room), dtype=np.int32)
-        if rows:
-            serial = np.arange(self.freed, self.count)
-            old, new = serial % rows, serial % room
-            larger[:, new], index[:, new] = self._goals[:, old], self._index[:, old]
-            trajectory, step = index[:, new]
-            self._rows[self._table[2, trajectory] + step] = new
-        self._goals, self._index = larger, index
+        self.free(self.count - stored)
+        serial = np.arange(self.freed, self.count)
+        if (needed := end - self.freed + rows // 64) > rows:
+            placed = self.find(serial)
+            self._ring = _grow(self._ring, needed)
+            self._ring[serial % len(self._ring)] = placed.T
 
     def free(self, floor: int) -> None:
         """Forgets the transitions below a serial: they have been overwritten."""
         if floor <= self.freed:
             return
         trajectory, step = self.find(np.arange(self.freed, floor))
-        first, end = self._table[:2]
+        first, end = self._table.T[:2]
         first[trajectory] = step + 1
-        for t in set(trajectory[first[trajectory] == end[trajectory]].tolist()):
+        gone = set(trajectory[first[trajectory] == end[trajectory]].tolist())
+        for t in gone:
             self._release(t)
-            self._table[:, t] = 0
-            self._unused.append(t)
-        self.open = {i: last for i, last in self.open.items() if last >= floor}
+            self._table[t] = 0
+        self._unused += gone
+        self.open = {i: known for i, known in self.open.items() if known[0] not in gone}
         self.freed = floor
 
     def find(self, serial: Integers) -> Integers:
         """Returns trajectories and steps of transitions, (2, n)."""
-        return self._index.take(serial % self._index.shape[1], axis=1)
+        return self._ring.take(serial % len(self._ring), axis=0).T
 
     def is_open(self, serial: Integers) -> Any:  # noqa: ANN401 (booleans)
         """Tells which transitions' trajectories may go on, (n,)."""
-        last = np.array([*self.open.values()], dtype=np.int64)
-        return np.isin(self.find(serial)[0], self.find(last)[0])
+        return np.isin(self.find(serial)[0], [t for t, _, _ in self.open.values()])
 
     def draw(self, serial: Integers, weights: Weights, rng: Generator | None) -> Goals:
         """Draws a goal for each serial, (n,), by strategies: (n, *goal)."""
-        if len(weights) == 1:
-            (strategy,) = weights
-            kind = int(strategy == strategies.DESIRED)
-            return self._goals[kind].take(self._draw(serial, strategy, rng), axis=0)
-        limits = np.cumsum([*weights.values()])[:-1]
-        u = strategies.draw_uniform(len(serial), rng)
-        which = limits.searchsorted(u, side="right")
-        goals = np.empty((len(serial), *self._goals.shape[2:]), self._goals.dtype)
-        for number, strategy in enumerate(weights):
-            rows = (which == number).nonzero()[0]
-            goals[rows] = self.draw(serial[rows], {strategy: 1.0}, rng)
-        return goals
-
-    def _draw(
-        self, serial: Integers, strategy: str | Strategy, rng: Generator | None
-    ) -> Integers:
-        """Draws the ring's rows of the transitions that goals are from, (n,)."""
-        if strategy in (strategies.RANDOM, strategies.DESIRED):
+        if len(weights) > 1:
+            limits = np.cumsum([*weights.values()])[:-1]
+            u = strategies.draw_uniform(len(serial), rng)
+            which = limits.searchsorted(u, side="right")
+            goals = np.empty((len(serial), *self._goals.shape[2:]), self._goals.dtype)
+            for number, strategy in enumerate(weights):
+                rows = (which == number).nonzero()[0]
+                goals[rows] = self.draw(serial[rows], {strategy: 1.0}, rng)
+            return goals
+        (strategy,) = weights
+        of_any = strategy in (strategies.RANDOM, strategies.DESIRED)
+        if of_any:
             end = np.full(len(serial), self.count)
-            drawn = strategies.draw_integers(self.freed, end, rng)
-            return drawn % self._index.shape[1]
+            serial = strategies.draw_integers(self.freed, end, rng)
         trajectory, step = self.find(serial)
-        first, end, base = self._table[:3].take(trajectory, axis=1)
-        chosen = strategies.choose_steps(strategy, step, first, end, rng)
-        return self._rows.take(base + chosen)
+        first, end, base, _, _ = self._table.take(trajectory, axis=0).T
+        if not of_any:
+            step = strategies.choose_steps(strategy, step, first, end, rng)
+        kind = int(strategy == strategies.DESIRED)
+        return self._goals[:, kind].take(base + step, axis=0)
 
     def state(self) -> dict[str, Any]:
-        """Returns a copy of everything, as tensors, numbers, lists and dicts."""
+        """Returns a copy of everything, as tensors, numbers, strings and containers."""
         own, array = vars(self).items(), np.ndarray
         state = {k: torch.from_numpy(v) if isinstance(v, array) else v for k, v in own}
+        state["open"] = {i: (t, s, goal.hex()) for i, (t, s, goal) in self.open.items()}
         return copy.deepcopy(state)
 
     def load(self, state: dict[str, Any]) -> None:
@@ -223,5 +197,19 @@ class GoalMemory:
         for name, value in copy.deepcopy(state).items():
             is_array = isinstance(value, torch.Tensor)
             setattr(self, name, value.numpy() if is_array else value)
-        if not self._links:  # nothing would show that an id is used again
-            self.open.clear()
+        known = state["open"] if self._links else {}  # else used again, ids might not
+        self.open = {i: (t, s, bytes.fromhex(g)) for i, (t, s, g) in known.items()}
+
+
+def _as_bytes(goals: Goals) -> list[bytes]:
+    """Returns each of the goals, (n, *goal), as bytes, which are fast to compare."""
+    flat = np.ascontiguousarray(goals).reshape(len(goals), -1)
+    return flat.view(f"V{flat[0].nbytes}").ravel().tolist()
+
+
+def _grow(array: NDArray[Any], size: int) -> NDArray[Any]:
+    """Returns an array with zeros appended, `size` rows long or a bit longer."""
+    if (length := len(array)) >= size:
+        return array
+    more = max(size, length + length // 32, 256) - length
+    return np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)])

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, RoundRobinWriter
 
 from torch_panda.transforms import base
@@ -82,9 +82,8 @@ class HindsightRelabel(base.BufferTransform):
                 )
             is_item = tensordict.ndim < ndim
         batch = tensordict.unsqueeze(-1) if is_item else tensordict
-        capacity = self.capacity if buffer is None else buffer.storage.max_size
         with self._lock:
-            batch = self._note(batch, self._stored(buffer), capacity)
+            batch = self._note(batch, self._stored(buffer))
         return batch.squeeze(-1) if is_item else batch
 
     def _stored(self, buffer: ReplayBuffer | None) -> int:
@@ -93,11 +92,7 @@ class HindsightRelabel(base.BufferTransform):
         return min(count := self._memory.count, self.capacity or count)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Relabels rows that a buffer has sampled.
-
-        Raises:
-            KeyError, RuntimeError: the rows were stored without this transform.
-        """
+        """Relabels rows that a buffer has sampled."""
         tag = tensordict.get(base.SERIAL_KEY, None)
         buffer, method = base.find_buffer()
         if self._is_first_sample:
@@ -119,7 +114,9 @@ class HindsightRelabel(base.BufferTransform):
         if not len(rows):
             return tensordict.exclude(base.SERIAL_KEY)
         index, new = (torch.from_numpy(x).to(tag.device) for x in (rows, goals))
-        is_own = method == "_sample"  # made for us; others may hand out their storage
+        # Others may hand out their storage, or tensors that are stacked when asked for.
+        is_own = method == "_sample" and type(tensordict) is TensorDict
+        is_own = is_own and tensordict.ndim == 1
         batch = self._rewriter.rewrite(tensordict, index, new, is_own=is_own)
         return batch.del_(base.SERIAL_KEY)
 
@@ -146,8 +143,7 @@ class HindsightRelabel(base.BufferTransform):
         self, serial: Integers, last: Integers, unit: Integers | None
     ) -> tuple[Integers, Goals]:
         """Draws units, and a goal for each; returns their rows and the rows' goals."""
-        u = draw_uniform(len(last), self._generator)
-        chosen: Any = np.less(u, self.her_ratio)
+        chosen: Any = draw_uniform(len(last), self._generator) < self.her_ratio
         overwritten = serial < self._memory.freed  # since they were sampled
         chosen[overwritten if unit is None else unit[overwritten]] = False
         units = chosen.nonzero()[0]
@@ -172,6 +168,6 @@ class HindsightRelabel(base.BufferTransform):
             row = torch.arange(len(flat), device="cpu") // data.shape[-1]
             noted.set(self.trajectory_key, row)
         with self._lock:
-            tag = self._note(noted, 0, None).get(base.SERIAL_KEY)
+            tag = self._note(noted, 0).get(base.SERIAL_KEY)
         self.end_trajectories()
         return flat.copy().set(base.SERIAL_KEY, tag)

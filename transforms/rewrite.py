@@ -43,15 +43,11 @@ class Rewriter:
     def rewrite(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor, *, is_own: bool
     ) -> TensorDictBase:
-        """Gives rows of a batch other goals, and what follows from these.
+        """Gives rows, (n,), of the flattened batch other goals, (n, *goal).
 
-        Args:
-            batch: transitions of any batch shape; their tensors are never written to.
-            rows: which, (n,), of the flattened batch.
-            goals: the other goals, (n, *goal).
-            is_own: entries of the batch itself may be exchanged, not of a copy.
+        Written to is the batch, if it `is_own`: flat, and made for us; else a copy.
         """
-        flat = batch if batch.ndim == 1 else batch.reshape(-1)
+        flat = batch if is_own else batch.reshape(-1).to_tensordict()
         achieved = flat.get(self.next_achieved_key).index_select(0, rows)
         old_goals = flat.get(self.goal_key)
         goals = goals.to(old_goals.dtype)
@@ -70,14 +66,9 @@ class Rewriter:
             stays |= evaluate(self.terminated_fn, achieved, goals, terminated)
             new[_TERMINATED] = stays
             new[_DONE] = stays | truncated.index_select(0, rows)
-        # The copy is also of the nested tensordicts that hold these entries.
-        result = batch if is_own else batch.exclude(*new)
         for key, values in new.items():
-            value = flat.get(key).index_copy(0, rows, values)
-            if batch.ndim != 1:
-                value = value.reshape(*batch.shape, *value.shape[1:])
-            result.set(key, value)
-        return result
+            flat.get(key).index_copy_(0, rows, values)
+        return flat.reshape(batch.shape)
 
 
 def evaluate(

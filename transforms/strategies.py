@@ -59,11 +59,7 @@ def choose_steps(
     end: Integers,
     generator: Generator | None,
 ) -> Integers:
-    """Chooses steps, (n,), for transitions of steps `step` from `first` up to `end`.
-
-    Raises:
-        ValueError: a user's own strategy returns anything else.
-    """
+    """Chooses steps, (n,), for transitions of steps `step` from `first` up to `end`."""
     if strategy == "final":
         return end - 1
     if isinstance(strategy, str):
@@ -72,13 +68,12 @@ def choose_steps(
     numbers = (step - first, zero, end - first)
     s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in numbers)
     chosen = strategy(s, f, e, generator)
-    must = "the strategy must return"
-    if not isinstance(chosen, Tensor):
-        raise ValueError(f"{must} a tensor, got {type(chosen).__name__}.")
-    if chosen.shape != step.shape or chosen.is_floating_point():
-        got = f"{chosen.dtype} of shape {tuple(chosen.shape)}"
-        raise ValueError(f"{must} integer steps {tuple(step.shape)}, got {got}.")
-    goal_step: Integers = first + chosen.cpu().numpy()
-    if ((goal_step < first) | (goal_step >= end)).any():
-        raise ValueError(f"{must} steps from first up to end.")
-    return goal_step
+    is_right = isinstance(chosen, Tensor) and chosen.shape == s.shape
+    if is_right and not chosen.is_floating_point():
+        steps: Integers = chosen.numpy(force=True)
+        if ((steps >= 0) & (steps < end - first)).all():
+            return first + steps
+    raise ValueError(
+        f"the strategy must return a tensor of integer steps {tuple(s.shape)}, from "
+        f"first up to end, got {chosen!r}."
+    )

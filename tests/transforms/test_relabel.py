@@ -248,7 +248,7 @@ def test_strategy_of_the_user():
         (lambda step, first, end, rng: end, "from first up to end"),
         (lambda step, first, end, rng: step.float(), "integer steps"),
         (lambda step, first, end, rng: step[:-1], "integer steps"),
-        (lambda step, first, end, rng: step.numpy(), "a tensor, got ndarray"),
+        (lambda step, first, end, rng: step.numpy(), "a tensor of integer.*array"),
     ],
 )
 def test_bad_strategy_of_the_user_raises(strategy, message):
