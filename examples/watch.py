@@ -25,9 +25,9 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_ty
 from tqdm import tqdm
 
 import torch_panda
-from agents import load_policy, read_checkpoint
 from experts import make_expert, prepare
-from limits import check_limits
+from limits import Positive, Seed, check_limits
+from training.policies import load_policy, read_checkpoint
 
 CELL = (240, 320)  # height and width [pixels]
 FPS = 25  # real time: the control frequency
@@ -128,9 +128,9 @@ class Args:
     """a run's folder or checkpoint, "random", or "expert" """
     env_id: str | None = None
     """task; None means the one the policy was trained on, or Push"""
-    num_envs: int = 6
+    num_envs: Positive = 6
     """environments side by side; with a window, episodes one after the other"""
-    seed: int = 0
+    seed: Seed = 0
     """of the environments and of random actions"""
     out: Path = Path("watch.mp4")
     """video to write, .mp4 or .gif"""
@@ -145,13 +145,11 @@ def main(args: Args) -> None:
         torch.manual_seed(args.seed)
         checkpoint = None
         if args.policy not in ("random", "expert"):
-            path = Path(args.policy)
-            path = path / "checkpoint.pt" if path.is_dir() else path
-            if not path.exists():
+            if not Path(args.policy).exists():
                 raise ValueError(
                     f"a policy is random, expert or a run, got {args.policy!r}"
                 )
-            checkpoint = read_checkpoint(path)
+            checkpoint = read_checkpoint(Path(args.policy))
         env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
         num_envs = 1 if args.human else args.num_envs
         with torch_panda.make(env_id, num_envs=num_envs, seed=args.seed) as env:
