@@ -16,7 +16,7 @@ import json
 import os
 import time
 from collections import defaultdict
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -31,16 +31,22 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import Hyperparameters, make_agent
-from limits import Count, Positive, Ratio, Seed, Weight, check_limits
+from limits import Count, Positive, Ratio, Seed, Weight, check_device, check_limits
 from training.buffers import Hindsight, make_buffer, select_episodes
-from training.checkpoint import Checkpoint, Progress, StopSignal, check_folder
+from training.checkpoint import (
+    SAVE_INTERVAL,
+    Checkpoint,
+    Progress,
+    StopSignal,
+    check_folder,
+)
 from training.curve import Curve, reseed
 from training.demonstrations import make_demo_buffer, read_demos
+from training.pretraining import pretrain
 from training.recipes import find_recipe
 from training.starts import StartFrom, states_at_objects
 from watch import record
 
-SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
 KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
 
 
@@ -160,20 +166,25 @@ class Run:
         Returns:
             whether the last step was reached.
         """
-        args, progress = self.args, self.progress
+        args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if not progress.curve:
             self.curve.add(progress)  # the untrained policy
-        if not self.pretrain(stop):
-            return False
+            checkpoint.save()
+        if progress.pretrained < args.pretrain_updates:
+            count, size = args.pretrain_updates, args.batch_size
+            pretrain(checkpoint, self.demos, updates=count, batch_size=size, stop=stop)
+            if progress.pretrained < count:
+                return False
+            self.curve.add(progress)
+            checkpoint.save()
+
+        name = f"{args.env_id} {args.algo}"
         bar = tqdm(
-            desc=f"{args.env_id} {args.algo}",
-            initial=progress.steps,
-            total=args.total_steps,
-            unit="step",
-            postfix={"success": progress.success},
+            desc=name, initial=progress.steps, total=args.total_steps, unit="step"
         )
+        finished = stopped = progress.steps >= args.total_steps
         episodes = iter(self.collector)
-        while progress.steps < args.total_steps and not stop:
+        while not stopped:
             started, before = time.perf_counter(), progress.steps
             reseed(self.env)
             data = next(episodes)
@@ -186,11 +197,12 @@ class Run:
             finished = progress.steps >= args.total_steps
             if finished or crossed(args.eval_interval, before, progress.steps):
                 self.curve.add(progress, losses)
-                bar.set_postfix(success=progress.success)
-            if finished or stop or crossed(SAVE_INTERVAL, before, progress.steps):
-                self.checkpoint.save()
+            bar.set_postfix(success=progress.success)
+            stopped = finished or bool(stop)
+            if stopped or crossed(SAVE_INTERVAL, before, progress.steps):
+                checkpoint.save()
         bar.close()
-        return progress.steps >= args.total_steps
+        return finished
 
     def store(self, data: TensorDictBase) -> None:
         """Put episodes [num_envs, steps] into the buffer and into the statistics."""
@@ -223,34 +235,6 @@ class Run:
                 losses[key].append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
 
-    def pretrain(self, stop: object) -> bool:
-        """Imitate the demonstrations, if asked to, and evaluate.
-
-        Returns:
-            whether this is done.
-        """
-        count, progress = self.args.pretrain_updates, self.progress
-        if progress.pretrained == count:
-            return True
-        bar = tqdm(
-            desc="imitation", initial=progress.pretrained, total=count, unit="update"
-        )
-        while progress.pretrained < count and not stop:
-            started = time.perf_counter()
-            self.agent.set_learning_rate(1 - progress.pretrained / count)
-            self.agent.imitate(self.demos.sample(self.args.batch_size))
-            progress.pretrained += 1
-            progress.seconds += time.perf_counter() - started
-            bar.update()
-            if progress.pretrained % SAVE_INTERVAL == 0:
-                self.checkpoint.save()
-        bar.close()
-        self.agent.set_learning_rate(1.0)
-        if progress.pretrained == count:
-            self.curve.add(progress)
-        self.checkpoint.save()
-        return progress.pretrained == count
-
     def close(self) -> None:
         """Free the environments."""
         self.collector.shutdown()
@@ -278,14 +262,14 @@ def check(args: Args) -> None:
             f"a demo_ratio of {args.demo_ratio} leaves no room for transitions of "
             f"one's own in a batch of {args.batch_size}"
         )
-    try:
-        torch.zeros(1, device=args.device).item()
-    except (RuntimeError, AssertionError, ImportError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            "device must be one that torch can use here, such as cpu, "
-            f"got {args.device!r}: {reason}"
-        ) from None
+    check_device(args.device)
+
+
+def default_args(preset: str, env_id: str) -> Args:
+    """The options of a preset for a task."""
+    if preset == "paper":
+        return Args(env_id=env_id)
+    return Args(preset="tuned", env_id=env_id, **find_recipe(env_id))
 
 
 def main(args: Args) -> None:
@@ -319,8 +303,5 @@ def main(args: Args) -> None:
 
 if __name__ == "__main__":
     # Parsed twice: preset and task say what the other options default to.
-    args = tyro.cli(Args)
-    if args.preset == "tuned":
-        recipe = replace(Args(preset="tuned"), **find_recipe(args.env_id))
-        args = tyro.cli(Args, default=recipe)
-    main(args)
+    given = tyro.cli(Args)
+    main(tyro.cli(Args, default=default_args(given.preset, given.env_id)))
