@@ -49,6 +49,12 @@ from watch import record
 
 KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
 
+# What is no other way to train: other runs of the same line in a plot.
+PLAIN_OPTIONS = {
+    *("algo", "seed", "total_steps", "eval_interval"),
+    *("out", "resume", "device", "video"),
+}
+
 
 @dataclass
 class Args(Hyperparameters):
@@ -272,6 +278,16 @@ def default_args(preset: str, env_id: str) -> Args:
     return Args(preset="tuned", env_id=env_id, **find_recipe(env_id))
 
 
+def changed(args: Args) -> dict[str, object]:
+    """The options that make other results than the preset's, for a plot's labels."""
+    default = asdict(default_args(args.preset, args.env_id))
+    return {
+        key: value
+        for key, value in asdict(args).items()
+        if value != default[key] and key not in PLAIN_OPTIONS
+    }
+
+
 def main(args: Args) -> None:
     """Train, and say where the results are."""
     out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
@@ -280,7 +296,8 @@ def main(args: Args) -> None:
         check_folder(out, resume=args.resume)
         run = Run(args, out)
         out.mkdir(parents=True, exist_ok=True)
-        (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
+        options = {**asdict(args), "changed": changed(args)}
+        (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
     stop = StopSignal()

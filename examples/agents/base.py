@@ -58,8 +58,6 @@ class Agent(nn.Module, ABC):
         actor: TensorDictModuleBase,
         noise: Sequence[TensorDictModuleBase],
         trained: Sequence[Tensor],
-        online: Sequence[Tensor],
-        target: Sequence[Tensor],
     ) -> None:
         """Put together what an algorithm has made, at the end of its constructor.
 
@@ -67,14 +65,11 @@ class Agent(nn.Module, ABC):
             actor: from ``normalized`` to ``action``.
             noise: modules that change ``action`` to explore.
             trained: the parameters of the optimizer.
-            online: parameters that have a target network.
-            target: those of the target networks, in the same order.
         """
         normalize = TensorDictModule(self.normalizer, STATE_KEYS, ["normalized"])
         self.policy = TensorDictSequential(normalize, actor)
         self.explore = TensorDictSequential(normalize, actor, *noise)
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
-        self._online, self._target = list(online), list(target)
 
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None
@@ -96,8 +91,7 @@ class Agent(nn.Module, ABC):
         self.optimizer.step()
         self.updates += 1
         if self.updates % self.hp.target_interval == 0:
-            with torch.no_grad():
-                torch._foreach_lerp_(self._target, self._online, TAU)
+            self.move_targets()
         return {key: loss.detach() for key, loss in losses.items()}
 
     @abstractmethod
@@ -115,6 +109,10 @@ class Agent(nn.Module, ABC):
         Returns:
             the losses, scalars.
         """
+
+    @abstractmethod
+    def move_targets(self) -> None:
+        """Move the target networks towards their networks, by TAU."""
 
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """One gradient step of the policy alone, towards actions of demonstrations.

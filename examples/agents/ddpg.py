@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
-from agents.base import Agent
+from agents.base import TAU, Agent
 from agents.hyperparameters import Hyperparameters
 from agents.imitation import imitation_loss
 from agents.networks import make_mlp
@@ -51,13 +51,15 @@ class DDPG(Agent):
         # (num_envs,): compared with one random number per environment.
         random_action.eps = torch.linspace(*hp.random_eps, env.batch_size[0])
         self.actor_parameters = list(self.actor.parameters())
-        online = [*self.actor_parameters, *self.critics.parameters()]
+        self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
+        self.target: list[Tensor] = [
+            *self.target_actor.parameters(),
+            *self.target_critics.parameters(),
+        ]
         self.assemble(
             TensorDictModule(self.actor, ["normalized"], ["action"]),
             [noise, random_action],
-            trained=online,
-            online=online,
-            target=[*self.target_actor.parameters(), *self.target_critics.parameters()],
+            trained=self.online,
         )
 
     def target_action(self, next_state: Tensor) -> Tensor:
@@ -92,3 +94,8 @@ class DDPG(Agent):
             )
         actor_loss.backward(inputs=self.actor_parameters)  # and of the critics none
         return {"critic_loss": critic_loss, "actor_loss": actor_loss}
+
+    def move_targets(self) -> None:
+        """Move the target networks towards their networks, by TAU."""
+        with torch.no_grad():
+            torch._foreach_lerp_(self.target, self.online, TAU)

@@ -4,9 +4,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
-from torchrl.objectives import LossModule, SACLoss
+from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
-from agents.base import Agent
+from agents.base import TAU, Agent
 from agents.hyperparameters import Hyperparameters
 from agents.networks import make_mlp
 from agents.transitions import Transitions
@@ -47,15 +47,8 @@ class SAC(Agent):
         self.loss.make_value_estimator(gamma=self.gamma)
         # A buffer, but only once it was asked for: in the states that runs save.
         _ = self.loss.target_entropy
-        online = self.loss.qvalue_network_params.flatten_keys().to_dict()
-        target = self.loss.target_qvalue_network_params.flatten_keys().to_dict()
-        self.assemble(
-            actor,
-            [],
-            trained=list(self.loss.parameters()),
-            online=list(online.values()),
-            target=[target[key] for key in online],
-        )
+        self.soft_update = SoftUpdate(self.loss, tau=TAU)
+        self.assemble(actor, [], trained=list(self.loss.parameters()))
 
     def make_loss(
         self,
@@ -80,3 +73,7 @@ class SAC(Agent):
         }
         (losses["critic_loss"] + losses["actor_loss"]).backward()
         return losses
+
+    def move_targets(self) -> None:
+        """Move the target networks towards their networks, by TAU."""
+        self.soft_update.step()
