@@ -278,6 +278,13 @@ def default_args(preset: str, env_id: str) -> Args:
     return Args(preset="tuned", env_id=env_id, **find_recipe(env_id))
 
 
+def parse(arguments: list[str] | None = None) -> Args:
+    """Read the command line; preset and task say what other options default to."""
+    given = tyro.cli(Args, args=arguments)
+    default = default_args(given.preset, given.env_id)
+    return tyro.cli(Args, args=arguments, default=default)
+
+
 def changed(args: Args) -> dict[str, object]:
     """The options that make other results than the preset's, for a plot's labels."""
     default = asdict(default_args(args.preset, args.env_id))
@@ -319,6 +326,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    # Parsed twice: preset and task say what the other options default to.
-    given = tyro.cli(Args)
-    main(tyro.cli(Args, default=default_args(given.preset, given.env_id)))
+    main(parse())

@@ -2,26 +2,21 @@
 
 import pytest
 import torch
-from torchrl.collectors import Collector
-from torchrl.envs.utils import RandomPolicy
 
 import torch_panda
+from tests.examples.training.episodes import play
 from training.buffers import STORED_KEYS
 
 
 @pytest.fixture
 def make_demos(tmp_path):
-    """Write random episodes as record_demos.py writes an expert's."""
+    """Write random episodes as an expert's are written."""
 
     def make(env_id="PandaPush-v1", episodes=4):
-        env = torch_panda.make(env_id, num_envs=episodes, seed=0)
-        torch.manual_seed(0)
-        data = next(
-            iter(Collector(env, RandomPolicy(env.action_spec), frames_per_batch=200))
-        )
+        with torch_panda.make(env_id, num_envs=episodes, seed=0) as env:
+            data = play(env).select(*STORED_KEYS).reshape(-1)
         path = tmp_path / "demos.pt"
-        torch.save(data.select(*STORED_KEYS).reshape(-1).to_dict(), path)
-        env.close()
+        torch.save(data.to_dict(), path)
         return path
 
     return make

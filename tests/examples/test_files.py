@@ -11,7 +11,7 @@ import experts
 import torch_panda
 import train
 import watch
-from tests.examples.test_train import run
+from training.demonstrations import read_demos
 
 
 def save(path, content):
@@ -62,7 +62,7 @@ def test_files_that_hold_no_demonstrations(tmp_path, content):
         torch_panda.make("PandaReach-v1", num_envs=1) as env,
         pytest.raises(ValueError, match=message),
     ):
-        train.read_demos(path, env)
+        read_demos(path, env)
 
 
 class Intruder:
@@ -82,41 +82,17 @@ def test_a_file_of_a_stranger_runs_no_code(tmp_path):
         torch_panda.make("PandaReach-v1", num_envs=1) as env,
         pytest.raises(ValueError, match="does not hold demonstrations"),
     ):
-        train.read_demos(path, env)
+        read_demos(path, env)
     assert not mark.exists()
-
-
-def test_demonstrations_of_unequal_lengths(tmp_path):
-    path = tmp_path / "demos.pt"
-    experts.main(experts.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path))
-    content = torch.load(path)
-    content["action"] = content["action"][:-1]
-    save(path, content)
-    with (
-        torch_panda.make("PandaReach-v1", num_envs=1) as env,
-        pytest.raises(ValueError, match=f"{path} does not hold demonstrations"),
-    ):
-        train.read_demos(path, env)
-
-
-def test_demonstrations_without_a_transition(tmp_path):
-    path = tmp_path / "demos.pt"
-    experts.main(experts.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path))
-    with torch_panda.make("PandaReach-v1", num_envs=1) as env:
-        assert len(train.read_demos(path, env))
-        save(path, TensorDict(torch.load(path)).auto_batch_size_(1)[:0].to_dict())
-        with pytest.raises(ValueError, match=f"{path} holds no transitions"):
-            train.read_demos(path, env)
 
 
 @pytest.mark.parametrize("content", [b"hello", {"args": {}}])
 def test_damaged_state_of_a_run(tmp_path, content):
     save(tmp_path / "resume.pt", content)
     before = (tmp_path / "resume.pt").read_bytes()
-    refused = run("train", "--resume", "--out", tmp_path, check=False)
-    assert refused.returncode == 1
-    assert "resume.pt does not hold the state of a run, or is damaged" in refused.stderr
-    assert "Traceback" not in refused.stderr
+    message = "resume.pt does not hold the state of a run, or is damaged"
+    with pytest.raises(SystemExit, match=message):
+        train.main(train.Args(resume=True, out=tmp_path))
     assert (tmp_path / "resume.pt").read_bytes() == before
 
 
@@ -149,7 +125,5 @@ def test_outputs_do_not_replace_a_folder(tmp_path, monkeypatch, script):
 
 def test_training_below_a_file(tmp_path):
     (tmp_path / "file").touch()
-    refused = run("train", "--out", tmp_path / "file" / "run", check=False)
-    assert refused.returncode == 1
-    assert "Not a directory" in refused.stderr
-    assert "Traceback" not in refused.stderr
+    with pytest.raises(SystemExit, match="Not a directory"):
+        train.main(train.Args(out=tmp_path / "file" / "run"))
