@@ -92,8 +92,8 @@ def moved(data: TensorDictBase) -> Tensor:
 
     Every hindsight goal of the others is reached without acting (arXiv 2012.08850).
     """
-    goal = data["next", "achieved_goal"]
-    change = (goal - goal[:, SETTLED : SETTLED + 1]).abs()
+    goal = data["next", "achieved_goal"][:, SETTLED:]
+    change = (goal - goal[:, :1]).abs()
     return (change > MOVED).flatten(1).any(1)
 
 
