@@ -33,9 +33,8 @@ from tqdm import tqdm
 import torch_panda
 from agents import Hyperparameters, make_agent
 from limits import Positive, Ratio, Seed, Weight, check_limits
-from train import crossed
 from training.buffers import STORED_KEYS, make_buffer
-from training.checkpoint import Progress, StopSignal
+from training.checkpoint import Progress, StopSignal, crossed
 from training.curve import Curve
 
 try:

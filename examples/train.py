@@ -39,21 +39,15 @@ from training.checkpoint import (
     Progress,
     StopSignal,
     check_folder,
+    crossed,
 )
 from training.curve import Curve, reseed
-from training.demonstrations import make_demo_buffer, read_demos
-from training.pretraining import pretrain
-from training.recipes import find_recipe
+from training.demonstrations import make_demo_buffer, pretrain, read_demos
+from training.recipes import find_changes, find_recipe
 from training.starts import StartFrom, states_at_objects
-from watch import record
+from video import record
 
 KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
-
-# What is no other way to train: other runs of the same line in a plot.
-PLAIN_OPTIONS = {
-    *("algo", "seed", "total_steps", "eval_interval"),
-    *("out", "resume", "device", "video"),
-}
 
 
 @dataclass
@@ -184,10 +178,8 @@ class Run:
             self.curve.add(progress)
             checkpoint.save()
 
-        name = f"{args.env_id} {args.algo}"
-        bar = tqdm(
-            desc=name, initial=progress.steps, total=args.total_steps, unit="step"
-        )
+        bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
+        bar.set_description(f"{args.env_id} {args.algo}")
         finished = stopped = progress.steps >= args.total_steps
         episodes = iter(self.collector)
         while not stopped:
@@ -228,9 +220,8 @@ class Run:
         """
         args, agent = self.args, self.agent
         losses: dict[str, list[Tensor]] = defaultdict(list)
-        while len(self.buffer) and agent.updates < int(
-            self.progress.steps * args.updates_per_step
-        ):
+        due = int(self.progress.steps * args.updates_per_step) - agent.updates
+        for _ in range(due if len(self.buffer) else 0):
             if args.anneal_lr:
                 last = args.updates_per_step * args.total_steps
                 # The last iteration may go beyond the last step.
@@ -245,11 +236,6 @@ class Run:
         """Free the environments."""
         self.collector.shutdown()
         self.curve.close()
-
-
-def crossed(interval: int, before: int, after: int) -> bool:
-    """Whether a multiple of ``interval`` lies in (before, after]."""
-    return before // interval < after // interval
 
 
 def check(args: Args) -> None:
@@ -285,16 +271,6 @@ def parse(arguments: list[str] | None = None) -> Args:
     return tyro.cli(Args, args=arguments, default=default)
 
 
-def changed(args: Args) -> dict[str, object]:
-    """The options that make other results than the preset's, for a plot's labels."""
-    default = asdict(default_args(args.preset, args.env_id))
-    return {
-        key: value
-        for key, value in asdict(args).items()
-        if value != default[key] and key not in PLAIN_OPTIONS
-    }
-
-
 def main(args: Args) -> None:
     """Train, and say where the results are."""
     out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
@@ -303,7 +279,8 @@ def main(args: Args) -> None:
         check_folder(out, resume=args.resume)
         run = Run(args, out)
         out.mkdir(parents=True, exist_ok=True)
-        options = {**asdict(args), "changed": changed(args)}
+        default = default_args(args.preset, args.env_id)
+        options = {**asdict(args), "changed": find_changes(args, default)}
         (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
@@ -312,13 +289,12 @@ def main(args: Args) -> None:
     stop.release()
     run.close()
     if finished and args.video:
-        with torch_panda.make(
-            args.env_id, num_envs=6, seed=args.seed, device=args.device
-        ) as env:
-            try:
+        options = {"num_envs": 6, "seed": args.seed, "device": args.device}
+        try:
+            with torch_panda.make(args.env_id, **options) as env:
                 record(env, run.agent.policy, out / "video.mp4")
-            except KeyboardInterrupt:
-                print("no video")
+        except KeyboardInterrupt:
+            print("no video")
     progress = run.progress
     print(f"success {progress.success} after {progress.steps} steps; see {out}")
     if not finished:

@@ -60,17 +60,17 @@ def mirror(rows: Transitions, geometry: Geometry) -> Transitions:
 
 
 def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions:
-    """Move the second half of the rows, each by up to ``distance`` in x and y [m].
+    """Move half of the rows, at random, each by up to ``distance`` in x and y [m].
 
     Hand, objects and goals move together, as if the robot stood elsewhere.
     """
-    half = len(rows.goal) // 2
-    offset = torch.empty_like(rows.goal[half:, :2]).uniform_(-distance, distance)
+    offset = torch.empty_like(rows.goal[:, :2]).uniform_(-distance, distance)
+    offset *= torch.rand_like(offset[:, :1]) < 0.5
 
     def shifted(values: Tensor, starts: tuple[int, ...]) -> Tensor:
         values = values.clone()
         for start in starts:
-            values[half:, start : start + 2] += offset
+            values[:, start : start + 2] += offset
         return values
 
     return rows._replace(

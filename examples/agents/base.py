@@ -79,11 +79,13 @@ class Agent(nn.Module, ABC):
         Returns:
             the losses, scalars without gradients.
         """
-        rows = self.augmentation(Transitions.from_tensordict(batch))
-        num_demos = 0 if demos is None else len(demos)
+        rows = Transitions.from_tensordict(batch)
+        num_demos = 0
         if demos is not None:
-            demonstrated = Transitions.from_tensordict(demos)
-            rows = rows.followed_by(self.augmentation(demonstrated))
+            num_demos = len(demos)
+            pairs = zip(rows, Transitions.from_tensordict(demos), strict=True)
+            rows = Transitions(*map(torch.cat, pairs))
+        rows = self.augmentation(rows)
         state = self.normalizer(rows.observation, rows.goal)
         next_state = self.normalizer(rows.next_observation, rows.goal)
         self.optimizer.zero_grad()

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -38,7 +37,3 @@ class Transitions(NamedTuple):
             following.get("terminated"),
             following.get("observation"),
         )
-
-    def followed_by(self, other: "Transitions") -> "Transitions":
-        """These rows, then those of another batch."""
-        return Transitions(*map(torch.cat, zip(self, other, strict=True)))

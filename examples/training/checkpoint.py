@@ -99,6 +99,11 @@ class Checkpoint:
         torch.cuda.set_rng_state_all(state["cuda_random"])
 
 
+def crossed(interval: int, before: int, after: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
 def fixed(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
     """The options that a continuation must share."""
     every = json.loads(json.dumps(asdict(args), default=str))

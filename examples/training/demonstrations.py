@@ -1,13 +1,16 @@
-"""Transitions of an expert, to learn from beside one's own."""
+"""Transitions of an expert, to learn from before and beside one's own."""
 
+import time
 from pathlib import Path
 
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from tqdm import tqdm
 
 from torch_panda import RobotTaskEnv
 from training import files
 from training.buffers import STORED_KEYS
+from training.checkpoint import SAVE_INTERVAL, Checkpoint
 
 
 def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
@@ -39,3 +42,38 @@ def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:
     buffer = TensorDictReplayBuffer(storage=storage)
     buffer.extend(demos)
     return buffer
+
+
+def pretrain(
+    checkpoint: Checkpoint,
+    demos: TensorDictReplayBuffer,
+    *,
+    updates: int,
+    batch_size: int,
+    stop: object = False,
+) -> None:
+    """Take gradient steps that only imitate, from where the run is, and save it.
+
+    Args:
+        checkpoint: of the run, whose learning rate falls to 0 meanwhile.
+        demos: to imitate.
+        updates: gradient steps, over all.
+        batch_size: transitions per gradient step.
+        stop: ends this early when it is true.
+    """
+    agent, progress = checkpoint.agent, checkpoint.progress
+    bar = tqdm(
+        desc="imitation", initial=progress.pretrained, total=updates, unit="update"
+    )
+    while progress.pretrained < updates and not stop:
+        started = time.perf_counter()
+        agent.set_learning_rate(1 - progress.pretrained / updates)
+        agent.imitate(demos.sample(batch_size))
+        progress.pretrained += 1
+        progress.seconds += time.perf_counter() - started
+        bar.update()
+        if progress.pretrained % SAVE_INTERVAL == 0:
+            checkpoint.save()
+    bar.close()
+    agent.set_learning_rate(1.0)
+    checkpoint.save()

@@ -11,6 +11,17 @@ import torch
 from tensordict import NestedKey
 
 
+def prepare(path: Path) -> None:
+    """Make a file's folder, so that what takes long to make will not be lost.
+
+    Raises:
+        OSError: the file could not be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise OSError(f"cannot write to {path}")
+
+
 def replace(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file whole or not at all: a kill never leaves half of it."""
     temporary = path.with_name(path.name + ".new")

@@ -5,6 +5,7 @@ command line come before a recipe's.
 """
 
 import re
+from dataclasses import asdict
 from typing import Any
 
 # Every object task: hindsight about what moved, and symmetry.
@@ -15,6 +16,11 @@ OBJECT: dict[str, Any] = {
     "relative_inputs": "coarse",
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
+}
+# What is no other way to train: other runs of the same line in a plot.
+PLAIN_OPTIONS = {
+    *("algo", "seed", "total_steps", "eval_interval"),
+    *("out", "resume", "device", "video"),
 }
 RECIPES: dict[str, dict[str, Any]] = {
     "Reach": {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
@@ -46,3 +52,10 @@ def find_recipe(env_id: str) -> dict[str, Any]:
     """The recipe of an environment's task; none of an unknown one."""
     found = re.match(r"Panda([A-Za-z]+?)(Joints)?(Dense)?-v\d", env_id)
     return RECIPES.get(found[1], {}) if found else {}
+
+
+def find_changes(args: Any, default: Any) -> dict[str, Any]:  # noqa: ANN401 (dataclasses)
+    """The options that make another way to train of a preset's, for plots' labels."""
+    ours, others = asdict(args), asdict(default)
+    plain = PLAIN_OPTIONS
+    return {k: x for k, x in ours.items() if x != others[k] and k not in plain}

@@ -1,10 +1,13 @@
-"""What the examples' tests share: a file of demonstrations, if of no expert."""
+"""What the examples' tests share: quick evaluations, and demonstrations of no expert."""
+
+import signal
 
 import pytest
 import torch
 
 import torch_panda
 from tests.examples.training.episodes import play
+from training import curve
 from training.buffers import STORED_KEYS
 
 
@@ -20,3 +23,17 @@ def make_demos(tmp_path):
         return path
 
     return make
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few episodes an evaluation, and signals and threads as they were."""
+    monkeypatch.setattr(curve, "EPISODES", 8)
+    monkeypatch.setattr(curve, "NUM_ENVS", 8)
+    handlers = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(precision)

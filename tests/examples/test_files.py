@@ -10,6 +10,7 @@ import evaluate
 import experts
 import torch_panda
 import train
+import video
 import watch
 from training.demonstrations import read_demos
 
@@ -108,7 +109,7 @@ def must_not_play(*arguments):
 
 @pytest.mark.parametrize("script", [experts, watch])
 def test_outputs_below_a_file(tmp_path, monkeypatch, script):
-    monkeypatch.setattr(script, "play", must_not_play)
+    monkeypatch.setattr(video if script is watch else script, "play", must_not_play)
     (tmp_path / "file").touch()
     with pytest.raises(SystemExit, match=r"^\[Errno .*file"):
         script.main(script.Args(out=tmp_path / "file" / "out.gif"))
@@ -116,7 +117,7 @@ def test_outputs_below_a_file(tmp_path, monkeypatch, script):
 
 @pytest.mark.parametrize("script", [experts, watch])
 def test_outputs_do_not_replace_a_folder(tmp_path, monkeypatch, script):
-    monkeypatch.setattr(script, "play", must_not_play)
+    monkeypatch.setattr(video if script is watch else script, "play", must_not_play)
     folder = tmp_path / "folder.gif"
     folder.mkdir()
     with pytest.raises(SystemExit, match=f"^cannot write to {folder}$"):

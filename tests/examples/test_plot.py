@@ -9,14 +9,16 @@ import matplotlib.pyplot as plt
 import pytest
 
 import plot
-from train import Args, changed
+from train import Args, default_args
+from training.recipes import find_changes
 
 POINT = {"step": 0.5, "success": 0.5, "ever_success": 0.5, "return": -40.0}
 
 
 def write_run(folder, args, rows=(POINT,)):
     folder.mkdir(parents=True)
-    options = {**asdict(args), "changed": changed(args)}
+    default = default_args(args.preset, args.env_id)
+    options = {**asdict(args), "changed": find_changes(args, default)}
     (folder / "args.json").write_text(json.dumps(options, default=str))
     with (folder / "curve.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, [*rows[-1]])

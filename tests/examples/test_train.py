@@ -19,23 +19,9 @@ import plot
 import train
 from agents.base import LEARNING_RATE
 from train import Args, Run, default_args, parse
-from training import curve
 
+pytestmark = pytest.mark.usefixtures("quick")
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """Few episodes an evaluation, and signals and threads as they were."""
-    monkeypatch.setattr(curve, "EPISODES", 8)
-    monkeypatch.setattr(curve, "NUM_ENVS", 8)
-    handlers = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
-    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    torch.set_num_threads(threads)
-    torch.set_float32_matmul_precision(precision)
 
 
 class After:

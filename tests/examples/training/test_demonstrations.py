@@ -7,8 +7,10 @@ from tensordict import TensorDict
 import torch_panda
 from tests.examples.test_train import After
 from train import Args, Run
-from training import pretraining
+from training import demonstrations
 from training.demonstrations import make_demo_buffer, read_demos
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture
@@ -73,7 +75,7 @@ def test_a_ratio_of_each_batch_is_demonstrations(make_demos, tmp_path):
 def test_imitation_saves_in_between(
     make_demos, tmp_path, monkeypatch, updates, expected
 ):
-    monkeypatch.setattr(pretraining, "SAVE_INTERVAL", 12)
+    monkeypatch.setattr(demonstrations, "SAVE_INTERVAL", 12)
     args = small(make_demos(), total_steps=0, pretrain_updates=updates)
     run = Run(args, tmp_path)
     saved = []
