@@ -1,4 +1,4 @@
-"""What the examples' tests share: quick evaluations, and demonstrations of no expert."""
+"""What the tests of the examples share: evaluations that are quick, demonstrations."""
 
 import signal
 
