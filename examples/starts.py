@@ -12,8 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Transform
 
 import torch_panda
+from experts.moves import carry, go_over, is_held, norm
 from geometry import read_geometry
-from moves import carry, go_over, is_held, norm
 
 APPROACH = 35  # steps
 # How far beside an object a hand that cannot grasp stops, between the centres [m]: the

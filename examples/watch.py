@@ -26,8 +26,9 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import load_policy, read_checkpoint
-from experts import make_expert, prepare
+from experts import make_expert
 from limits import check_limits
+from record_demos import prepare
 
 CELL = (240, 320)  # height and width [pixels]
 FPS = 25  # real time: the control frequency

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-import experts
+import record_demos
 import torch_panda
 from agents import Agent, Hyperparameters
 from tests.examples.test_train import run
@@ -73,7 +73,9 @@ def test_policy_comes_closer_to_demonstrations(env, algo):
 @pytest.mark.parametrize("her_ratio", [0.0, 0.6, 1.0])
 def test_demonstrations_are_given_the_goal_they_achieved(tmp_path, her_ratio):
     path = tmp_path / "demos.pt"
-    experts.main(experts.Args("PandaSlide-v1", episodes=4, num_envs=4, out=path))
+    record_demos.main(
+        record_demos.Args("PandaSlide-v1", episodes=4, num_envs=4, out=path)
+    )
     demos = TensorDict(torch.load(path), [200]).reshape(4, -1)
     final = demos["next", "achieved_goal"][:, -1]
     assert (final - demos["desired_goal"][:, -1]).norm(dim=-1).max() > 0.05  # a miss
@@ -115,7 +117,7 @@ class StopAfter:
 )
 def test_imitation_saves_in_between(tmp_path, updates, expected):
     path = tmp_path / "demos.pt"
-    experts.main(experts.Args(episodes=4, num_envs=4, out=path))
+    record_demos.main(record_demos.Args(episodes=4, num_envs=4, out=path))
     options = {"total_steps": 0, "pretrain_updates": updates, "eval_episodes": 2}
     args = Args(env_id="PandaPush-v1", demos=path, save_interval=12, **options)
     training = Run(args, tmp_path)
@@ -129,7 +131,7 @@ def test_imitation_saves_in_between(tmp_path, updates, expected):
 @pytest.mark.parametrize("algo", ["td3", "sac"])
 def test_imitation_goes_on_where_it_was_stopped(tmp_path, algo):
     path = tmp_path / "demos.pt"
-    experts.main(experts.Args(episodes=4, num_envs=4, out=path))
+    record_demos.main(record_demos.Args(episodes=4, num_envs=4, out=path))
     options = {"mirror": True, "eval_episodes": 2}
     options |= {"total_steps": 0, "pretrain_updates": 40}
     args = Args(algo=algo, env_id="PandaPush-v1", demos=path, **options)
@@ -164,7 +166,7 @@ def test_imitation_goes_on_where_it_was_stopped(tmp_path, algo):
 
 def test_training_stores_demonstrations_apart(tmp_path):
     demos = tmp_path / "demos.pt"
-    run("experts", "--env-id", "PandaPush-v1", "--episodes", 4, "--out", demos)
+    run("record_demos", "--env-id", "PandaPush-v1", "--episodes", 4, "--out", demos)
     arguments = [*("--env-id", "PandaPush-v1", "--demos", demos, "--num-envs", 2)]
     arguments += [*("--eval-episodes", 2, "--updates-per-step", 0.05, "--no-video")]
     arguments += [*("--total-steps", 200, "--save-interval", 100, "--batch-size", 16)]

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 import evaluate
-import experts
+import record_demos
 import torch_panda
 import train
 import watch
@@ -88,7 +88,9 @@ def test_a_file_of_a_stranger_runs_no_code(tmp_path):
 
 def test_demonstrations_of_unequal_lengths(tmp_path):
     path = tmp_path / "demos.pt"
-    experts.main(experts.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path))
+    record_demos.main(
+        record_demos.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path)
+    )
     content = torch.load(path)
     content["action"] = content["action"][:-1]
     save(path, content)
@@ -101,7 +103,9 @@ def test_demonstrations_of_unequal_lengths(tmp_path):
 
 def test_demonstrations_without_a_transition(tmp_path):
     path = tmp_path / "demos.pt"
-    experts.main(experts.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path))
+    record_demos.main(
+        record_demos.Args(env_id="PandaReach-v3", episodes=1, num_envs=1, out=path)
+    )
     with torch_panda.make("PandaReach-v1", num_envs=1) as env:
         assert len(train.read_demos(path, env))
         save(path, TensorDict(torch.load(path)).auto_batch_size_(1)[:0].to_dict())
@@ -122,7 +126,9 @@ def test_damaged_state_of_a_run(tmp_path, content):
 
 def test_demonstrations_go_into_a_new_folder(tmp_path):
     path = tmp_path / "new" / "folder" / "demos.pt"
-    experts.main(experts.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path))
+    record_demos.main(
+        record_demos.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path)
+    )
     assert len(torch.load(path)["action"]) > 2
 
 
@@ -130,7 +136,7 @@ def must_not_play(*arguments):
     raise AssertionError("the file should have been refused before")
 
 
-@pytest.mark.parametrize("script", [experts, watch])
+@pytest.mark.parametrize("script", [record_demos, watch])
 def test_outputs_below_a_file(tmp_path, monkeypatch, script):
     monkeypatch.setattr(script, "play", must_not_play)
     (tmp_path / "file").touch()
@@ -138,7 +144,7 @@ def test_outputs_below_a_file(tmp_path, monkeypatch, script):
         script.main(script.Args(out=tmp_path / "file" / "out.gif"))
 
 
-@pytest.mark.parametrize("script", [experts, watch])
+@pytest.mark.parametrize("script", [record_demos, watch])
 def test_outputs_do_not_replace_a_folder(tmp_path, monkeypatch, script):
     monkeypatch.setattr(script, "play", must_not_play)
     folder = tmp_path / "folder.gif"

@@ -8,7 +8,7 @@ from math import inf, nan
 import pytest
 
 import evaluate
-import experts
+import record_demos
 import train
 import watch
 from limits import LIMITS, check_limits
@@ -17,7 +17,7 @@ NUMBERS = (int, float, int | None, float | None)
 
 
 @pytest.mark.parametrize(
-    "script", ["train", "evaluate", "experts", "watch", "distributed"]
+    "script", ["train", "evaluate", "record_demos", "watch", "distributed"]
 )
 def test_every_number_has_a_limit(script):
     if script == "distributed":
@@ -86,7 +86,11 @@ def test_devices_that_do_not_work(tmp_path, device):
     ("script", "option", "value"),
     [
         *((evaluate, "episodes", 0), (evaluate, "num_envs", 0), (evaluate, "seed", -1)),
-        *((experts, "episodes", 0), (experts, "num_envs", 0), (experts, "seed", -1)),
+        *(
+            (record_demos, "episodes", 0),
+            (record_demos, "num_envs", 0),
+            (record_demos, "seed", -1),
+        ),
         *((watch, "num_envs", 0), (watch, "seed", 2**64)),
     ],
 )
