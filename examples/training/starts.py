@@ -14,7 +14,7 @@ from torchrl.envs import Transform
 
 import torch_panda
 from agents.geometry import read_geometry
-from moves import carry, go_over, is_held, norm
+from experts.moves import carry, go_over, is_held, norm
 
 APPROACH = 45  # steps
 # How far beside an object a hand that cannot grasp stops, between the centres [m]: the

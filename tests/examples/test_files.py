@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 import evaluate
-import experts
+import record_demos
 import torch_panda
 import train
 import video
@@ -99,7 +99,9 @@ def test_damaged_state_of_a_run(tmp_path, content):
 
 def test_demonstrations_go_into_a_new_folder(tmp_path):
     path = tmp_path / "new" / "folder" / "demos.pt"
-    experts.main(experts.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path))
+    record_demos.main(
+        record_demos.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path)
+    )
     assert len(torch.load(path)["action"]) > 2
 
 
@@ -107,7 +109,7 @@ def must_not_play(*arguments):
     raise AssertionError("the file should have been refused before")
 
 
-@pytest.mark.parametrize("script", [experts, watch])
+@pytest.mark.parametrize("script", [record_demos, watch])
 def test_outputs_below_a_file(tmp_path, monkeypatch, script):
     monkeypatch.setattr(video if script is watch else script, "play", must_not_play)
     (tmp_path / "file").touch()
@@ -115,7 +117,7 @@ def test_outputs_below_a_file(tmp_path, monkeypatch, script):
         script.main(script.Args(out=tmp_path / "file" / "out.gif"))
 
 
-@pytest.mark.parametrize("script", [experts, watch])
+@pytest.mark.parametrize("script", [record_demos, watch])
 def test_outputs_do_not_replace_a_folder(tmp_path, monkeypatch, script):
     monkeypatch.setattr(video if script is watch else script, "play", must_not_play)
     folder = tmp_path / "folder.gif"

@@ -9,6 +9,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import evaluate
+import record_demos
 import train
 import watch
 from limits import check_limits, find_limits
@@ -20,7 +21,9 @@ def numbers(hint):
     return any(map(numbers, parts)) if parts else hint in (int, float)
 
 
-@pytest.mark.parametrize("script", ["train", "evaluate", "watch", "distributed"])
+@pytest.mark.parametrize(
+    "script", ["train", "evaluate", "record_demos", "watch", "distributed"]
+)
 def test_every_number_has_a_limit(script):
     if script == "distributed":
         pytest.importorskip("ray")
@@ -69,6 +72,7 @@ def test_devices_that_do_not_work(tmp_path, device):
     ("script", "option", "value"),
     [
         *((evaluate, "episodes", 0), (evaluate, "num_envs", 0), (evaluate, "seed", -1)),
+        *((record_demos, "episodes", 0), (record_demos, "num_envs", 0)),
         *((watch, "num_envs", 0), (watch, "seed", 2**64)),
     ],
 )
