@@ -8,15 +8,13 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 import record_demos
 import torch_panda
 from evaluate import wilson_interval
-from tests.examples.test_train import run
 from torch_panda.transforms import HindsightRelabel
 
 
-def test_demonstrations_extend_a_replay_buffer(tmp_path):
+def test_demonstrations_extend_a_replay_buffer(tmp_path, capsys):
     out = tmp_path / "demos.pt"
-    options = ["--env-id", "PandaPush-v3", "--episodes", 6, "--num-envs", 4]
-    result = run("record_demos", *options, "--out", out)
-    assert "success at the end" in result.stdout
+    record_demos.main(record_demos.Args("PandaPush-v3", 6, num_envs=4, out=out))
+    assert "success at the end" in capsys.readouterr().out
     demonstrations = TensorDict(torch.load(out)).auto_batch_size_(1)
     ids = demonstrations["collector", "traj_ids"]
     assert ids.unique().tolist() == list(range(6))
