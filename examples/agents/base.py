@@ -130,6 +130,7 @@ class Agent(nn.Module, ABC):
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
+        self.move_targets()
         return loss.detach()
 
     def set_learning_rate(self, factor: float) -> None:
