@@ -27,16 +27,15 @@ import tyro
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
 import torch_panda
-from agents import Agent, Hyperparameters, save_policy
-from evaluate import evaluate
-from limits import check_limits
-from torch_panda.transforms import HindsightRelabel
-from train import STORED_KEYS, StopSignal, crossed
+from agents import Hyperparameters, make_agent
+from limits import Positive, Ratio, Seed, Weight, check_limits
+from training.buffers import STORED_KEYS, make_buffer
+from training.checkpoint import Progress, StopSignal, crossed
+from training.curve import Curve
 
 try:
     import ray
@@ -56,32 +55,28 @@ class Args(Hyperparameters):
     joins the one that this machine belongs to"""
     env_id: str = "PandaReach-v1"
     """one of torch_panda.ENV_IDS"""
-    num_workers: int = 2
+    num_workers: Positive = 2
     """processes that collect, spread over the machines"""
-    num_envs: int = 8
+    num_envs: Positive = 8
     """environments of each worker"""
-    steps_per_batch: int = 50
+    steps_per_batch: Positive = 50
     """steps of each environment in a batch that a worker sends"""
-    cpus_per_worker: int = 1
+    cpus_per_worker: Positive = 1
     """CPUs that a worker reserves, and threads that step its environments"""
-    total_steps: int = 10_000
+    total_steps: Positive = 10_000
     """environment steps, over all workers"""
-    updates_per_step: float = 0.5
+    updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
-    batch_size: int = 256
+    batch_size: Positive = 256
     """transitions per gradient step"""
-    her_ratio: float = 0.8
-    """share of relabelled transitions"""
-    buffer_size: int = 1_000_000
-    """transitions in the replay buffer"""
-    eval_interval: int = 1_000
+    her_ratio: Ratio = 0.8
+    """the ratio of relabelled transitions"""
+    eval_interval: Positive = 1_000
     """environment steps between evaluations"""
-    eval_episodes: int = 80
-    """fresh episodes per evaluation"""
-    seed: int = 0
-    """of the environments, the networks and the sampling"""
+    seed: Seed = 0
+    """the seed of the environments, the networks and the sampling"""
     out: Path | None = None
-    """folder of the checkpoint; None means runs/<env-id>-<algo>-distributed-<seed>"""
+    """the folder of the results; None means runs/<env-id>-<algo>-distributed-<seed>"""
 
     @property
     def batch_frames(self) -> int:
@@ -97,56 +92,44 @@ class Learner:
             first come first served.
         buffer: the replay buffer.
         agent: the agent.
-        steps: environment steps so far.
-        success: share of successful episodes in the last evaluation.
+        progress: steps so far, and the evaluations.
     """
 
-    def __init__(self, args: Args) -> None:
+    def __init__(self, args: Args, out: Path) -> None:
         torch.manual_seed(args.seed)
         self.args = args
         # As many environments as a worker has: exploration noise has their shape.
-        self.eval_env = torch_panda.make(
-            args.env_id, num_envs=args.num_envs, seed=draw_seed()
+        self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
+        self.agent = make_agent(self.env, args)
+        self.buffer = make_buffer(
+            self.env,
+            args.total_steps + args.batch_frames,
+            her_ratio=args.her_ratio,
+            seed=args.seed,
         )
-        self.agent = Agent(
-            self.eval_env,
-            args,
-            max_episode_steps=self.eval_env.max_episode_steps,
-            sparse="Dense" not in args.env_id,
-        )
-        capacity = min(args.buffer_size, args.total_steps + args.batch_frames)
-        self.buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(capacity),
-            transform=HindsightRelabel.from_env(
-                self.eval_env,
-                success_fn=None,
-                her_ratio=args.her_ratio,
-                seed=args.seed,
-            ),
-            batch_size=args.batch_size,
-        )
-        self.steps = 0
-        self.success = 0.0
+        self.progress = Progress()
+        self.curve = Curve(args.env_id, self.agent, out, device="cpu")
         self.collector = make_collector(args, self.agent.explore)
 
-    def train(self, out: Path, stop: StopSignal | None = None) -> None:
+    def train(self, stop: object = False) -> None:
         """Collect and learn until the last step or a stop signal.
 
         Raises:
             RayActorError: a worker died.
         """
-        args = self.args
+        args, progress = self.args, self.progress
         label = f"{args.env_id} {args.algo}"
-        with tqdm(total=args.total_steps, unit="step", desc=label) as progress:
+        self.curve.add(progress)  # the untrained policy
+        with tqdm(total=args.total_steps, unit="step", desc=label) as bar:
             for data in self.collector:
-                before, self.steps = self.steps, self.steps + data.numel()
+                before, progress.steps = progress.steps, progress.steps + data.numel()
                 self.learn(data)
                 self.send_weights(worker_of(data, args.num_workers))
-                progress.update(data.numel())
-                last = self.steps >= args.total_steps or bool(stop)
-                if last or crossed(args.eval_interval, before, self.steps):
-                    self.evaluate(out)
-                    progress.set_postfix(success=f"{self.success:.0%}")
+                bar.update(data.numel())
+                last = progress.steps >= args.total_steps or bool(stop)
+                if last or crossed(args.eval_interval, before, progress.steps):
+                    self.curve.add(progress)
+                    bar.set_postfix(success=progress.success)
                 if last:
                     break
 
@@ -154,9 +137,9 @@ class Learner:
         """Store a worker's batch and take the gradient steps that are due."""
         stored = self.buffer[self.buffer.extend(data.reshape(-1))]
         self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
-        due = int(self.steps * self.args.updates_per_step) - self.agent.updates
+        due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
         for _ in range(due):
-            self.agent.update(self.buffer.sample())
+            self.agent.update(self.buffer.sample(self.args.batch_size))
 
     def send_weights(self, worker: int) -> None:
         """Give a worker the weights and the normaliser for its next batch."""
@@ -165,16 +148,11 @@ class Learner:
         remote = self.collector.remote_collectors[worker]
         ray.get(remote.update_policy_weights_.remote(weights))
 
-    def evaluate(self, out: Path) -> None:
-        """Measure the success, and write the policy for `evaluate.py`."""
-        result = evaluate(self.eval_env, self.agent.policy, self.args.eval_episodes)
-        self.success = float(result.success.float().mean())
-        save_policy(out / "checkpoint.pt", self.agent, self.args.env_id)
-
     def close(self) -> None:
         """End the workers and free the environments."""
         self.collector.shutdown()
-        self.eval_env.close()
+        self.curve.close()
+        self.env.close()
 
 
 @dataclass
@@ -277,12 +255,10 @@ def main(args: Args) -> None:
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
-        if not args.total_steps:
-            raise ValueError("total_steps must be positive, got 0")
         connect(args)
-        learner = Learner(args)
         out.mkdir(parents=True, exist_ok=True)
-        learner.train(out, StopSignal())
+        learner = Learner(args, out)
+        learner.train(StopSignal())
         learner.close()
     except (ConnectionError, ValueError) as error:
         raise SystemExit(str(error)) from None
@@ -292,7 +268,8 @@ def main(args: Args) -> None:
         raise SystemExit("interrupted") from None
     finally:
         ray.shutdown()  # ends the workers, and the cluster if it was started here
-    print(f"success {learner.success:.0%} after {learner.steps} steps; see {out}")
+    progress = learner.progress
+    print(f"success {progress.success} after {progress.steps} steps; see {out}")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
-from agents import load_policy, read_checkpoint
-from limits import check_limits
+from limits import Positive, Seed, check_limits
 from torch_panda import PhysicsName
+from training.policies import load_policy, read_checkpoint
 
 
 class Evaluation(NamedTuple):
@@ -78,13 +78,13 @@ class Args:
     """folder of a run, or its checkpoint.pt"""
     env_id: str | None = None
     """another task with the same spaces; None means the one it was trained on"""
-    episodes: int = 200
+    episodes: Positive = 200
     """number of episodes"""
-    num_envs: int = 32
+    num_envs: Positive = 32
     """environments that are stepped in parallel"""
-    num_threads: int | None = None
+    num_threads: Positive | None = None
     """threads that step them; None means one per core"""
-    seed: int = 1_000
+    seed: Seed = 1_000
     """of the environments"""
     physics: PhysicsName = "exact"
     """how Bullet integrates: as panda-gym, or faster and coarser"""
@@ -92,28 +92,21 @@ class Args:
 
 def main(args: Args) -> None:
     """Print what the policy achieves, with 95 % intervals."""
-    path = args.run / "checkpoint.pt" if args.run.is_dir() else args.run
-    if not path.exists():
-        raise SystemExit(f"there is no checkpoint at {path}")
     try:
         check_limits(args)
-        checkpoint = read_checkpoint(path)
+        checkpoint = read_checkpoint(args.run)
         env_id = args.env_id or checkpoint["env_id"]
-        env = torch_panda.make(
+        with torch_panda.make(
             env_id,
             num_envs=min(args.num_envs, args.episodes),
             num_threads=args.num_threads,
             seed=args.seed,
             physics=args.physics,
-        )
+        ) as env:
+            policy = load_policy(checkpoint, env)
+            result = evaluate(env, policy, args.episodes)
     except ValueError as error:
         raise SystemExit(str(error)) from None
-    with env:
-        try:
-            policy = load_policy(checkpoint, env)
-        except ValueError as error:
-            raise SystemExit(str(error)) from None
-        result = evaluate(env, policy, args.episodes)
     print(f"{env_id}, {args.episodes} episodes, {args.physics} physics")
     for name, flags in (
         ("success at the end", result.success),

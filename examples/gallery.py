@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 
 import torch_panda
 from experts import make_expert
-from watch import tile
+from video import tile
 
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
 

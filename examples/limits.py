@@ -1,57 +1,66 @@
-"""Which numbers the scripts accept: checked before a run starts, not hours into it."""
+"""Which numbers the scripts accept: checked before a run starts, not hours into it.
 
-from collections.abc import Callable
+A limit is part of an option's type, such as ``batch_size: Positive``.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from math import inf
+from typing import Annotated, Any, get_args, get_type_hints
 
-from agents import NUM_QUANTILES
+import torch
 
-# What must hold, in words and as a test, and the options for which it must.
-LIMITS: dict[str, tuple[Callable[[float], bool], tuple[str, ...]]] = {
-    "positive": (
-        lambda x: x > 0,
-        (
-            *("episodes", "eval_episodes", "eval_interval", "save_interval"),
-            *("steps_per_batch", "batch_size", "buffer_size"),
-            *("num_envs", "num_threads", "torch_threads", "hidden_size"),
-            *("num_workers", "cpus_per_worker"),
-        ),
-    ),
-    "from 0 to 2**64 - 1": (lambda x: 0 <= x < 2**64, ("seed",)),
-    "above 0 and finite": (lambda x: 0 < x < inf, ("learning_rate", "alpha")),
-    "finite": (lambda x: -inf < x < inf, ("goal_height",)),
-    "at least 0 and finite": (
-        lambda x: 0 <= x < inf,
-        (
-            *("total_steps", "pretrain_updates", "updates_per_step"),
-            *("action_l2", "bc_weight"),
-            *("noise_eps", "policy_noise", "shift", "fine_inputs"),
-        ),
-    ),
-    "from 0 to 1": (
-        lambda x: 0 <= x <= 1,
-        (
-            *("her_ratio", "demo_her_ratio", "keep_unmoved", "start_at_object"),
-            *("random_eps", "max_random_eps"),
-        ),
-    ),
-    "from 0 to below 1": (lambda x: 0 <= x < 1, ("demo_ratio",)),
-    "above 0 and at most 1": (lambda x: 0 < x <= 1, ("gamma", "tau")),
-    f"from 0 to {NUM_QUANTILES - 1}": (
-        lambda x: 0 <= x < NUM_QUANTILES,
-        ("drop_quantiles",),
-    ),
-}
+
+@dataclass(frozen=True)
+class Limit:
+    """What must hold for a number, in words and as a test."""
+
+    description: str
+    holds: Callable[[float], bool]
+
+
+Positive = Annotated[int, Limit("positive", lambda x: x > 0)]
+Count = Annotated[int, Limit("at least 0", lambda x: x >= 0)]
+Seed = Annotated[int, Limit("from 0 to 2**64 - 1", lambda x: 0 <= x < 2**64)]
+Weight = Annotated[float, Limit("at least 0 and finite", lambda x: 0 <= x < inf)]
+Ratio = Annotated[float, Limit("from 0 to 1", lambda x: 0 <= x <= 1)]
+Discount = Annotated[float, Limit("above 0 and at most 1", lambda x: 0 < x <= 1)]
 
 
 def check_limits(args: object) -> None:
-    """Check a script's options, those that it has and that are not None.
+    """Check a script's options, those that are not None.
 
     Raises:
         ValueError: one is outside of what is accepted.
     """
-    options = vars(args)
-    for what, (holds, names) in LIMITS.items():
-        for name in names:
-            value = options.get(name)
-            if value is not None and not holds(value):
-                raise ValueError(f"{name} must be {what}, got {value}")
+    for name, hint in get_type_hints(type(args), include_extras=True).items():
+        value = getattr(args, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        for limit in find_limits(hint):
+            if not all(number is None or limit.holds(number) for number in numbers):
+                raise ValueError(f"{name} must be {limit.description}, got {value}")
+
+
+def find_limits(hint: Any) -> Iterator[Limit]:  # noqa: ANN401 (any type)
+    """The limits in a type, which may be one in a union or a tuple."""
+    for part in get_args(hint):
+        if isinstance(part, Limit):
+            yield part
+        else:
+            yield from find_limits(part)
+
+
+def check_device(name: str) -> None:
+    """Try a device.
+
+    Raises:
+        ValueError: torch cannot use it.
+    """
+    try:
+        torch.zeros(1, device=name).item()
+    except (RuntimeError, AssertionError, ImportError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            "device must be one that torch can use here, such as cpu, "
+            f"got {name!r}: {reason}"
+        ) from None

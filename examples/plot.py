@@ -1,14 +1,14 @@
-"""Draw success curves: a panel per task, a line per algorithm or ablation.
+"""Draw success curves: a column a task, a row an algorithm, a line a way to train it.
 
     python examples/plot.py runs --out curves.png
 
 Reads every folder below the given ones that holds a run (args.json and curve.csv).
-Draws the median and the interquartile range over the seeds, as the panda-gym paper.
+Draws the median and the interquartile range over the seeds, as the panda-gym paper. A
+panel has four lines at most: what is more goes on in another row.
 """
 
 import csv
 import json
-from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,7 +23,13 @@ import tyro
 
 Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
-COLUMNS = 3  # of panels
+LINES = 4  # of a panel, at most
+# Okabe and Ito's, which can be told apart by everybody; then with other dashes.
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+DASHES = ("-", "--", ":", "-.")
+
+# Of the seeds: by line, within an algorithm, within a task.
+Runs = dict[str, dict[str, dict[str, list[Curve]]]]
 
 
 def plot_curve(curve: Curve, title: str, path: Path) -> None:
@@ -35,100 +41,110 @@ def plot_curve(curve: Curve, title: str, path: Path) -> None:
     plt.close(figure)
 
 
-def plot_panels(
-    runs: dict[str, dict[str, list[Curve]]], metric: Metric, path: Path
-) -> None:
+def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     """Draw median and interquartile range over seeds.
 
     Args:
-        runs: by task, then by line, the curves of the seeds.
+        runs: the curves.
         metric: the column to draw.
         path: where to write the picture.
     """
-    columns = min(len(runs), COLUMNS)
-    rows = -(-len(runs) // columns)
-    most = max(len(lines) for lines in runs.values())
-    figure, panels = plt.subplots(
-        rows,
-        columns,
-        figsize=(5 * columns, (3.5 + 0.2 * most) * rows),  # legends are below
+    lines = sorted(
+        {x for task in runs.values() for algo in task.values() for x in algo}
+    )
+    looks = {x: next_look(i) for i, x in enumerate(lines)}
+    columns = []  # of tasks, each a list of panels
+    for task, algorithms in sorted(runs.items()):
+        panels = []
+        for algo, curves in sorted(algorithms.items()):
+            names = sorted(curves)
+            for first in range(0, len(names), LINES):
+                some = {name: curves[name] for name in names[first : first + LINES]}
+                panels.append((f"{task}, {algo}", some))
+        columns.append(panels)
+    height = max(map(len, columns))
+    figure, grid = plt.subplots(
+        height,
+        len(columns),
+        figsize=(4.2 * len(columns), 4.0 * height),  # legends are below
         squeeze=False,
         layout="constrained",
     )
-    for axes in panels.flat[len(runs) :]:
-        axes.remove()
-    labels = sorted({label for lines in runs.values() for label in lines})
-    colors = dict(
-        zip(labels, plt.cm.turbo(np.linspace(0, 0.95, len(labels))), strict=True)
-    )
-    for axes, (task, lines) in zip(panels.flat, sorted(runs.items()), strict=False):
-        for label, curves in sorted(lines.items()):
-            # Seeds that are still running end earlier: up to where all have come.
-            length = min(len(curve) for curve in curves)
-            steps = [row["step"] for row in curves[0][:length]]
-            values = np.array([[r[metric] for r in c[:length]] for c in curves])
-            low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-            name = f"{label} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
-            marker = "o" if length == 1 else None
-            axes.plot(steps, median, marker=marker, color=colors[label], label=name)
-            axes.fill_between(steps, low, high, color=colors[label], alpha=0.2, lw=0)
-        _label(axes, task, metric)
-        axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
+    for column, panels in enumerate(columns):
+        for axes in grid[len(panels) :, column]:
+            axes.remove()
+        for axes, (title, curves) in zip(grid[:, column], panels, strict=False):
+            draw_panel(axes, curves, metric, looks)
+            _label(axes, title, metric)
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
-def read_runs(folders: list[Path]) -> dict[str, dict[str, list[Curve]]]:
-    """Read the curves below some folders: by task, then by line.
+def next_look(number: int) -> dict[str, str]:
+    """Colour and dashes of a line: no two of the first 28 are alike."""
+    dashes, color = divmod(number, len(COLORS))
+    return {"color": COLORS[color], "linestyle": DASHES[dashes % len(DASHES)]}
+
+
+def draw_panel(
+    axes: plt.Axes,
+    lines: dict[str, list[Curve]],
+    metric: Metric,
+    looks: dict[str, dict[str, str]],
+) -> None:
+    """Draw lines, each with a band over its seeds."""
+    for name, curves in lines.items():
+        # Seeds that are still running end earlier: up to where all have come.
+        points = [{row["step"]: row[metric] for row in curve} for curve in curves]
+        steps = sorted(set.intersection(*map(set, points)))
+        values = np.array([[curve[step] for step in steps] for curve in points])
+        low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+        label = f"{name} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
+        marker = "o" if len(steps) == 1 else None
+        axes.plot(steps, median, marker=marker, label=label, **looks[name])
+        axes.fill_between(steps, low, high, color=looks[name]["color"], alpha=0.2, lw=0)
+    axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
+
+
+def read_runs(folders: list[Path]) -> Runs:
+    """Read the curves below some folders.
 
     Raises:
         ValueError: there is no run, or what one of them holds cannot be read.
     """
-    runs: dict[str, dict[str, list[Curve]]] = defaultdict(lambda: defaultdict(list))
+    runs: Runs = {}
     for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
         try:
             args = json.loads((path.parent / "args.json").read_text())
-            task, line = args["env_id"], line_label(args)
+            task, algo = str(args["env_id"]), str(args["algo"]).upper()
+            line = line_label(str(args["preset"]), args.get("changed", {}))
             with path.open() as file:
                 curve = [
-                    {key: float(value) for key, value in row.items()}
+                    {key: float(value) for key, value in row.items() if value}
                     for row in csv.DictReader(file)
                 ]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path.parent} holds no run: {error!r}") from None
         if curve:
-            runs[task][line].append(curve)
+            lines = runs.setdefault(task, {}).setdefault(algo, {})
+            lines.setdefault(line, []).append(curve)
     if not runs:
         names = ", ".join(map(str, folders))
         raise ValueError(f"no run (args.json, curve.csv) below {names}")
     return runs
 
 
-def line_label(args: dict[str, object]) -> str:
-    """Name what sets a run apart from others of its task, but for the seed."""
-    parts = [str(args["algo"]).upper()]
-    if args["preset"] != "paper":
-        parts.append(str(args["preset"]))
-    parts.append(
-        {"relabel": "HER", "augment": "HER (stored copies)"}.get(
-            str(args["her"]), "no HER"
-        )
-    )
-    if not args["double_q"]:
-        parts.append("one Q")
-    if args.get("demos"):
-        parts.append("demonstrations")
-    if args["updates_per_step"] != 0.5:  # the presets'
-        parts.append(f"{args['updates_per_step']} updates a step")
-    if args.get("start_at_object"):
-        parts.append("starts at objects")
-    if args.get("pretrain_updates"):
-        parts.append("imitation first")
-    if args["preset"] == "tuned":
-        wanted = {"mirror": "mirror", "relative_inputs": "relative", "shift": "shift"}
-        parts += [f"no {name}" for key, name in wanted.items() if not args.get(key)]
-    if args.get("fine_inputs"):
-        parts.append("fine inputs")
+def line_label(preset: str, changed: dict[str, object]) -> str:
+    """Name what sets a run apart from others of its task and algorithm."""
+    parts = [preset]
+    for key, value in changed.items():
+        name = key.replace("_", " ")
+        if value is True or key == "demos":
+            parts.append(name)
+        elif value in (False, "none", 0):
+            parts.append(f"no {name}")
+        else:
+            parts.append(f"{name} {value}")
     return ", ".join(parts)
 
 

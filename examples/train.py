@@ -3,41 +3,51 @@
     python examples/train.py --env-id PandaPush-v1 --algo td3 --total-steps 300000
 
 The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687);
-where its table is silent they follow the HER of OpenAI Baselines. An iteration is one
-episode of every environment, then the gradient steps due for it, so that between two
-iterations a run is its weights, its buffer and its random numbers, and `--resume`
-continues it bit for bit.
+where its table is silent they follow the HER of OpenAI Baselines. `--preset tuned`
+takes the task's recipe of `training/recipes.py`.
+
+An iteration is one episode of every environment, then the gradient steps due for it, so
+that between two iterations a run is its weights, its buffer and its random numbers, and
+`--resume` continues it bit for bit. Gradient steps take the threads that
+OMP_NUM_THREADS says, or one.
 """
 
-import csv
 import json
-import signal
+import os
 import time
+from collections import defaultdict
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import tyro
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
-from torchrl.record import CSVLogger, TensorboardLogger
-from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 import torch_panda
-from agents import Agent, Hyperparameters, read, replace, save_policy
-from evaluate import evaluate
-from limits import check_limits
-from plot import plot_curve
-from starts import StartFrom, states_at_objects
-from torch_panda.transforms import HindsightAugment, HindsightRelabel
-from watch import record
+from agents import Hyperparameters, make_agent
+from limits import Count, Positive, Ratio, Seed, Weight, check_device, check_limits
+from training.buffers import Hindsight, make_buffer, select_episodes
+from training.checkpoint import (
+    SAVE_INTERVAL,
+    Checkpoint,
+    Progress,
+    StopSignal,
+    check_folder,
+    crossed,
+)
+from training.curve import Curve, reseed
+from training.demonstrations import make_demo_buffer, pretrain, read_demos
+from training.recipes import find_changes, find_recipe
+from training.starts import StartFrom, states_at_objects
+from video import record
+
+KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
 
 
 @dataclass
@@ -45,466 +55,190 @@ class Args(Hyperparameters):
     """What to train, how long, and where to write."""
 
     preset: Literal["paper", "tuned"] = "paper"
-    """where the defaults of the other options are from: the paper's table, or ours"""
+    """take the defaults of the other options from the paper's table, or from the task's
+    recipe; "tuned" stores only a tenth of the episodes in which nothing moved, too"""
     env_id: str = "PandaReach-v1"
-    """one of torch_panda.ENV_IDS"""
-    her: Literal["relabel", "augment", "none"] = "relabel"
-    """hindsight goals when sampling, as stored copies, or none"""
-    her_ratio: float = 0.8
-    """share of relabelled transitions, k / (k + 1): k = 4 goals per transition"""
-    seed: int = 0
-    """of the environments, the networks and the sampling"""
-    num_envs: int = 4
-    """environments that are stepped in parallel"""
-    num_threads: int | None = None
-    """threads that step them; None means one per core"""
-    torch_threads: int = 1
-    """threads of a gradient step on the CPU; more pay off only on idle cores"""
-    matmul_precision: Literal["highest", "high", "medium"] = "medium"
-    """torch's precision of float32 products. "medium" permits bfloat16; on CPUs with
-    AVX-512 it selects oneDNN, there up to twice as fast as MKL"""
-    device: str = "cpu"
-    """of the networks and the replay buffer"""
-    total_steps: int = 10_000
-    """environment steps, over all environments; 0 after `pretrain_updates` only"""
-    updates_per_step: float = 0.5
+    """the task, one of torch_panda.ENV_IDS"""
+    her: Hindsight = "relabel"
+    """give sampled transitions hindsight goals ("relabel"), each object's part of a
+    goal on its own ("parts"), store relabelled copies ("augment"), or do without"""
+    her_ratio: Ratio = 0.8
+    """the ratio of relabelled transitions, k / (k + 1): k = 4 goals per transition"""
+    desired_ratio: Ratio = 0.0
+    """of these, the ratio that get the desired goal of another transition instead of
+    one that their episode reached later"""
+    seed: Seed = 0
+    """the seed of the environments, the networks and the sampling"""
+    num_envs: Positive = 4
+    """the number of environments that are stepped in parallel"""
+    total_steps: Count = 10_000
+    """environment steps, over all environments; 0 stops after `pretrain_updates`"""
+    updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
-    batch_size: int = 256
+    batch_size: Positive = 256
     """transitions per gradient step"""
-    demos: Path | None = None
-    """transitions to learn from beside one's own, as examples/experts.py writes them"""
-    demo_ratio: float = 0.25
-    """share of each batch that is drawn from them"""
-    demo_her_ratio: float = 0.0
-    """share of those that get what their episode achieved at its end for a goal, as if
-    the expert had never missed"""
-    pretrain_updates: int = 0
-    """gradient steps that only imitate them, before the first step of the environments;
-    the learning rate falls to 0 in them"""
     anneal_lr: bool = False
     """let the learning rate fall to 0, linearly, until the last step"""
-    keep_unmoved: float = 1.0
-    """share of the episodes in which nothing moved that are stored (filtered HER, see
-    arXiv 2012.08850): every goal that they could be given is reached without acting"""
-    start_at_object: float = 0.0
-    """share of the training episodes that begin with the hand at an object: holding it,
-    or beside it if the gripper is blocked (see examples/starts.py)"""
-    buffer_size: int = 1_000_000
-    """transitions in the replay buffer"""
-    eval_interval: int = 1_000
+    start_at_object: Ratio = 0.0
+    """the ratio of training episodes that begin in the course of the task: with the
+    hand at an object, or holding it, or, of Stack, holding the second when the first
+    is placed (see examples/training/starts.py)"""
+    demos: Path | None = None
+    """a file of demonstrations to learn from beside one's own transitions"""
+    demo_ratio: Ratio = 0.25
+    """the ratio of each batch that is drawn from the demonstrations"""
+    pretrain_updates: Count = 0
+    """gradient steps that only imitate the demonstrations, before the first step of the
+    environments; the learning rate falls to 0 in them"""
+    eval_interval: Positive = 400
     """environment steps between evaluations"""
-    eval_episodes: int = 80
-    """fresh episodes per evaluation"""
-    save_interval: int = 20_000
-    """environment steps, or imitating gradient steps, between the states that --resume
-    starts from; Ctrl-C saves one, too"""
     out: Path | None = None
-    """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
+    """the folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
     resume: bool = False
-    """continue the run in that folder, with the same other arguments"""
-    tensorboard: bool = False
-    """log to TensorBoard, too"""
+    """continue the run in that folder, with the same other options"""
+    device: str = "cpu"
+    """the device of the networks and the replay buffer"""
     video: bool = True
-    """at the end, record 6 episodes"""
-
-
-PRESETS = {
-    "paper": Args(),
-    "tuned": Args(
-        preset="tuned",
-        num_envs=8,
-        gamma=0.95,
-        keep_unmoved=0.1,
-        max_random_eps=1.0,
-        relative_inputs=True,
-        mirror=True,
-        shift=0.15,
-    ),
-}
-# What may differ between a run and its continuation.
-FREE_ARGUMENTS = {
-    "resume",
-    "out",
-    "num_threads",
-    "tensorboard",
-    "save_interval",
-    "video",
-}
-RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
-SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
-SAVED_KEYS = [
-    *("args", "agent", "optimizer", "updates", "pretrained", "buffer", "demos"),
-    *("random", "cuda_random", "curve", "steps", "seconds"),
-]
-STORED_KEYS = [
-    "observation",
-    "desired_goal",
-    "action",
-    ("collector", "traj_ids"),
-    ("next", "observation"),
-    ("next", "achieved_goal"),
-    ("next", "desired_goal"),
-    ("next", "reward"),
-    ("next", "terminated"),
-    ("next", "done"),
-]
+    """record 6 episodes at the end"""
 
 
 class Run:
-    """A training: what it is made of, and what a continuation needs to know."""
+    """A training: what it is made of, and the algorithm.
+
+    Args:
+        args: the options.
+        out: the folder of the results.
+
+    Raises:
+        ValueError: options do not fit each other, the task or the files.
+    """
 
     def __init__(self, args: Args, out: Path) -> None:
-        self.args = args
-        self.out = out
-        self.env = torch_panda.make(
-            args.env_id,
-            num_envs=args.num_envs,
-            num_threads=args.num_threads,
-            device=args.device,
-        )
-        self.eval_env = torch_panda.make(
-            args.env_id,
-            num_envs=min(16, args.eval_episodes),
-            num_threads=args.num_threads,
-            device=args.device,
-        )
-        torch.set_num_threads(args.torch_threads)
-        torch.set_float32_matmul_precision(args.matmul_precision)
+        self.args, self.out = args, out
+        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+        # Permits bfloat16; on CPUs with AVX-512 it selects oneDNN, up to twice as fast.
+        torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
-        self.agent = Agent(
+        self.env = torch_panda.make(
+            args.env_id, num_envs=args.num_envs, device=args.device
+        )
+        self.agent = make_agent(self.env, args)
+        iteration = args.num_envs * self.env.max_episode_steps
+        self.buffer = make_buffer(
             self.env,
-            args,
-            max_episode_steps=self.env.max_episode_steps,
-            sparse="Dense" not in args.env_id,
-        ).to(args.device)
-        self.buffer = make_buffer(args, self.env)
-        self.demos: TensorDictReplayBuffer | None = None
+            args.total_steps + iteration,
+            her=args.her,
+            her_ratio=args.her_ratio,
+            desired_ratio=args.desired_ratio,
+            seed=args.seed,
+        )
         self.num_demos = 0  # of each batch
         if args.demos is not None:
             demos = read_demos(args.demos, self.env)
-            self.demos = TensorDictReplayBuffer(
-                storage=LazyTensorStorage(len(demos), device=args.device),
-                transform=HindsightRelabel.from_env(
-                    self.env,
-                    success_fn=None,
-                    her_ratio=args.demo_her_ratio,
-                    strategy="final",
-                    seed=args.seed,
-                ),
-            )
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
-            self.demos.extend(demos)
+            self.demos = make_demo_buffer(demos)
             self.num_demos = round(args.demo_ratio * args.batch_size)
-            if self.num_demos >= args.batch_size:
-                raise ValueError(
-                    f"a demo_ratio of {args.demo_ratio} leaves no room for transitions "
-                    f"of one's own in a batch of {args.batch_size}"
-                )
-        self.pretrained = 0  # gradient steps
-        self.curve: list[dict[str, float]] = []
-        self.steps = 0
-        self.seconds = 0.0
-        # Made before `load`, because making it draws random numbers.
-        self.collector = self.make_collector()
-
-    def train(self, stop: "StopSignal | None" = None) -> bool:
-        """Collect, learn and evaluate until the last step, or until told to stop.
-
-        Returns:
-            whether the last step was reached.
-        """
-        args, out = self.args, self.out
-        loggers: list[Logger] = [CSVLogger("log", log_dir=str(out))]
-        if args.tensorboard:
-            loggers.append(TensorboardLogger("tensorboard", log_dir=str(out)))
-        started = time.perf_counter() - self.seconds
-        if not self.pretrain(stop):
-            return False
-        if self.steps >= args.total_steps:  # none wanted, or resumed at the end
-            return True
-        progress = tqdm(
-            initial=self.steps,
-            total=args.total_steps,
-            unit="step",
-            desc=f"{args.env_id} {args.algo}",
-        )
-        self.show(progress)
-        self.reseed(self.env)
-        for data in self.collector:
-            before, self.steps = self.steps, self.steps + data.numel()
-            losses = self.learn(data)
-            progress.update(data.numel())
-            self.seconds = time.perf_counter() - started
-            finished = self.steps >= args.total_steps
-            if finished or crossed(args.eval_interval, before, self.steps):
-                self.evaluate()
-                self.show(progress)
-                for logger in loggers:
-                    for key, value in {**self.curve[-1], **losses}.items():
-                        logger.log_scalar(key, value, step=self.steps)
-            if finished or stop or crossed(args.save_interval, before, self.steps):
-                replace(out / "resume.pt", self.save)
-            if finished or stop:
-                break
-            self.reseed(self.env)
-        progress.close()
-        return self.steps >= args.total_steps
-
-    def pretrain(self, stop: "StopSignal | None") -> bool:
-        """Imitate the demonstrations, if asked to, and evaluate.
-
-        Returns:
-            whether this is done.
-        """
-        count, batch_size = self.args.pretrain_updates, self.args.batch_size
-        if self.pretrained == count:
-            return True
-        assert self.demos is not None
-        started = time.perf_counter() - self.seconds
-        progress = tqdm(
-            initial=self.pretrained, total=count, unit="update", desc="imitation"
-        )
-        while self.pretrained < count and not stop:
-            self.set_learning_rate(1 - self.pretrained / count)
-            loss = self.agent.imitate(self.demos.sample(batch_size))
-            self.pretrained += 1
-            progress.update()
-            if self.pretrained % 1000 == 0:
-                progress.set_postfix(loss=f"{loss:.2g}")
-            due = self.pretrained % self.args.save_interval == 0
-            if due and self.pretrained < count:  # the end is saved below
-                self.seconds = time.perf_counter() - started
-                replace(self.out / "resume.pt", self.save)
-        progress.close()
-        self.set_learning_rate(1.0)
-        self.seconds = time.perf_counter() - started
-        if self.pretrained == count:
-            self.evaluate()
-        replace(self.out / "resume.pt", self.save)
-        return self.pretrained == count
-
-    def make_collector(self) -> Collector:
-        """Whole episodes of all environments, one batch [num_envs, steps] each time."""
         env: EnvBase = self.env
-        if self.args.start_at_object:
-            states = states_at_objects(self.args.env_id, seed=self.args.seed)
-            start = StartFrom(states, self.args.start_at_object)
-            env = TransformedEnv(env, start)
-        return Collector(
+        if args.start_at_object:
+            states = states_at_objects(args.env_id, seed=args.seed)
+            env = TransformedEnv(env, StartFrom(states, args.start_at_object))
+        # Whole episodes of all environments, one batch [num_envs, steps] each time.
+        self.collector = Collector(
             env,
             self.agent.explore,
-            frames_per_batch=self.args.num_envs * self.env.max_episode_steps,
+            frames_per_batch=iteration,
             total_frames=-1,
             reset_at_each_iter=True,
             exploration_type=ExplorationType.RANDOM,
             auto_register_policy_transforms=True,
         )
+        self.curve = Curve(args.env_id, self.agent, out, device=args.device)
+        self.progress = Progress()
+        self.checkpoint = Checkpoint(
+            out / "resume.pt", args, self.agent, self.buffer, self.progress
+        )
+        if args.resume:
+            self.checkpoint.load()
 
-    def learn(self, data: TensorDictBase) -> dict[str, float]:
-        """Store the episodes and take the gradient steps that are due for them.
+    def train(self, stop: object = False) -> bool:
+        """Learn until the last step, or until ``stop`` is true after an iteration.
+
+        Returns:
+            whether the last step was reached.
+        """
+        args, progress, checkpoint = self.args, self.progress, self.checkpoint
+        if not progress.curve:
+            self.curve.add(progress)  # the untrained policy
+            checkpoint.save()
+        if progress.pretrained < args.pretrain_updates:
+            count, size = args.pretrain_updates, args.batch_size
+            pretrain(checkpoint, self.demos, updates=count, batch_size=size, stop=stop)
+            if progress.pretrained < count:
+                return False
+            self.curve.add(progress)
+            checkpoint.save()
+
+        bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
+        bar.set_description(f"{args.env_id} {args.algo}")
+        finished = stopped = progress.steps >= args.total_steps
+        episodes = iter(self.collector)
+        while not stopped:
+            started, before = time.perf_counter(), progress.steps
+            reseed(self.env)
+            data = next(episodes)
+            progress.steps += data.numel()
+            self.store(data)
+            losses = self.learn()
+            progress.seconds += time.perf_counter() - started
+
+            bar.update(data.numel())
+            finished = progress.steps >= args.total_steps
+            if finished or crossed(args.eval_interval, before, progress.steps):
+                self.curve.add(progress, losses)
+            bar.set_postfix(success=progress.success)
+            stopped = finished or bool(stop)
+            if stopped or crossed(SAVE_INTERVAL, before, progress.steps):
+                checkpoint.save()
+        bar.close()
+        return finished
+
+    def store(self, data: TensorDictBase) -> None:
+        """Put episodes [num_envs, steps] into the buffer and into the statistics."""
+        keep_unmoved = KEEP_UNMOVED if self.args.preset == "tuned" else 1.0
+        data = select_episodes(data, keep_unmoved)
+        if len(data):
+            stored = self.buffer[self.buffer.extend(data.reshape(-1))]
+            # As in Baselines, the statistics are of relabelled episodes.
+            normalizer = self.agent.normalizer
+            normalizer.update(stored["observation"], stored["desired_goal"])
+
+    def learn(self) -> dict[str, float]:
+        """Take the gradient steps that are due.
 
         Returns:
             the mean of each loss.
         """
-        # The next batch begins with a reset: an episode that is not over is cut here.
-        data["next", "done"][:, -1] = True
-        data = data.select(*STORED_KEYS)
-        if self.args.keep_unmoved < 1:
-            lucky = torch.rand(len(data)) < self.args.keep_unmoved
-            data = data[moved(data) | lucky.to(data.device)]
-            if not len(data):
-                return {}
-        stored = self.buffer[self.buffer.extend(data.reshape(-1))]
-        # As in Baselines, the statistics are of relabelled episodes.
-        self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
-        due = int(self.steps * self.args.updates_per_step) - self.agent.updates
-        losses: dict[str, list[Tensor]] = {}
-        for _ in range(due):
-            if self.args.anneal_lr:
-                last = self.args.updates_per_step * self.args.total_steps
+        args, agent = self.args, self.agent
+        losses: dict[str, list[Tensor]] = defaultdict(list)
+        due = int(self.progress.steps * args.updates_per_step) - agent.updates
+        for _ in range(due if len(self.buffer) else 0):
+            if args.anneal_lr:
+                last = args.updates_per_step * args.total_steps
                 # The last iteration may go beyond the last step.
-                self.set_learning_rate(max(0.0, 1 - self.agent.updates / last))
-            for key, loss in self.agent.update(*self.sample()).items():
-                losses.setdefault(key, []).append(loss)
+                agent.set_learning_rate(max(0.0, 1 - agent.updates / last))
+            batch = self.buffer.sample(args.batch_size - self.num_demos)
+            demos = self.demos.sample(self.num_demos) if self.num_demos else None
+            for key, loss in agent.update(batch, demos).items():
+                losses[key].append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
-
-    def set_learning_rate(self, share: float) -> None:
-        """Let the next gradient steps have so much of the learning rate."""
-        for group in self.agent.optimizer.param_groups:
-            group["lr"] = share * self.args.learning_rate
-
-    def sample(self) -> list[TensorDictBase]:
-        """A batch of the run's own transitions, and one of demonstrations if any."""
-        batches = [self.buffer.sample(self.args.batch_size - self.num_demos)]
-        if self.demos is not None and self.num_demos:
-            batches.append(self.demos.sample(self.num_demos))
-        return batches
-
-    def evaluate(self) -> None:
-        """Add a point to the curve, and write and draw it."""
-        self.reseed(self.eval_env)
-        result = evaluate(self.eval_env, self.agent.policy, self.args.eval_episodes)
-        row = {
-            "step": self.steps,
-            "success": float(result.success.float().mean()),
-            "ever_success": float(result.ever.float().mean()),
-            "return": float(result.episode_return.mean()),
-            "updates": self.agent.updates,
-            "seconds": round(self.seconds, 2),
-        }
-        self.curve.append(row)
-        with (self.out / "curve.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(row))
-            writer.writeheader()
-            writer.writerows(self.curve)
-        plot_curve(self.curve, self.args.env_id, self.out / "curve.png")
-        save_policy(self.out / "checkpoint.pt", self.agent, self.args.env_id)
-
-    def reseed(self, env: torch_panda.RobotTaskEnv) -> None:
-        """Make the next episodes follow from the random state that is saved."""
-        env.set_seed(int(torch.randint(2**62, ())))
-
-    def show(self, progress: tqdm) -> None:
-        """Show the last success rate beside the progress."""
-        if self.curve:
-            progress.set_postfix(success=f"{self.curve[-1]['success']:.0%}")
-
-    def save(self, path: Path) -> None:
-        """Write all that changes in a run."""
-        state = {
-            "args": fixed(self.args),
-            "agent": self.agent.state_dict(),
-            "optimizer": self.agent.optimizer.state_dict(),
-            "updates": self.agent.updates,
-            "pretrained": self.pretrained,
-            "buffer": self.buffer.state_dict(),
-            "demos": None if self.demos is None else self.demos.state_dict(),
-            "random": torch.get_rng_state(),
-            "cuda_random": torch.cuda.get_rng_state_all(),
-            "curve": self.curve,
-            "steps": self.steps,
-            "seconds": self.seconds,
-        }
-        torch.save(state, path)
-
-    def load(self, path: Path) -> None:
-        """Take what `save` wrote.
-
-        Raises:
-            ValueError: it is the state of a run with other arguments, or damaged.
-        """
-        state = read(path, "the state of a run", SAVED_KEYS)
-        ours, theirs = fixed(self.args), state["args"]
-        differing = [
-            f"{key} was {theirs.get(key)!r}, is {value!r}"
-            for key, value in ours.items()
-            if theirs.get(key) != value
-        ]
-        if differing:
-            raise ValueError(f"cannot resume {path.parent}: {'; '.join(differing)}")
-        self.agent.load_state_dict(state["agent"])
-        self.agent.optimizer.load_state_dict(state["optimizer"])
-        self.agent.updates = state["updates"]
-        self.pretrained = state["pretrained"]
-        self.buffer.load_state_dict(state["buffer"])
-        if self.demos is not None:
-            self.demos.load_state_dict(state["demos"])
-        torch.set_rng_state(state["random"])
-        torch.cuda.set_rng_state_all(state["cuda_random"])
-        self.curve = state["curve"]
-        self.steps = state["steps"]
-        self.seconds = state["seconds"]
 
     def close(self) -> None:
         """Free the environments."""
         self.collector.shutdown()
-        self.eval_env.close()
+        self.curve.close()
 
 
-class StopSignal:
-    """True after Ctrl-C or a SIGTERM; a second one ends the program as usual."""
-
-    def __init__(self) -> None:
-        self.received = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._receive)
-
-    def _receive(self, number: int, frame: object) -> None:
-        self.received = True
-        self.release()
-        tqdm.write("stopping after this iteration; again to stop at once")
-
-    def release(self) -> None:
-        """Let the signals act as usual."""
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-    def __bool__(self) -> bool:
-        return self.received
-
-
-def read_demos(path: Path, env: torch_panda.RobotTaskEnv) -> TensorDictBase:
-    """Transitions (n,) of whole episodes.
-
-    Raises:
-        ValueError: the file holds none, or none of such an environment.
-    """
-    content = read(path, "demonstrations", STORED_KEYS)
-    try:
-        demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
-    except (RuntimeError, TypeError) as error:  # other lengths, or no tensors
-        raise ValueError(f"{path} does not hold demonstrations: {error}") from None
-    if not len(demos):
-        raise ValueError(f"{path} holds no transitions")
-    for key in ("observation", "action", "desired_goal"):
-        expected = env.full_observation_spec.get(key, None)
-        size = (env.action_spec if expected is None else expected).shape[-1]
-        if demos[key].shape[-1] != size:
-            raise ValueError(
-                f"{path}: {key} has size {demos[key].shape[-1]}, the task's has {size}"
-            )
-    return demos.to(env.device)
-
-
-def make_buffer(args: Args, env: torch_panda.RobotTaskEnv) -> TensorDictReplayBuffer:
-    """The replay buffer with the chosen kind of hindsight."""
-    iteration = args.num_envs * env.max_episode_steps
-    capacity = min(args.buffer_size, args.total_steps + iteration)
-    transform: HindsightRelabel | HindsightAugment | None = None
-    if args.her == "relabel":
-        transform = HindsightRelabel.from_env(
-            env, success_fn=None, her_ratio=args.her_ratio, seed=args.seed
-        )
-    elif args.her == "augment":
-        k = round(args.her_ratio / (1 - args.her_ratio))
-        transform = HindsightAugment.from_env(env, success_fn=None, k=k, seed=args.seed)
-        capacity *= k + 1
-    return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, device=args.device), transform=transform
-    )
-
-
-def moved(data: TensorDictBase) -> Tensor:
-    """Which episodes [num_envs, steps] saw their achieved goal change, (num_envs,).
-
-    By more than 1 cm (or 0.01 in a quaternion) after the objects have settled.
-    """
-    goal = data["next", "achieved_goal"]
-    return ((goal - goal[:, SETTLED : SETTLED + 1]).abs() > 0.01).flatten(1).any(1)
-
-
-def crossed(interval: int, before: int, after: int) -> bool:
-    """Whether a multiple of ``interval`` lies in (before, after]."""
-    return before // interval < after // interval
-
-
-def fixed(args: Args) -> dict[str, Any]:
-    """The arguments that a continuation must share."""
-    every = json.loads(json.dumps(asdict(args), default=str))
-    return {key: value for key, value in every.items() if key not in FREE_ARGUMENTS}
-
-
-def check(args: Args, out: Path) -> None:
+def check(args: Args) -> None:
     """Refuse options that would end the training later.
 
     Raises:
@@ -515,42 +249,39 @@ def check(args: Args, out: Path) -> None:
         raise ValueError("pretrain_updates needs demos to imitate")
     if not args.total_steps and not args.pretrain_updates:
         raise ValueError("total_steps must be positive without pretrain_updates, got 0")
-    if args.her == "augment" and not 1 / 3 < args.her_ratio < 1:
+    if args.demos and round(args.demo_ratio * args.batch_size) >= args.batch_size:
         raise ValueError(
-            "with --her augment, which stores her_ratio / (1 - her_ratio) copies, "
-            f"her_ratio must be above 1/3 and below 1, got {args.her_ratio}"
+            f"a demo_ratio of {args.demo_ratio} leaves no room for transitions of "
+            f"one's own in a batch of {args.batch_size}"
         )
-    if args.resume and not (out / "resume.pt").exists():
-        raise ValueError(f"there is no run to resume in {out}")
-    if not args.resume and any((out / name).exists() for name in RESULTS):
-        raise ValueError(
-            f"{out} holds a run: continue it with --resume, remove it, or choose "
-            "another folder with --out"
-        )
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"out must be a folder, got the file {out}")
-    if args.tensorboard and find_spec("tensorboard") is None:
-        raise ValueError("--tensorboard needs another package: pip install tensorboard")
-    try:
-        torch.zeros(1, device=args.device).item()
-    except (RuntimeError, AssertionError, ImportError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            "device must be one that torch can use here, such as cpu, "
-            f"got {args.device!r}: {reason}"
-        ) from None
+    check_device(args.device)
+
+
+def default_args(preset: str, env_id: str) -> Args:
+    """The options of a preset for a task."""
+    if preset == "paper":
+        return Args(env_id=env_id)
+    return Args(preset="tuned", env_id=env_id, **find_recipe(env_id))
+
+
+def parse(arguments: list[str] | None = None) -> Args:
+    """Read the command line; preset and task say what other options default to."""
+    given = tyro.cli(Args, args=arguments)
+    default = default_args(given.preset, given.env_id)
+    return tyro.cli(Args, args=arguments, default=default)
 
 
 def main(args: Args) -> None:
     """Train, and say where the results are."""
     out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
     try:
-        check(args, out)
+        check(args)
+        check_folder(out, resume=args.resume)
         run = Run(args, out)
-        if args.resume:
-            run.load(out / "resume.pt")
         out.mkdir(parents=True, exist_ok=True)
-        (out / "args.json").write_text(json.dumps(asdict(args), default=str, indent=2))
+        default = default_args(args.preset, args.env_id)
+        options = {**asdict(args), "changed": find_changes(args, default)}
+        (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
     stop = StopSignal()
@@ -558,21 +289,17 @@ def main(args: Args) -> None:
     stop.release()
     run.close()
     if finished and args.video:
-        with torch_panda.make(
-            args.env_id, num_envs=6, seed=args.seed, device=args.device
-        ) as env:
-            try:
+        options = {"num_envs": 6, "seed": args.seed, "device": args.device}
+        try:
+            with torch_panda.make(args.env_id, **options) as env:
                 record(env, run.agent.policy, out / "video.mp4")
-            except KeyboardInterrupt:
-                print("no video")
-    if run.curve:
-        success = run.curve[-1]["success"]
-        print(f"success {success:.0%} after {run.steps} steps; see {out}")
+        except KeyboardInterrupt:
+            print("no video")
+    progress = run.progress
+    print(f"success {progress.success} after {progress.steps} steps; see {out}")
     if not finished:
         print(f"stopped and saved in {out}: the same command with --resume goes on")
 
 
 if __name__ == "__main__":
-    # Parsed twice: the preset says what the other options default to.
-    preset = tyro.cli(Args).preset
-    main(tyro.cli(Args, default=PRESETS[preset]))
+    main(parse())

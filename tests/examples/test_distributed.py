@@ -14,6 +14,7 @@ import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torch_panda.transforms import HindsightRelabel
+from training import curve
 
 ray = pytest.importorskip("ray")
 
@@ -52,7 +53,7 @@ def address():
 
 
 @pytest.fixture
-def start(distributed, address):
+def start(distributed, address, tmp_path, monkeypatch):
     """Make a learner with two workers, one on each node."""
     learners = []
     threads = torch.get_num_threads()
@@ -60,12 +61,14 @@ def start(distributed, address):
 
     def start(**options):
         args = distributed.Args(
-            address=address, num_envs=4, eval_episodes=4, eval_interval=10**6, **options
+            address=address, num_envs=4, eval_interval=10**6, **options
         )
         distributed.connect(args)
-        learners.append(distributed.Learner(args))
+        learners.append(distributed.Learner(args, tmp_path))
         return learners[0]
 
+    monkeypatch.setattr(curve, "EPISODES", 4)
+    monkeypatch.setattr(curve, "NUM_ENVS", 4)
     yield start
     for learner in learners:
         learner.close()
@@ -76,7 +79,7 @@ def start(distributed, address):
 def goals_of_others(buffer, true_ids):
     """Which relabelled rows of a few samples have another trajectory's goal."""
     stored = buffer.storage[:]
-    batch = torch.cat([buffer.sample() for _ in range(4)])
+    batch = torch.cat([buffer.sample(256) for _ in range(4)])
     row = batch["index"]
     goal = batch["desired_goal"]
     relabelled = (goal != stored["desired_goal"][row]).any(-1)
@@ -91,9 +94,10 @@ def test_workers_fill_one_buffer(distributed, start, tmp_path):
     assert len(ray.nodes()) == 2
     assert ray.available_resources().get("CPU", 0) == 0
     first = {k: v.clone() for k, v in learner.agent.explore.state_dict().items()}
-    learner.train(tmp_path)
+    learner.train()
 
-    assert learner.steps == 800
+    assert learner.progress.steps == 800
+    assert [row["step"] for row in learner.progress.curve] == [0, 800]
     assert learner.agent.updates == 80
     assert (tmp_path / "checkpoint.pt").exists()
     stored = learner.buffer.storage[:]
@@ -119,8 +123,7 @@ def test_workers_fill_one_buffer(distributed, start, tmp_path):
     # The workers' own numbers collide: with them, goals do get mixed.
     colliding = TensorDictReplayBuffer(
         storage=LazyTensorStorage(800),
-        transform=HindsightRelabel(learner.eval_env.compute_reward),
-        batch_size=256,
+        transform=HindsightRelabel(learner.env.compute_reward),
     )
     copy = stored.select(*stored.keys(True, True)).exclude("index", "hindsight_serial")
     colliding.extend(copy.set(IDS, copy[IDS] // 2))
@@ -135,7 +138,7 @@ def test_a_dead_worker_is_an_error(start, tmp_path):
     learner = start(total_steps=100_000, updates_per_step=0.0)
     ray.kill(learner.collector.remote_collectors[1])
     with pytest.raises(ray.exceptions.RayActorError):
-        learner.train(tmp_path)
+        learner.train()
 
 
 def test_too_small_a_cluster_is_an_error(distributed, address):
@@ -149,7 +152,7 @@ def test_interrupt_leaves_nothing_running(tmp_path):
     mark = str(uuid.uuid4())
     arguments = (
         *("--total-steps", "1000000", "--eval-interval", "200", "--num-envs", "4"),
-        *("--eval-episodes", "4", "--updates-per-step", "0.1", "--out", tmp_path),
+        *("--updates-per-step", "0.1", "--out", tmp_path),
     )
     process = subprocess.Popen(
         [sys.executable, EXAMPLES / "distributed.py", *arguments],

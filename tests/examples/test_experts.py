@@ -1,25 +1,18 @@
 """The scripted experts: they solve their tasks, from observations alone."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import experts
+import record_demos
 import torch_panda
-from torch_panda.transforms import HindsightRelabel
-
-FILE = experts.__file__
 
 
 def successes(env_id, episodes, seed):
     """Success at the end of each episode, and the episodes."""
     with torch_panda.make(env_id, num_envs=episodes, seed=seed) as env:
-        episodes = experts.play(env, experts.make_expert(env_id))
+        episodes = record_demos.play(env, experts.make_expert(env_id))
     return [bool(episode["next", "success"][-1]) for episode in episodes], episodes
 
 
@@ -80,41 +73,7 @@ def test_collectors_take_an_expert():
     assert data["next", "success"][:, [49, 99]].all()
 
 
-def test_demonstrations_extend_a_replay_buffer(tmp_path):
-    out = tmp_path / "demos.pt"
-    arguments = ["--env-id", "PandaPush-v3", "--episodes", "6", "--num-envs", "4"]
-    result = subprocess.run(
-        [sys.executable, FILE, *arguments, "--out", out],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert "success at the end" in result.stdout
-    demonstrations = TensorDict(torch.load(out)).auto_batch_size_(1)
-    ids = demonstrations["collector", "traj_ids"]
-    assert ids.unique().tolist() == list(range(6))
-    last = demonstrations["next", "done"].squeeze(-1)
-    assert ids[last].tolist() == list(range(6))
-
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(1000),
-        transform=HindsightRelabel(torch_panda.Push().compute_reward, seed=0),
-        batch_size=64,
-    )
-    buffer.extend(demonstrations)
-    batch = buffer.sample()
-    assert batch["desired_goal"].shape == (64, 3)
-    assert (batch["next", "reward"] == 0).any()
-
-
 @pytest.mark.parametrize("env_id", ["PandaPushJoints-v1", "PandaFly-v1", "Push"])
 def test_ids_without_an_expert(env_id):
     with pytest.raises(ValueError, match="no expert for"):
         experts.make_expert(env_id)
-
-
-def test_wilson_interval():
-    # The textbook value for 8 of 10.
-    low, high = experts.wilson_interval(8, 10)
-    assert low == pytest.approx(0.490, abs=1e-3)
-    assert high == pytest.approx(0.943, abs=1e-3)

@@ -1,15 +1,13 @@
 """What stepping and learning at once would gain: pytest -m slow -s this file."""
 
-import copy
 import statistics
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import pytest
 import torch
 
-from train import PRESETS, Run
+from train import Run, default_args
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ROUNDS = 7
@@ -17,15 +15,11 @@ ROUNDS = 7
 
 @pytest.fixture
 def run(tmp_path):
-    args = replace(
-        PRESETS["tuned"], env_id="PandaPush-v1", updates_per_step=0, keep_unmoved=1
-    )
+    args = default_args("tuned", "PandaPush-v1")
+    args.updates_per_step = 0
+    args.preset = "paper"  # stores all episodes
     threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     run = Run(args, tmp_path)
-    # torchrl's losses put other weights into the modules for a moment.
-    run.agent.explore = copy.deepcopy(run.agent.explore)
-    run.collector.shutdown(close_env=False)
-    run.collector = run.make_collector()
     yield run
     run.close()
     torch.set_num_threads(threads)
@@ -46,7 +40,7 @@ def test_taking_turns_loses_little(run):
     """
     batches = iter(run.collector)
     data = next(batches)
-    run.learn(data)
+    run.store(data)
     updates = data.numel() // 2
 
     def step():
@@ -54,7 +48,7 @@ def test_taking_turns_loses_little(run):
 
     def update():
         for _ in range(updates):
-            run.agent.update(*run.sample())
+            run.agent.update(run.buffer.sample(run.args.batch_size))
 
     def take_turns():
         step()

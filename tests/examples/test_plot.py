@@ -9,20 +9,38 @@ import matplotlib.pyplot as plt
 import pytest
 
 import plot
-from train import Args
+from train import Args, default_args
+from training.recipes import find_changes
+
+POINT = {"step": 0.5, "success": 0.5, "ever_success": 0.5, "return": -40.0}
+
+
+def write_run(folder, args, rows=(POINT,)):
+    folder.mkdir(parents=True)
+    default = default_args(args.preset, args.env_id)
+    options = {**asdict(args), "changed": find_changes(args, default)}
+    (folder / "args.json").write_text(json.dumps(options, default=str))
+    with (folder / "curve.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*rows[-1]])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 @pytest.fixture
 def runs(tmp_path):
     for seed in range(2):
-        folder = tmp_path / "runs" / str(seed)
-        folder.mkdir(parents=True)
-        (folder / "args.json").write_text(json.dumps(asdict(Args(seed=seed))))
-        with (folder / "curve.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, ["step", "success", "ever_success", "return"])
-            writer.writeheader()
-            writer.writerow(dict.fromkeys(writer.fieldnames, 0.5) | {"return": -40.0})
+        write_run(tmp_path / "runs" / str(seed), Args(seed=seed))
     return tmp_path / "runs"
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """What is drawn, before it is closed."""
+    drawn = []
+    with monkeypatch.context() as patch:
+        patch.setattr(plt, "close", drawn.append)
+        yield drawn
+    plt.close("all")
 
 
 @pytest.mark.parametrize(
@@ -33,18 +51,73 @@ def runs(tmp_path):
         ("return", "return", -40.0),
     ],
 )
-def test_every_metric_is_seen(runs, tmp_path, monkeypatch, metric, label, shown):
-    figures = []
-    monkeypatch.setattr(plt, "close", figures.append)
+def test_every_metric_is_seen(runs, tmp_path, figures, metric, label, shown):
     plot.main(plot.Args(runs=[runs], metric=metric, out=tmp_path / "new" / "curves"))
-    monkeypatch.undo()
     assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
     (axes,) = figures[0].axes
     assert axes.get_ylabel() == label
     low, high = axes.get_ylim()
     assert low < shown < high
     assert axes.lines[0].get_ydata().tolist() == [shown]
-    plt.close("all")
+
+
+def lines_of(axes):
+    return [line.get_label() for line in axes.lines]
+
+
+def test_a_panel_has_four_lines_that_can_be_told_apart(tmp_path, figures):
+    ways = [
+        *({}, {"her": "none"}, {"double_q": False}, {"batch_size": 64}),
+        *({"anneal_lr": True}, {"demos": Path("demos.pt")}),
+    ]
+    for task in ("Push", "Slide"):
+        for algo in ("td3", "sac"):
+            for way in ways[: 6 if algo == "sac" else 3]:
+                for seed in range(2):
+                    args = Args(env_id=f"Panda{task}-v1", algo=algo, seed=seed, **way)
+                    name = f"{task}-{algo}-{ways.index(way)}-{seed}"
+                    write_run(tmp_path / name, args)
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    panels = {}
+    for axes in figures[0].axes:
+        panels.setdefault(axes.get_title(), []).append(axes)
+    assert {name: list(map(lines_of, some)) for name, some in panels.items()} == {
+        f"Panda{task}-v1, {algo}": [
+            [f"{line} (2 seeds)" for line in lines] for lines in expected
+        ]
+        for task in ("Push", "Slide")
+        for algo, expected in {
+            "SAC": [
+                ["paper", "paper, anneal lr", "paper, batch size 64", "paper, demos"],
+                ["paper, no double q", "paper, no her"],
+            ],
+            "TD3": [["paper", "paper, no double q", "paper, no her"]],
+        }.items()
+    }
+    looks = {}
+    for axes in figures[0].axes:
+        for line in axes.lines:
+            look = (line.get_color(), line.get_linestyle())
+            assert looks.setdefault(line.get_label(), look) == look
+    assert len(set(looks.values())) == len(looks) == 6
+
+
+def test_band_over_the_steps_that_all_seeds_have(tmp_path, figures):
+    curves = [
+        {0: 0.0, 100: 0.2, 200: 0.4, 300: 0.6},
+        {0: 0.1, 200: 0.8},  # evaluated less often
+        {0: 0.2, 100: 0.5, 200: 0.6, 300: 0.7, 400: 1.0},
+    ]
+    for seed, curve in enumerate(curves):
+        rows = [{"step": step, "success": value} for step, value in curve.items()]
+        write_run(tmp_path / str(seed), Args(seed=seed), rows)
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    (axes,) = figures[0].axes
+    (line,) = axes.lines
+    assert line.get_xydata().tolist() == [[0, 0.1], [200, 0.6]]
+    (band,) = axes.collections
+    heights = {tuple(point) for point in band.get_paths()[0].vertices.round(6).tolist()}
+    assert {(0.0, 0.05), (0.0, 0.15), (200.0, 0.5), (200.0, 0.7)} <= heights
 
 
 def spoil_arguments(folder):

@@ -1,5 +1,8 @@
-"""Time to learn beside Stable-Baselines3: pytest -m slow -s <this file>."""
+"""What a gradient step and learning cost: pytest -m slow -s <this file>."""
 
+import copy
+import itertools
+import statistics
 import time
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,12 +16,153 @@ from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.objectives import DDPGLoss
 
+import torch_panda
+from agents import Hyperparameters, make_agent
+from agents.base import LEARNING_RATE, TAU
+from agents.networks import HIDDEN_SIZE
+from agents.normalizer import CLIP_NORMALIZED
+from tests.examples.agents.transitions import make_transitions
 from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
-from train import PRESETS, Args, Run
+from train import Args, Run, default_args
+from training.buffers import BUFFER_SIZE
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
 EPISODES = 80
+ROUNDS = 100
+
+
+class PlainDDPG:
+    """The arithmetic of our gradient step in plain torch, of networks of its own."""
+
+    def __init__(self, batch, gamma):
+        self.batch, self.gamma = batch, gamma
+        states = batch["observation"].shape[-1] + batch["desired_goal"].shape[-1]
+        actions = batch["action"].shape[-1]
+        self.mean, self.std = torch.zeros(states), torch.ones(states)
+        self.actor = self.mlp(states, actions, nn.Tanh())
+        self.critic = self.mlp(states + actions, 1)
+        nets = nn.ModuleList([self.actor, self.critic])
+        self.targets = copy.deepcopy(nets).requires_grad_(False)
+        self.online, self.target = list(nets.parameters()), [*self.targets.parameters()]
+        self.optimizer = torch.optim.Adam(self.online, lr=LEARNING_RATE, fused=True)
+
+    @staticmethod
+    def mlp(inputs, outputs, *last):
+        sizes = [inputs] + [HIDDEN_SIZE] * 3
+        layers = [
+            layer
+            for n, m in itertools.pairwise(sizes)
+            for layer in (nn.Linear(n, m), nn.ReLU())
+        ]
+        return nn.Sequential(*layers, nn.Linear(HIDDEN_SIZE, outputs), *last)
+
+    def normalize(self, observation, goal):
+        state = (torch.cat((observation, goal), -1) - self.mean) / self.std
+        return state.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+
+    def states(self):
+        batch, after = self.batch, self.batch["next"]
+        goal = batch["desired_goal"]
+        return (
+            self.normalize(batch["observation"], goal),
+            self.normalize(after["observation"], goal),
+        )
+
+    def descend(self):
+        self.optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(self.target, self.online, TAU)
+
+    def update(self):
+        batch, after, (actor, critic) = self.batch, self.batch["next"], self.targets
+        state, next_state = self.states()
+        with torch.no_grad():
+            value = critic(torch.cat((next_state, actor(next_state)), -1))
+            target = after["reward"] + self.gamma * value * ~after["terminated"]
+            target = target.clamp(-1 / (1 - self.gamma), 0)
+        value = self.critic(torch.cat((state, batch["action"]), -1))
+        self.optimizer.zero_grad()
+        (value - target).square().mean().backward()
+        action = self.actor(state)
+        value = self.critic(torch.cat((state, action), -1))
+        loss = action.square().mean() - value.mean()
+        loss.backward(inputs=list(self.actor.parameters()))
+        self.descend()
+
+
+class OverTorchRL(PlainDDPG):
+    """The same over torchrl's DDPGLoss."""
+
+    def __init__(self, batch, gamma):
+        super().__init__(batch, gamma)
+        keys = ["normalized"], ["action"], ["state_action_value"]
+        actor = TensorDictModule(self.actor, keys[0], keys[1])
+        concatenate = Concatenate(self.critic)
+        critic = TensorDictModule(concatenate, keys[0] + keys[1], keys[2])
+        self.loss = DDPGLoss(actor, critic, delay_actor=True, loss_function="l2")
+        self.loss.make_value_estimator(gamma=gamma)
+        self.online = list(self.loss.parameters())
+        parts = ("target_actor_network_params", "target_value_network_params")
+        self.target = [
+            x for part in parts for x in getattr(self.loss, part).values(True, True)
+        ]
+        own = ("actor_network_params", "value_network_params")
+        self.online = [
+            x for part in own for x in getattr(self.loss, part).values(True, True)
+        ]
+        self.optimizer = torch.optim.Adam(self.online, lr=LEARNING_RATE, fused=True)
+
+    def update(self):
+        batch = self.batch.copy()
+        batch["normalized"], batch["next", "normalized"] = self.states()
+        losses = self.loss(batch)
+        self.optimizer.zero_grad()
+        (losses["loss_value"] + losses["loss_actor"]).backward()
+        self.descend()
+
+
+class Concatenate(nn.Module):
+    """A critic of two inputs."""
+
+    def __init__(self, net):
+        super().__init__()
+        self.net = net
+
+    def forward(self, state, action):
+        return self.net(torch.cat((state, action), -1))
+
+
+def test_a_gradient_step_costs_little_more_than_its_arithmetic():
+    """Of DDPG on 256 rows that are sampled already, in turns, on one thread."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    with torch_panda.make("PandaPush-v1", num_envs=2) as env:
+        agent = make_agent(env, Hyperparameters())
+        batch = make_transitions(env, 256)
+    ways = {
+        "plain torch": PlainDDPG(batch, agent.gamma).update,
+        "ours": lambda: agent.update(batch),
+        "over torchrl's DDPGLoss": OverTorchRL(batch, agent.gamma).update,
+    }
+    taken = {name: [] for name in ways}
+    for _ in range(ROUNDS):
+        for name, update in ways.items():
+            started = time.perf_counter()
+            for _ in range(5):
+                update()
+            taken[name].append((time.perf_counter() - started) / 5)
+    print()
+    ratios = {}
+    for name, times in taken.items():
+        pairs = zip(times, taken["plain torch"], strict=True)
+        ratios[name] = statistics.median(ours / plain for ours, plain in pairs)
+        milliseconds = 1000 * statistics.median(times)
+        print(f"{name}: {milliseconds:.2f} ms, {ratios[name]:.2f} times plain torch")
+    assert ratios["ours"] <= 1.15
 
 
 @dataclass
@@ -38,9 +182,8 @@ class Case:
         return f"Panda{self.task}-v3"
 
 
-PAPER = replace(PRESETS["paper"], total_steps=10_000, eval_interval=500)
-TUNED = replace(PRESETS["tuned"], total_steps=200_000, eval_interval=5_000)
-REACH = Case("Reach", PAPER, goal=1.0, seeds=3, patience=10)
+REACH = Case("Reach", Args(eval_interval=500), goal=1.0, seeds=3, patience=10)
+TUNED = replace(default_args("tuned", "PandaPush-v3"), total_steps=200_000)
 PUSH = Case("Push", TUNED, goal=0.95, seeds=1, patience=2.5)
 
 
@@ -49,19 +192,14 @@ def make_gym_env(task):
     return gymnasium.make(f"Panda{task}-v{panda_gym.__version__[0]}")
 
 
-class OurRun(Run):
-    """Stops when it has learned; what evaluations take is not counted."""
+class Learned:
+    """A stop signal: true once an evaluation was good enough."""
 
-    evaluating, learned, goal = 0.0, None, 1.0
+    def __init__(self, run, goal):
+        self.run, self.goal = run, goal
 
-    def evaluate(self):
-        learning = self.seconds - self.evaluating
-        started = time.perf_counter()
-        super().evaluate()
-        self.evaluating += time.perf_counter() - started
-        if self.learned is None and self.curve[-1]["success"] >= self.goal:
-            self.learned = self.steps, learning
-            self.args.total_steps = self.steps  # ends the run
+    def __bool__(self):
+        return self.run.progress.curve[-1]["success"] >= self.goal
 
 
 class Evaluations(BaseCallback):
@@ -100,11 +238,11 @@ class Evaluations(BaseCallback):
 
 
 def learn_ours(case, folder, seed):
-    run = OurRun(replace(case.args, env_id=case.env_id, seed=seed), folder)
-    run.goal = case.goal
-    run.train()
+    run = Run(replace(case.args, env_id=case.env_id, seed=seed), folder)
+    run.train(stop=Learned(run, case.goal))
     run.close()
-    return run.learned
+    last = run.progress.curve[-1]
+    return (last["step"], last["seconds"]) if last["success"] >= case.goal else None
 
 
 def learn_sb3(case, seed, patience):
@@ -113,18 +251,18 @@ def learn_sb3(case, seed, patience):
     model = DDPG(
         "MultiInputPolicy",
         env,
-        learning_rate=args.learning_rate,
-        buffer_size=args.buffer_size,
+        learning_rate=LEARNING_RATE,
+        buffer_size=BUFFER_SIZE,
         learning_starts=50 * args.num_envs,
         batch_size=args.batch_size,
-        tau=args.tau,
+        tau=TAU,
         gamma=args.gamma or 0.98,
         train_freq=1,
         gradient_steps=int(args.updates_per_step * args.num_envs),
         action_noise=NormalActionNoise(np.zeros(3), np.full(3, args.noise_eps)),
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4},
-        policy_kwargs={"net_arch": [args.hidden_size] * 3},
+        policy_kwargs={"net_arch": [HIDDEN_SIZE] * 3},
         seed=seed,
     )
     evaluations = Evaluations(case, patience)

@@ -1,22 +1,21 @@
-"""What an agent may know of the shipped tasks: where things are, and the symmetry.
-
-Transitions that are mirrored or moved over the table are as possible as those that were
-seen, nearly: see Invariant Transform Experience Replay (arXiv 1909.10707) for mirrors.
-"""
+"""What an agent may know of the shipped tasks: where things are, and the symmetry."""
 
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_panda import RobotTaskEnv
+from torch_panda import RobotTaskEnv, Slide
 
 # Factors that mirror a quantity in the plane y = 0, in which robot and table are
 # symmetric.
 _POINT = (1.0, -1.0, 1.0)  # also a velocity
 _ANGLES = (-1.0, 1.0, -1.0)  # also an angular velocity
 _QUATERNION = (-1.0, 1.0, -1.0, 1.0)
+
+# [m]. Slide draws goals 1.5 cm above where its puck can be, by which networks would
+# tell them from hindsight goals.
+SLIDE_GOAL_HEIGHT = 0.03
 
 
 @dataclass(frozen=True)
@@ -31,6 +30,8 @@ class Geometry:
         action: factors that mirror an action; None with joint control.
         positions: where positions begin in an observation.
         goal_positions: where they begin in a goal.
+        goal_height: at which goals are shown to networks that see differences of
+            positions [m]; None shows them where they are.
     """
 
     later: tuple[int, ...]
@@ -40,41 +41,7 @@ class Geometry:
     action: tuple[float, ...] | None
     positions: tuple[int, ...]
     goal_positions: tuple[int, ...]
-
-    def mirror(self, batch: TensorDictBase) -> None:
-        """Mirror every second row of a batch of transitions."""
-        assert self.action is not None
-        factors = {
-            "observation": self.observation,
-            "desired_goal": self.goal,
-            "action": self.action,
-            ("next", "observation"): self.observation,
-            ("next", "desired_goal"): self.goal,
-        }
-        for key, values in factors.items():
-            value = batch[key].clone()
-            value[::2] *= value.new_tensor(values)
-            batch[key] = value
-
-    def shift(self, batch: TensorDictBase, distance: float) -> None:
-        """Move half of the rows of a batch, each by up to ``distance`` in x and y [m].
-
-        Hand, objects and goals move together, as if the robot stood elsewhere.
-        """
-        rows = slice(len(batch) // 2, None)
-        offset = batch["desired_goal"].new_empty(len(batch) - rows.start, 2)
-        offset.uniform_(-distance, distance)
-        starts = {
-            "observation": self.positions,
-            "desired_goal": self.goal_positions,
-            ("next", "observation"): self.positions,
-            ("next", "desired_goal"): self.goal_positions,
-        }
-        for key, positions in starts.items():
-            value = batch[key].clone()
-            for start in positions:
-                value[rows, start : start + 2] += offset
-            batch[key] = value
+    goal_height: float | None
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Objects from the end-effector and goals from objects, (..., n) [m]."""
@@ -107,4 +74,5 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
         action=(*_POINT, *gripper) if robot.control_type == "ee" else None,
         positions=(0, *starts),
         goal_positions=goals,
+        goal_height=SLIDE_GOAL_HEIGHT if isinstance(task, Slide) else None,
     )

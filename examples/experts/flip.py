@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from moves import CUBE, GAIN, OPEN, ROUGH, norm, open_to, unit
+from experts.moves import CUBE, GAIN, OPEN, ROUGH, norm, open_to, unit
 
 GRASP_ASIDE = 0.014  # [m] beside the cube's centre, so that its weight turns it
 CREEP, RELAX = 0.0012, -0.001  # the gripper's action until the cube turns, and then
@@ -100,7 +100,7 @@ def descend(ee: Tensor, point: Tensor, error: Tensor) -> Tensor:
     )
 
 
-def flip(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Turn the cube with strokes of the fingers, or about y within the grasp.
 
     A stroke upwards along +x, +y or -y tips the cube over by a quarter turn. Held

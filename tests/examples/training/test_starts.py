@@ -5,7 +5,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 import torch_panda
-from starts import PHYSICAL, StartFrom, states_at_objects
+from training.starts import PHYSICAL, StartFrom, states_at_objects
 
 NUM_ENVS = 8
 
@@ -17,7 +17,7 @@ def states():
 
 def place(env, states):
     """Let the first environments start from these states."""
-    return env.reset(states[: env.num_envs].clone(), set_state=True)
+    return env.reset(states[: env.num_envs].exclude("placed"), set_state=True)
 
 
 @pytest.mark.parametrize("task", ["Push", "Slide"])
@@ -49,9 +49,30 @@ def test_hand_holds_an_object(task, number):
         lifted = td["achieved_goal"].unflatten(-1, (number, 3)) - before
     assert ((lifted[..., 2] > 0.05).sum(1) == 1).all()
     assert (lifted[..., 2] > 0.05).any(0).all()  # each object in some states
+    placed = states["placed"][:20, 0]
+    assert placed.any() == (task == "Stack")
+    assert (lifted[placed, -1, 2] > 0.05).all()
 
 
-def test_share_of_the_episodes(states):
+def test_lower_cube_of_a_stack_can_be_at_its_goal():
+    """In a third of the states, and it stays there while the upper one is held up."""
+    states = states_at_objects("PandaStack-v1", seed=0)
+    assert 0.2 < states["placed"].double().mean() < 0.45
+    torch.manual_seed(0)
+    with torch_panda.make("PandaStack-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartFrom(states[states["placed"][:, 0]], 1.0))
+        td = env.reset()
+        for _ in range(10):
+            lower, upper = td["achieved_goal"].split(3, -1)
+            goal = td["desired_goal"][:, :3]
+            torch.testing.assert_close(lower, goal, atol=2e-3, rtol=0)
+            assert (upper[:, 2] > 0.08).all()
+            hold = torch.tensor([0.0, 0.0, 0.0, -1.0]).repeat(NUM_ENVS, 1)
+            td = env.step(td.set("action", hold))["next"]
+        assert len(goal.unique(dim=0)) == NUM_ENVS
+
+
+def test_ratio_of_the_episodes(states):
     # Hands that start in the neutral position are 20 cm high.
     with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
         env = TransformedEnv(base, StartFrom(states, 0.3))

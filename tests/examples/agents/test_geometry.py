@@ -1,13 +1,10 @@
 """What the agents assume about the tasks holds in their physics."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 import torch_panda
-from agents import Hyperparameters, Normalizer
-from geometry import read_geometry
+from agents.geometry import read_geometry
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
 MIRROR_VELOCITY = torch.tensor([1, -1, 1, -1, 1, -1], dtype=torch.float64)
@@ -61,50 +58,3 @@ def test_differences(task):
         from_hand = objects - td["observation"][:, None, :3]
         expected = torch.cat((from_hand, goals - objects), 1).flatten(1)
         torch.testing.assert_close(found, expected)
-
-
-def test_inputs_of_the_networks():
-    hp = Hyperparameters(goal_height=0.5)
-    relative = replace(hp, relative_inputs=True)
-    with torch_panda.make("PandaStack-v1", num_envs=3, seed=0) as env:
-        td = env.reset()
-        geometry = read_geometry(env)
-        kinds = [hp, relative, replace(relative, fine_inputs=0.03)]
-        plain, coarse, fine = (
-            Normalizer(env, kind)(td["observation"], td["desired_goal"])
-            for kind in kinds
-        )
-    goal = td["desired_goal"].clone()
-    goal[:, [2, 5]] = 0.5
-    torch.testing.assert_close(plain, torch.cat((td["observation"], goal), -1))
-    differences = geometry.differences(td["observation"], goal)
-    torch.testing.assert_close(coarse, torch.cat((plain, differences), -1))
-    clipped = differences.clamp(-0.03, 0.03)
-    assert 0 < (clipped != differences).sum() < differences.numel()
-    torch.testing.assert_close(fine, torch.cat((coarse, clipped), -1))
-
-
-def test_shift():
-    with torch_panda.make("PandaStack-v1", num_envs=8, seed=0) as env:
-        geometry = read_geometry(env)
-        batch = env.rollout(1).reshape(-1)
-        before = batch.clone()
-        geometry.shift(batch, 0.2)
-    assert (batch[:4] == before[:4]).all()
-    for now, was in ((batch[4:], before[4:]), (batch["next"][4:], before["next"][4:])):
-        differences = [
-            geometry.differences(td["observation"], td["desired_goal"])
-            for td in (now, was)
-        ]
-        torch.testing.assert_close(*differences)
-        moved = now["desired_goal"] - was["desired_goal"]
-        assert (moved[:, [0, 1]].abs().amax(0) > 0.05).all()
-        assert (moved[:, [0, 1]].abs() <= 0.2).all()
-        torch.testing.assert_close(moved[:, :3], moved[:, 3:])
-        assert (moved[:, 2] == 0).all()
-        changed = (now["observation"] != was["observation"]).any(0).nonzero().flatten()
-        assert changed.tolist() == [0, 1, 7, 8, 19, 20]
-    torch.testing.assert_close(
-        batch["observation"] - before["observation"],
-        batch["next", "observation"] - before["next", "observation"],
-    )

@@ -14,7 +14,6 @@ CUBE = 0.04  # [m], edge length
 # Deceleration of a cube that slides where friction is 0.5 * 0.5, as on the table of
 # -v3; on that of -v1 the cubes of Stack, with 5 * 0.1, stop still sooner [m/s^2].
 ROUGH = 0.25 * 9.81
-ON_TOP = 0.01  # [m] above an object's top: where the end-effector presses on it
 
 
 def norm(vector: Tensor) -> Tensor:
@@ -71,23 +70,6 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     done = (left < 0.01) | ~pushing & (distance < 0.03)
     action = torch.where(pushing, advance, go_over(ee, behind, 0.06))
     return torch.where(done, 0.0, action)
-
-
-def drag_to(ee: Tensor, cube: Tensor, goal: Tensor) -> Tensor:
-    """Press on a cube from above and drag it: on a slippery table it follows.
-
-    Args:
-        ee: end-effector, (..., 3).
-        cube: its position, (..., 3).
-        goal: where to drag it, (..., 3).
-    """
-    beside, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE / 2 + ON_TOP
-    pressing = (norm(beside) < CUBE / 2) & (ee[..., 2:] < top + 0.004)
-    step = 0.6 * (goal - cube)[..., :2]
-    step = step / (norm(step) / 0.02).clamp(min=1.0)
-    drag = torch.cat((step, torch.full_like(top, -0.01)), -1) / 0.05
-    on_top = torch.cat((cube[..., :2], top - 0.003), -1)
-    return torch.where(pressing, drag, go_over(ee, on_top, 0.04))
 
 
 def is_held(ee: Tensor, width: Tensor, cube: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Fits the strike of Slide's scripted expert to strikes of random strength.
 
-    python examples/fit_strike.py
+    cd examples && python -m experts.fit_strike
 
-It prints the numbers that `experts.py` has, for the physics of PandaSlide-v1.
+It prints the numbers that `slide.py` has, for the physics of PandaSlide-v1.
 """
 
 import torch
@@ -10,8 +10,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torch_panda
-from experts import DEVIATION, STRENGTH, strike, strike_terms
-from moves import unit
+from experts.moves import unit
+from experts.slide import DEVIATION, STRENGTH, strike, strike_terms
 
 ENV_ID, NUM_ENVS, ROUNDS = "PandaSlide-v1", 64, 40
 STEPS = 70  # until every puck lies still

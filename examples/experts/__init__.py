@@ -1,0 +1,46 @@
+"""Scripted experts: they show that each task can be solved, and give demonstrations.
+
+An expert maps a batch of observations and goals to actions of end-effector control. It
+has no state and sees no simulator: what to do next follows from the observation alone,
+so experts serve rollouts and collectors of any batch size. Positions are in the world
+frame [m]; an action of 1 displaces the end-effector by 5 cm.
+"""
+
+import re
+from collections.abc import Callable
+
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from experts import flip, pick_and_place, push, reach, slide, stack
+
+# (observation, achieved_goal, desired_goal), each (..., size), to the action.
+Expert = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+EXPERTS: dict[str, Expert] = {
+    "Reach": reach.act,
+    "Push": push.drag,
+    "Slide": slide.act,
+    "PickAndPlace": pick_and_place.act,
+    "Stack": stack.act,
+    "Flip": flip.act,
+}
+# On the rougher table of -v3 a cube can be pushed.
+V3_EXPERTS: dict[str, Expert] = EXPERTS | {"Push": push.push}
+
+
+def make_expert(env_id: str) -> TensorDictModule:
+    """The policy for an id of end-effector control.
+
+    Raises:
+        ValueError: there is no expert for it.
+    """
+    match = re.fullmatch(r"Panda([A-Za-z]+?)(Dense)?-v([13])", env_id)
+    if match is None or match[1] not in EXPERTS:
+        raise ValueError(
+            f"no expert for {env_id!r}; accepted are "
+            f"Panda{{{','.join(EXPERTS)}}}{{,Dense}}-v{{1,3}}"
+        )
+    keys = ["observation", "achieved_goal", "desired_goal"]
+    experts = EXPERTS if match[3] == "1" else V3_EXPERTS
+    return TensorDictModule(experts[match[1]], keys, ["action"])

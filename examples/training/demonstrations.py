@@ -1,0 +1,79 @@
+"""Transitions of an expert, to learn from before and beside one's own."""
+
+import time
+from pathlib import Path
+
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from tqdm import tqdm
+
+from torch_panda import RobotTaskEnv
+from training import files
+from training.buffers import STORED_KEYS
+from training.checkpoint import SAVE_INTERVAL, Checkpoint
+
+
+def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
+    """Transitions (n,) of whole episodes.
+
+    Raises:
+        ValueError: the file holds none, or none of such an environment.
+    """
+    content = files.read(path, "demonstrations", STORED_KEYS)
+    try:
+        demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
+    except (RuntimeError, TypeError) as error:  # other lengths, or no tensors
+        raise ValueError(f"{path} does not hold demonstrations: {error}") from None
+    if not len(demos):
+        raise ValueError(f"{path} holds no transitions")
+    for key in ("observation", "action", "desired_goal"):
+        expected = env.full_observation_spec.get(key, None)
+        size = (env.action_spec if expected is None else expected).shape[-1]
+        if demos[key].shape[-1] != size:
+            raise ValueError(
+                f"{path}: {key} has size {demos[key].shape[-1]}, the task's has {size}"
+            )
+    return demos.to(env.device)
+
+
+def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:
+    """A buffer that holds these transitions with their own goals."""
+    storage = LazyTensorStorage(len(demos), device=demos.device)
+    buffer = TensorDictReplayBuffer(storage=storage)
+    buffer.extend(demos)
+    return buffer
+
+
+def pretrain(
+    checkpoint: Checkpoint,
+    demos: TensorDictReplayBuffer,
+    *,
+    updates: int,
+    batch_size: int,
+    stop: object = False,
+) -> None:
+    """Take gradient steps that only imitate, from where the run is, and save it.
+
+    Args:
+        checkpoint: of the run, whose learning rate falls to 0 meanwhile.
+        demos: to imitate.
+        updates: gradient steps, over all.
+        batch_size: transitions per gradient step.
+        stop: ends this early when it is true.
+    """
+    agent, progress = checkpoint.agent, checkpoint.progress
+    bar = tqdm(
+        desc="imitation", initial=progress.pretrained, total=updates, unit="update"
+    )
+    while progress.pretrained < updates and not stop:
+        started = time.perf_counter()
+        agent.set_learning_rate(1 - progress.pretrained / updates)
+        agent.imitate(demos.sample(batch_size))
+        progress.pretrained += 1
+        progress.seconds += time.perf_counter() - started
+        bar.update()
+        if progress.pretrained % SAVE_INTERVAL == 0:
+            checkpoint.save()
+    bar.close()
+    agent.set_learning_rate(1.0)
+    checkpoint.save()

@@ -1,0 +1,59 @@
+"""Trained policies as files: weights, normaliser and how to build them."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+
+from agents import Agent, Hyperparameters, make_agent
+from torch_panda import RobotTaskEnv
+from training import files
+
+
+def save_policy(path: Path, agent: Agent, env_id: str) -> None:
+    """Write what `load_policy` needs, plain tensors and numbers."""
+    hp = {
+        field.name: getattr(agent.hp, field.name) for field in fields(Hyperparameters)
+    }
+    policy = agent.policy.state_dict()
+    files.save(path, {"env_id": env_id, "hyperparameters": hp, "policy": policy})
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What `save_policy` wrote, on the CPU.
+
+    Args:
+        path: of the file, or of the folder of a run.
+
+    Raises:
+        ValueError: there is no file, or it holds no policy.
+    """
+    if path.is_dir():
+        path = path / "checkpoint.pt"
+    keys = ("env_id", "hyperparameters", "policy")
+    return files.read(path, "a policy", keys, map_location="cpu")
+
+
+def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> TensorDictModuleBase:
+    """The policy of a checkpoint that `save_policy` wrote.
+
+    Raises:
+        ValueError: the environment's spaces are not those it was trained on, or
+            another version wrote the checkpoint.
+    """
+    options = checkpoint["hyperparameters"]
+    if unknown := options.keys() - {field.name for field in fields(Hyperparameters)}:
+        raise ValueError(
+            f"the policy was saved by another version, with options that this one does "
+            f"not have: {', '.join(sorted(unknown))}"
+        )
+    policy = make_agent(env, Hyperparameters(**options)).policy
+    try:
+        policy.load_state_dict(checkpoint["policy"])
+    except RuntimeError:
+        raise ValueError(
+            f"the policy was trained on {checkpoint['env_id']}, whose spaces are not "
+            "those of this environment"
+        ) from None
+    return policy

@@ -1,0 +1,209 @@
+"""The algorithms: their losses, what a gradient step changes, and how they explore."""
+
+import copy
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import DDPGLoss, TD3Loss
+
+import torch_panda
+from agents import AGENTS, Hyperparameters, make_agent
+from agents.base import TAU
+from agents.td3 import NOISE_CLIP, POLICY_NOISE
+from tests.examples.agents.transitions import make_transitions
+
+ALGOS = list(AGENTS)
+
+
+@pytest.fixture(scope="module")
+def env():
+    with torch_panda.make("PandaPush-v1", num_envs=4) as env:
+        yield env
+
+
+def make(env, algo, **options):
+    torch.manual_seed(0)
+    return make_agent(env, Hyperparameters(algo=algo, **options))
+
+
+def critics_of(agent):
+    """The parameters of the critics, and of their target networks."""
+    if hasattr(agent, "critics"):
+        return list(agent.critics.parameters()), list(agent.target_critics.parameters())
+    keys = agent.loss.qvalue_network_params.keys(True, True)
+    loss = agent.loss
+    return tuple(
+        [parameters[key] for key in keys]
+        for parameters in (
+            loss.qvalue_network_params,
+            loss.target_qvalue_network_params,
+        )
+    )
+
+
+def normalized(agent, batch):
+    """The batch with the networks' inputs, as torchrl's losses take it."""
+    for part in (batch, batch["next"]):
+        part["normalized"] = agent.normalizer(part["observation"], part["desired_goal"])
+    return batch
+
+
+def as_modules(agent):
+    actor = TensorDictModule(copy.deepcopy(agent.actor), ["normalized"], ["action"])
+    keys = (["normalized", "action"], ["state_action_value"])
+    return actor, [TensorDictModule(copy.deepcopy(c), *keys) for c in agent.critics]
+
+
+def test_ddpg_has_torchrls_losses(env):
+    agent = make(env, "ddpg", action_l2=0.0)
+    batch = make_transitions(env, 64)
+    actor, (critic,) = as_modules(agent)
+    loss = DDPGLoss(actor, critic, delay_actor=True, loss_function="l2")
+    loss.make_value_estimator(gamma=agent.gamma)
+    agent.lowest = None  # torchrl does not clip targets
+    theirs = loss(normalized(agent, batch.clone()))
+    ours = agent.update(batch)
+    torch.testing.assert_close(ours["critic_loss"], theirs["loss_value"])
+    torch.testing.assert_close(ours["actor_loss"], theirs["loss_actor"])
+
+
+@pytest.mark.parametrize("double_q", [True, False])
+def test_td3_has_torchrls_losses(env, double_q):
+    agent = make(env, "td3", action_l2=0.0, double_q=double_q)
+    agent.lowest = None
+    batch = make_transitions(env, 64)
+    actor, critics = as_modules(agent)
+    assert len(critics) == 1 + double_q
+    options = {"policy_noise": POLICY_NOISE, "noise_clip": NOISE_CLIP}
+    loss = TD3Loss(
+        actor,
+        critics,
+        num_qvalue_nets=len(critics),
+        action_spec=env.action_spec_unbatched,
+        loss_function="l2",
+        deactivate_vmap=True,
+        **options,
+    )
+    loss.make_value_estimator(gamma=agent.gamma)
+    torch.manual_seed(1)
+    # They draw the targets' noise first, too.
+    theirs = loss.value_loss(normalized(agent, batch.clone()))[0]
+    policy_loss = loss.actor_loss(normalized(agent, batch.clone()))[0]
+    torch.manual_seed(1)
+    ours = agent.update(batch)
+    torch.testing.assert_close(ours["critic_loss"], theirs)
+    torch.testing.assert_close(ours["actor_loss"], policy_loss)
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+def test_targets_are_possible_returns(env, algo):
+    """Of -1 and 0: a critic far off is pulled to an end of their range."""
+    agent = make(env, algo, gamma=0.5, action_l2=0.0)
+    batch = make_transitions(env, 64)
+    for value, end in ((1000.0, 0.0), (-1000.0, -2.0)):
+        for critics in (agent.critics, agent.target_critics):
+            for critic in critics:
+                nn.init.zeros_(critic[-1].weight)
+                nn.init.constant_(critic[-1].bias, value)
+        terminated = batch["next", "terminated"]
+        target = torch.where(terminated, batch["next", "reward"], end)
+        expected = len(agent.critics) * (value - target).square().mean()
+        losses = copy.deepcopy(agent).update(batch.clone())
+        torch.testing.assert_close(losses["critic_loss"], expected)
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+def test_small_actions_are_preferred(env, algo):
+    batch = make_transitions(env, 64)
+    losses = [
+        make(env, algo, action_l2=weight).update(batch.clone())["actor_loss"]
+        for weight in (0.0, 2.0)
+    ]
+    agent = make(env, algo)
+    state = agent.normalizer(batch["observation"], batch["desired_goal"])
+    penalty = 2 * agent.actor(state).square().mean()
+    torch.testing.assert_close(losses[1] - losses[0], penalty)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("algo", ALGOS)
+def test_a_gradient_step_trains_all_networks(env, algo, layer_norm):
+    agent = make(env, algo, layer_norm=layer_norm)
+    before = {key: x.clone() for key, x in agent.named_parameters()}
+    trained = {key for key, x in agent.named_parameters() if x.requires_grad}
+    online, target = critics_of(agent)
+    before_target = [x.clone() for x in target]
+    losses = agent.update(make_transitions(env, 64))
+    assert losses.keys() == {"critic_loss", "actor_loss"}
+    assert not any(x.requires_grad for x in losses.values())
+    after = dict(agent.named_parameters())
+    same = {key for key in trained if torch.equal(before[key], after[key])}
+    assert not {key for key in same if "alpha" not in key}
+    online, target = critics_of(agent)
+    moved = [a.lerp(b, TAU) for a, b in zip(before_target, online, strict=True)]
+    torch.testing.assert_close([x.data for x in target], [x.data for x in moved])
+    norms = [m for m in agent.modules() if isinstance(m, nn.LayerNorm)]
+    assert bool(norms) == layer_norm
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_target_networks_move_at_intervals(env, algo):
+    agent = make(env, algo, target_interval=3)
+    before = critics_of(agent)[1][0].clone()
+    moves = []
+    for _ in range(6):
+        agent.update(make_transitions(env, 16))
+        after = critics_of(agent)[1][0].clone()
+        moves.append(not torch.equal(before, after))
+        before = after
+    assert moves == [False, False, True] * 2
+
+
+def test_td3_moves_its_actor_at_every_second_step(env):
+    agent = make(env, "td3")
+    keys = [agent.update(make_transitions(env, 16)).keys() for _ in range(4)]
+    assert [len(k) for k in keys] == [2, 1, 2, 1]
+
+
+@pytest.mark.parametrize(("algo", "double_q"), [("sac", True), ("tqc", False)])
+def test_number_of_critics(env, algo, double_q):
+    agent = make(env, algo, double_q=double_q)
+    layers = [x for x in critics_of(agent)[0] if x.shape[-1] == agent.state_size + 3]
+    assert [x.shape[0] for x in layers] == [1 + double_q]
+
+
+def test_environments_explore_differently(env):
+    agent = make(env, "ddpg", noise_eps=0.0, random_eps=(0.0, 1.0))
+    td = env.reset()
+    with torch.no_grad():
+        policy = agent.policy(td.clone())["action"]
+        rounds = torch.stack(
+            [(agent.explore(td.clone())["action"] != policy).any(-1) for _ in range(99)]
+        )
+    share = rounds.double().mean(0)
+    assert share[0] == 0
+    assert share[-1] == 1
+    assert 0.1 < share[1] < share[2] < 0.9
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_policies_are_deterministic_in_evaluations(env, algo):
+    agent = make(env, algo)
+    td = env.reset()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        first, second = (agent.policy(td.clone())["action"] for _ in range(2))
+    assert torch.equal(first, second)
+    assert (first.abs() <= 1).all()
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "sac"])
+def test_learning_rate(env, algo):
+    agent = make(env, algo)
+    agent.set_learning_rate(0.0)
+    agent.hp.target_interval = 2  # they would move to where their networks are
+    before = [x.clone() for x in agent.parameters()]
+    agent.update(make_transitions(env, 16))
+    assert all(map(torch.equal, before, agent.parameters()))

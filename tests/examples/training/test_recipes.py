@@ -1,0 +1,31 @@
+"""The recipes of --preset tuned."""
+
+import pytest
+
+import torch_panda
+from limits import check_limits
+from train import Args, default_args
+from training.recipes import RECIPES, find_recipe
+
+
+@pytest.mark.parametrize("task", RECIPES)
+def test_recipes_are_options(task):
+    args = default_args("tuned", f"Panda{task}-v1")
+    check_limits(args)
+    assert args.preset == "tuned"
+    assert args != Args(preset="tuned", env_id=args.env_id)
+
+
+def test_every_task_has_a_recipe():
+    for env_id in torch_panda.ENV_IDS:
+        assert find_recipe(env_id) is not None
+        assert any(env_id.startswith(f"Panda{task}") for task in RECIPES)
+    push = RECIPES["Push"]
+    for variant in ("", "Joints", "Dense", "JointsDense"):
+        assert find_recipe(f"PandaPush{variant}-v3") == push
+    assert find_recipe("PandaPickAndPlace-v1") != push
+
+
+def test_unknown_tasks_and_the_paper_have_none():
+    assert find_recipe("PandaFly-v1") == find_recipe("Fly-v1") == {}
+    assert default_args("paper", "PandaPush-v1") == Args(env_id="PandaPush-v1")
