@@ -8,6 +8,7 @@ frame [m]; an action of 1 displaces the end-effector by 5 cm.
 
 import re
 from collections.abc import Callable
+from functools import partial
 
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -25,8 +26,11 @@ EXPERTS: dict[str, Expert] = {
     "Stack": stack.act,
     "Flip": flip.act,
 }
-# On the rougher table of -v3 a cube can be pushed.
-V3_EXPERTS: dict[str, Expert] = EXPERTS | {"Push": push.push}
+# On the rougher table of -v3 a cube can be pushed, and spins less.
+V3_EXPERTS: dict[str, Expert] = EXPERTS | {
+    "Push": push.push,
+    "Flip": partial(flip.act, table=flip.ROUGH),
+}
 
 
 def make_expert(env_id: str) -> TensorDictModule:

@@ -1,184 +1,243 @@
-"""The scripted expert for Flip: turns of the cube, planned from its quaternion."""
+"""The scripted expert for Flip: taps, drops and swings, planned from the quaternion.
+
+The hand cannot turn, so it turns the cube in two other ways. A tap: with the fingers
+open around it, one of them knocks a corner, and on the slippery table the cube spins
+about z until the fingers close. A swing: held beside its centre in a grasp that
+loosens, the cube swings about y, the axis from finger to finger. A swing that ends
+with the cube hanging down can be set down: another face is up then. Last comes a
+swing that is held where it is best, or nothing more.
+"""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from experts.moves import CUBE, GAIN, OPEN, ROUGH, norm, open_to, unit
+from experts.moves import GAIN, norm, open_to
+from experts.rotations import best_pitch, compose, distance, straighten, turn
 
-GRASP_ASIDE = 0.014  # [m] beside the cube's centre, so that its weight turns it
-CREEP, RELAX = 0.0012, -0.001  # the gripper's action until the cube turns, and then
-FREE, HUNG = 0.035, 0.1  # [m], heights from which the grasp loosens, and of the swing
-GOOD = 0.17  # a distance that is worth aiming at; success is 0.2
-# Strokes along y, where the fingers are wide, and along x: from where [m from the
-# cube's centre, m above the table], and actions along the stroke and upwards.
-GAP_Y, HEIGHT_Y, SPEED_Y, LIFT_Y = 0.051, 0.022, 0.6, 0.6
-GAP_X, HEIGHT_X, SPEED_X, LIFT_X = 0.035, 0.024, 0.75, 0.6
-WAYS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0))  # of strokes; towards -x they fail
-STROKE_COST, SWING_COST, DETOUR_COST = 0.04, 0.06, 0.2  # the last one per metre
-QUARTER = math.sqrt(0.5)
-
-
-def compose(first: Tensor, second: Tensor) -> Tensor:
-    """The quaternion of turning by ``second``, then by ``first``, xyzw (..., 4)."""
-    first, second = torch.broadcast_tensors(first, second)
-    a, a_w, b, b_w = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    scalar = a_w * b_w - (a * b).sum(-1, keepdim=True)
-    return torch.cat((a_w * b + b_w * a + torch.linalg.cross(a, b), scalar), -1)
-
-
-def yaw_of(cube: Tensor) -> Tensor:
-    """How far a cube's sides are turned from x and y, within 45 degrees, (..., 1)."""
-    x, y, z, w = cube.unbind(-1)
-    axes = torch.stack(  # what becomes of the axes x, y and z, (..., 3, 3)
-        (
-            torch.stack((w * w + x * x - y * y - z * z, 2 * (x * y + z * w)), -1),
-            torch.stack((2 * (x * y - z * w), w * w - x * x + y * y - z * z), -1),
-            torch.stack((2 * (x * z + y * w), 2 * (y * z - x * w)), -1),
-        ),
-        -2,
-    )
-    level = norm(axes).argmax(-2, keepdim=True).expand(*axes.shape[:-2], 1, 2)
-    side = axes.gather(-2, level).squeeze(-2)
-    yaw = torch.atan2(side[..., 1:], side[..., :1])
-    return torch.remainder(yaw + math.pi / 4, math.pi / 2) - math.pi / 4
+# Widths of the fingers [m]: around the cube, closing on it, holding it as firmly as it
+# takes, and where it begins to slip; by what action they loosen and then stay so.
+WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0385
+CATCH = 0.034  # while it swings: closing faster would squeeze it out
+LOOSEN, STAY = 0.0012, -0.001
+ASIDE = 0.014  # [m] beside the cube's centre, so that its weight turns it
+LAG = 0.004  # [m] by which the arm's first step upwards takes the grasp towards -x
+CLEAR, LIFTED = 0.035, 0.075  # [m], heights from which the grasp loosens, of the swing
+LOST = 0.025  # [m] below the fingers, where they hold the cube only just
+TILT = 0.15  # [rad] of a cube that need not be straightened before it is swung
+TAP_ASIDE = 0.025  # [m] beside the cube's centre, where a finger knocks its corner
+SUCCESS, DONE = 0.2, 0.17  # distances: the task's, and one to leave alone
+# Costs of a plan: of each quarter turn about y and z, of the last swing, and of the
+# distance that it leaves, above all of what exceeds `GOOD`; 1 if it cannot succeed.
+PITCH_COST, YAW_COST, SWING_COST, LEFT_COST, MISS_COST = 0.3, 0.15, 0.1, 0.2, 6.0
+GOOD, GOOD_LYING = 0.15, 0.13
+# Quarter turns about y, then about z: how many (16, 2), as quaternions (16, 4), costs.
+QUARTERS = torch.cartesian_prod(*[torch.tensor((0.0, 1.0, -1.0, 2.0))] * 2)
+TURNS = compose(
+    *(turn(axis, QUARTERS[:, k : k + 1] * math.pi / 2) for axis, k in ((2, 1), (1, 0)))
+)
+TURN_COSTS = QUARTERS.abs() @ torch.tensor(((PITCH_COST,), (YAW_COST,)))
 
 
-def without(yaw: Tensor, cube: Tensor) -> Tensor:
-    """A cube's quaternion turned back by a yaw [rad], as a grasp does, (..., 4)."""
-    zero = torch.zeros_like(yaw)
-    turn = torch.cat((zero, zero, (-yaw / 2).sin(), (yaw / 2).cos()), -1)
-    return compose(turn, cube)
+class Table(NamedTuple):
+    """How a cube spins on a table.
+
+    Attributes:
+        deceleration: of its spin after a tap [rad/s^2].
+        quarter: the action of a tap after which it turns by about a quarter.
+        half: by about a half.
+    """
+
+    deceleration: float
+    quarter: float
+    half: float
 
 
-def best_pitch(cube: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-    """The distance left after the best turn about y, and that turn [rad], (..., 1)."""
-    half_turn = compose(cube.new_tensor((0.0, 1.0, 0.0, 0.0)), cube)
-    cosine = (goal * cube).sum(-1, keepdim=True)
-    sine = (goal * half_turn).sum(-1, keepdim=True)
-    angle = 2 * torch.atan2(sine, cosine)
-    angle = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
-    return 1 - cosine.square() - sine.square(), angle
+SLIPPERY = Table(deceleration=15.0, quarter=0.3, half=0.335)  # friction 0.1, of -v1
+ROUGH = Table(deceleration=60.0, quarter=0.45, half=0.6)  # 0.5, of -v3
 
 
-def costs(cube: Tensor, flat: Tensor, goal: Tensor, strokes: int) -> Tensor:
-    """What it costs to reach a goal from a cube that lies still, (..., ways + 2).
+class Plan(NamedTuple):
+    """What to do with a cube, each (..., 1) but ``lying``.
+
+    Attributes:
+        lying: the straight orientation in which it lies, or will, (..., 4).
+        pitch: quarter turns about y that come first, each set down again.
+        yaw: quarter turns about z that follow.
+        swing: whether a swing comes last.
+    """
+
+    lying: Tensor
+    pitch: Tensor
+    yaw: Tensor
+    swing: Tensor
+
+
+def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
+    """The plan that comes close to a goal with little effort.
 
     Args:
         cube: its quaternion, (..., 4).
-        flat: the same without yaw, as a grasp would turn it.
-        goal: the quaternion wanted.
-        strokes: how many may be planned.
-
-    Returns:
-        of leaving it, of a swing, and of beginning with a stroke of each way.
+        spin: of a cube that slides on the table, about z [rad/s], (..., 1).
+        goal: the quaternion wanted, (..., 4).
+        table: on which it spins.
     """
+    # It may be caught now, on the way, or when it will have stopped: (..., 3, 4).
+    ahead = (spin * spin.abs() / (2 * table.deceleration)).clamp(-2.0, 2.0)
+    ahead = ahead[..., None, :] * ahead.new_tensor(((0.0,), (0.5,), (1.0,)))
+    lying = straighten(compose(turn(2, ahead), cube[..., None, :]))
+    # Then turned by quarters, and left so or swung: (..., 3, 16, 2).
+    turned = compose(TURNS.to(cube), lying[..., None, :])
+    goal = goal[..., None, None, :]
+    left = torch.cat((distance(turned, goal), best_pitch(turned, goal)[0]), -1)
+    miss = (left - left.new_tensor((GOOD_LYING, GOOD))).clamp(min=0.0)
+    costs = MISS_COST * miss + LEFT_COST * left + TURN_COSTS.to(cube)
+    costs = costs + left.new_tensor((0.0, SWING_COST)) + (left > SUCCESS)
+    best = costs.flatten(-3).argmin(-1, keepdim=True)
+    caught, turns, swing = best // 32, best // 2 % 16, best % 2 == 1
+    lying = lying.take_along_dim(caught[..., None], -2).squeeze(-2)
+    pitch, yaw = QUARTERS.to(cube)[turns.squeeze(-1)].split(1, -1)
+    return Plan(lying, pitch, yaw, swing)
 
-    def miss(distance: Tensor) -> Tensor:
-        return 4 * (distance - GOOD).clamp(min=0.0)
 
-    lying = 1 - (cube * goal).sum(-1, keepdim=True).square()
-    found = [miss(lying), miss(best_pitch(flat, goal)[0]) + SWING_COST]
-    for x, y in WAYS if strokes else ():
-        turn = goal.new_tensor((-y * QUARTER, x * QUARTER, 0.0, QUARTER))
-        after = compose(turn, cube), compose(turn, flat)
-        least = costs(*after, goal, strokes - 1).amin(-1, keepdim=True)
-        found.append(STROKE_COST + least)
-    return torch.cat(found, -1)
-
-
-def descend(ee: Tensor, point: Tensor, error: Tensor) -> Tensor:
-    """To a point from above, the lower the smaller the error [m], (..., 1)."""
+def descend(ee: Tensor, point: Tensor) -> Tensor:
+    """To a point with open fingers, beside which a cube may lie: from above."""
     offset = point - ee
-    rise = offset[..., 2:] + (5 * (error - 0.006)).clamp(0.0, 0.06)
+    # Along x the fingers pass the cube on both sides, along y they would hit it.
+    off = (offset[..., 1:2].abs() - 0.01).clamp(min=0.0)
+    off = off + (offset[..., :1].abs() - 0.03).clamp(min=0.0)
+    rise = offset[..., 2:] + (5 * (off - 0.006)).clamp(0.0, 0.06)
     free = (1 - rise / 0.03).clamp(0.0, 1.0)
     # The outstretched arm covers a small part only of an offset along x.
-    far = 1 + 30 * (ee[..., :1] - 0.1).clamp(min=0.0)
+    far = 1 + 30 * (ee[..., :1] - 0.03).clamp(min=0.0)
     return GAIN * torch.cat(
         (offset[..., :1] * far * free, offset[..., 1:2] * free, rise), -1
     )
 
 
-def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Turn the cube with strokes of the fingers, or about y within the grasp.
+def tap(
+    ee: Tensor, width: Tensor, position: Tensor, yaw: Tensor, table: Table
+) -> Tensor:
+    """Knock a corner of the cube with a finger, towards the middle of the table."""
+    x, y, z = position.split(1, -1)
+    ahead = torch.where(y > 0, -1.0, 1.0)
+    ready = torch.cat((x + yaw.sign() * ahead * TAP_ASIDE, y, 0 * z + 0.02), -1)
+    error = ready - ee
+    around = (error[..., :1].abs() < 0.005) & (error[..., 1:2].abs() < 0.03)
+    around = around & ((error[..., 2:] - 0.002).abs() < 0.012) & (width > 0.07)
+    speed = torch.where(yaw.abs() > 1, table.half, table.quarter)
+    knock = torch.cat((GAIN * error[..., :1], speed * ahead, GAIN * error[..., 2:]), -1)
+    action = torch.where(around, knock, descend(ee, ready))
+    return torch.cat((action, open_to(width, WIDE)), -1)
 
-    A stroke upwards along +x, +y or -y tips the cube over by a quarter turn. Held
-    beside its centre in a grasp that loosens, the cube swings about y, the axis from
-    finger to finger, until the fingers close. A swing ends when the cube hangs down;
-    it is then dropped and grasped again.
+
+def grasp(
+    ee: Tensor,
+    width: Tensor,
+    position: Tensor,
+    velocity: Tensor,
+    aside: Tensor,
+    ripe: Tensor,
+) -> Tensor:
+    """Close the fingers ``aside`` of the cube's centre along x, once it is ``ripe``."""
+    x, y, z = (position + 0.04 * velocity).split(1, -1)
+    point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)
+    error = (point - ee).abs()
+    slides = norm(velocity[..., :2]) > 0.05
+    near = (error < error.new_tensor((0.008, 0.012, 0.01))).all(-1, True)
+    near = near & (slides | (error[..., :1] < 0.006)) & ripe
+    fingers = torch.where(near, open_to(width, CLOSE), open_to(width, WIDE))
+    return torch.cat((descend(ee, point), fingers), -1)
+
+
+def swing(
+    ee: Tensor,
+    width: Tensor,
+    offset: Tensor,
+    spin: Tensor,
+    pitch: Tensor,
+    left: Tensor,
+    last: Tensor,
+) -> Tensor:
+    """Lift the cube, let it swing about y and hold it, or set it down again.
+
+    Args:
+        ee: end-effector, (..., 3).
+        width: of the fingers, (..., 1).
+        offset: of the cube from it, (..., 3).
+        spin: of the cube [rad/s], (..., 3).
+        pitch: the turn about y that is wanted [rad], (..., 1).
+        left: distance to the goal, (..., 1).
+        last: whether the cube is to be held, not set down, (..., 1).
     """
-    ee, ee_velocity = observation[..., :3], observation[..., 3:6]
-    width, cube = observation[..., 6:7], observation[..., 7:10]
-    velocity, spin = observation[..., 14:16], observation[..., 17:20]
-    goal, offset = desired_goal, cube - ee
-    speed, turning, one = norm(velocity), norm(spin), torch.ones_like(width)
+    height, rate, turning = ee[..., 2:] + offset[..., 2:], spin[..., 1:2], norm(spin)
     zero = torch.zeros_like(width)
-    rest = cube[..., :2] + velocity * speed / (2 * ROUGH)
-    rest = torch.cat((rest, cube[..., 2:]), -1)  # where it will have stopped
-    distance = 1 - (achieved_goal * goal).sum(-1, keepdim=True).square()
-    tumbling = (turning > 3) | (cube[..., 2:] > 0.025)
-    still = (speed < 0.05) & (turning < 0.5)
+    firmly = open_to(width, HOLD + (CATCH - HOLD) * (turning > 0.5))
+    slipping = offset[..., 2:] < -LOST
+    there = (pitch.abs() < 0.2) | (pitch * (pitch - 0.04 * rate) < 0) | slipping
+    there = there | (left < DONE) | (ee[..., 2:] < CLEAR)
+    loosely = torch.where(rate.abs() < 1, LOOSEN, STAY)
+    loosely = torch.where(width < SLIP, open_to(width, SLIP + 0.0003), loosely)
+    lift = GAIN * (LIFTED - ee[..., 2:])
+    lift = torch.cat((zero, zero, lift, torch.where(there, firmly, loosely)), -1)
 
-    # Plan: a swing, or at most two strokes before it, not out of reach.
-    yaw = yaw_of(achieved_goal)
-    flat = without(yaw, achieved_goal)
-    _, pitch = best_pitch(flat, goal)
-    plan = costs(achieved_goal, flat, goal, strokes=2)[..., 1:]
-    ways = goal.new_tensor(WAYS)
-    ends = rest[..., None, :2] + 0.1 * ways
-    outside = (ends.abs() - 0.2).clamp(min=0.0).sum(-1)
-    starts = rest[..., None, :2] - 0.05 * ways
-    detour = norm(ee[..., None, :2] - starts).squeeze(-1)
-    extra = torch.cat((zero, outside + DETOUR_COST * detour), -1)
-    choice = (plan + extra).argmin(-1)
-    swing = choice.unsqueeze(-1) == 0
-    way = ways[(choice - 1).clamp(min=0)]
+    # Set down: where it should be, or where it hangs and will not swing on.
+    hangs = (offset[..., :1].abs() < 0.004) & (offset[..., 2:] < -0.006)
+    over = (hangs | slipping) & (turning < 1) & (pitch.abs() > 0.5)
+    over = over | ~last & (pitch.abs() < 0.4) & (turning < 3)
+    over = over & ~((left < DONE) & (ee[..., 2:] > CLEAR))
+    release = torch.where(height < 0.026, 1.0, firmly)
+    down = torch.cat((zero, zero, GAIN * (0.019 - height), release), -1)
+    return torch.where(over, down, lift)
 
-    # Stroke, with closed fingers: get beside the cube, strike, go on while it tips.
-    numbers = goal.new_tensor(
-        ((GAP_Y, HEIGHT_Y, SPEED_Y, LIFT_Y), (GAP_X, HEIGHT_X, SPEED_X, LIFT_X))
-    )
-    gap, height, pace, lift = numbers[way[..., 0].long()].split(1, -1)
-    # A corner sticks out.
-    gap = gap + CUBE / 2 * (yaw.abs().cos() + yaw.abs().sin() - 1)
-    ready = torch.cat((rest[..., :2] - gap * way, height), -1)
-    closed = width < 0.02
-    set_up = (norm(ready - ee) < 0.003) & (norm(ee_velocity) < 0.2) & still & closed
-    upward = (ee[..., 2:] < 0.06) & (ee_velocity[..., 2:] > 0.05)
-    upward = upward & (norm(ee_velocity[..., :2]) > 0.2)
-    follow = ~still & closed & upward & (norm(offset[..., :2]) < 0.08)
-    # The arm's first step upwards takes it back by some millimetres, hence along x.
-    back = 0.1 * way[..., 1:].abs()
-    strike = torch.cat((pace * way[..., :1] + back, pace * way[..., 1:], lift), -1)
-    along = torch.cat((unit(velocity) * SPEED_Y, LIFT_Y * one), -1)
-    ahead = ((ee - ready)[..., :2] * way).sum(-1, keepdim=True)
-    stroke = torch.where(set_up, strike, descend(ee, ready, ahead))
-    stroke = torch.cat((torch.where(follow, along, stroke), -one), -1)
 
-    # Grasp beside the centre, lift, loosen until it swings, close when it is there.
-    grip = rest - torch.cat((GRASP_ASIDE * pitch.sign(), zero, zero), -1)
-    error = grip - ee
-    aside = error[..., 1:2].abs() + (error[..., :1].abs() - 0.03).clamp(min=0.0)
-    near = (norm(error[..., :2]) < 0.006) & (error[..., 2:].abs() < 0.008)
-    close = torch.where(near, -1.0, open_to(width, OPEN))
-    grasp = torch.cat((descend(ee, grip, aside), close), -1)
-    _, pitch = best_pitch(achieved_goal, goal)
-    rate = spin[..., 1:2]
-    there = (pitch.abs() < 0.2) | (pitch * (pitch - 0.04 * rate) < 0)
-    there = there | (distance < GOOD) | (offset[..., 2:] < -0.03)
-    hanging = (offset[..., :1].abs() < 0.004) & (offset[..., 2:] < -0.006)
-    drop = hanging & (turning < 1) & (distance > 0.2) & (pitch.abs() > 0.5)
-    loosen = torch.where(rate.abs() < 1, CREEP * one, RELAX * one)
-    fingers = torch.where(there | (ee[..., 2:] < FREE), -one, loosen)
-    lift = torch.cat((zero, zero, GAIN * (HUNG - ee[..., 2:])), -1)
-    swinging = torch.cat((lift, torch.where(drop, one, fingers)), -1)
-
+def act(
+    observation: Tensor,
+    achieved_goal: Tensor,
+    desired_goal: Tensor,
+    table: Table = SLIPPERY,
+) -> Tensor:
+    """Turn the cube by quarters until one more swing, or nothing, is enough."""
+    ee, width, position = (observation[..., a:b] for a, b in ((0, 3), (6, 7), (7, 10)))
+    velocity, spin = observation[..., 14:17], observation[..., 17:20]
+    cube, goal, offset = achieved_goal, desired_goal, position - ee
+    left, turning, zero = distance(cube, goal), norm(spin), torch.zeros_like(width)
+    on_table = position[..., 2:] < 0.024
     held = (width > 0.03) & (width < 0.05)
     held = held & (offset.abs() < ee.new_tensor((0.03, 0.04, 0.035))).all(-1, True)
-    up = (ee[..., 2:] < 0.09).to(ee.dtype)
-    rise = torch.cat((zero, zero, up, torch.where(closed, -one, one)), -1)
-    action = torch.where(swing, grasp, stroke)
-    action = torch.where(tumbling & ~near | still & (distance < 0.19), rise, action)
-    action = torch.where(follow, stroke, action)
-    return torch.where(held, swinging, action)
+
+    spin_z = spin[..., 2:]
+    plan = make_plan(cube, torch.where(on_table & ~held, spin_z, 0.0), goal, table)
+    last = plan.swing & (plan.pitch == 0) & (plan.yaw == 0)
+    set_down = compose(turn(1, plan.pitch * math.pi / 2), plan.lying)
+    _, pitch = best_pitch(cube, torch.where(last, goal, set_down))
+    swings = plan.swing | (plan.pitch != 0)
+    leave = ~swings & (plan.yaw == 0) | (left < DONE) & (turning < 0.5) & on_table
+
+    # The fingers straighten a cube that they close on at its centre; straight, it is
+    # grasped aside.
+    now = straighten(cube)
+    tilt = 2 * (cube * now).sum(-1, keepdim=True).abs().clamp(max=1.0).acos()
+    slow, straight = spin_z.abs() < 1.5, tilt < TILT
+    aside = LAG - ASIDE * pitch.sign()
+    aside = torch.where(swings & straight & slow, aside, 0.0)
+    ripe = (tilt < 0.25) | (tilt < 0.65) & slow
+    ripe = ripe & (distance(plan.lying, now) < 0.05)
+
+    taps = (plan.pitch == 0) & (plan.yaw != 0)
+    action = grasp(ee, width, position, velocity, aside, ripe)
+    action = torch.where(taps, tap(ee, width, position, plan.yaw, table), action)
+    rise = (ee[..., 2:] < 0.12).to(ee.dtype)
+    rise = torch.cat((zero, zero, rise, open_to(width, WIDE)), -1)
+    action = torch.where(leave, rise, action)
+
+    fresh = on_table & (offset[..., 2:].abs() < 0.012)
+    centred = offset[..., :1].abs() < 0.008
+    crooked = fresh & ~straight & centred
+    again = fresh & (~straight | swings & centred & (pitch.abs() > 0.2))
+    fingers = torch.where(crooked, open_to(width, CLOSE), 1.0)
+    stay = torch.cat((zero, zero, zero, fingers), -1)
+    swinging = swing(ee, width, offset, spin, pitch, left, last)
+    return torch.where(held, torch.where(again, stay, swinging), action)

@@ -78,7 +78,7 @@ def is_held(ee: Tensor, width: Tensor, cube: Tensor) -> Tensor:
     return (width > 0.02) & (width < 0.057) & offset.all(-1, keepdim=True)
 
 
-def open_to(width: Tensor, wanted: float) -> Tensor:
+def open_to(width: Tensor, wanted: float | Tensor) -> Tensor:
     """The gripper's action for a width [m]."""
     return ((wanted - width) / GRIPPER).clamp(-1.0, 1.0)
 

@@ -26,8 +26,9 @@ def successes(env_id, episodes, seed):
         ("PandaSlide-v1", 32, 20),
         ("PandaPickAndPlace-v1", 16, 15),
         ("PandaStack-v1", 16, 12),
-        ("PandaFlip-v1", 48, 2),
+        ("PandaFlip-v1", 48, 28),
         ("PandaPush-v3", 16, 13),
+        ("PandaFlip-v3", 32, 20),
     ],
 )
 def test_solves_its_task(env_id, episodes, least):

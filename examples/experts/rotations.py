@@ -1,0 +1,52 @@
+"""Quaternions xyzw, (..., 4), and the 24 ways in which a cube lies straight."""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def compose(first: Tensor, second: Tensor) -> Tensor:
+    """The quaternion of turning by ``second``, then by ``first``, (..., 4)."""
+    first, second = torch.broadcast_tensors(first, second)
+    a, a_w, b, b_w = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
+    scalar = a_w * b_w - (a * b).sum(-1, keepdim=True)
+    return torch.cat((a_w * b + b_w * a + torch.linalg.cross(a, b), scalar), -1)
+
+
+def turn(axis: int, angle: Tensor) -> Tensor:
+    """The quaternion of a turn about a world axis by an angle [rad], (..., 1)."""
+    parts = [torch.zeros_like(angle)] * 3
+    parts[axis] = (angle / 2).sin()
+    return torch.cat((*parts, (angle / 2).cos()), -1)
+
+
+def distance(first: Tensor, second: Tensor) -> Tensor:
+    """1 - <q, q'>^2, as the task Flip has it, (..., 1)."""
+    return 1 - (first * second).sum(-1, keepdim=True).square()
+
+
+def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+    """The distance left after the best turn about y, and that turn [rad], (..., 1)."""
+    half_turn = compose(start.new_tensor((0.0, 1.0, 0.0, 0.0)), start)
+    cosine = (goal * start).sum(-1, keepdim=True)
+    sine = (goal * half_turn).sum(-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, cosine)
+    angle = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+    return 1 - cosine.square() - sine.square(), angle
+
+
+def _straight_orientations() -> Tensor:
+    """Any face up, then any quarter turn about z: (24, 4)."""
+    quarters = torch.arange(4.0)[:, None] * math.pi / 2
+    faces = torch.cat((turn(0, quarters), turn(1, quarters[1::2])))
+    return compose(turn(2, quarters)[:, None], faces).flatten(0, 1)
+
+
+STRAIGHT = _straight_orientations()
+
+
+def straighten(cube: Tensor) -> Tensor:
+    """The nearest orientation of a cube that lies along the axes, (..., 4)."""
+    straight = STRAIGHT.to(cube)
+    return straight[(cube[..., None, :] * straight).sum(-1).abs().argmax(-1)]
