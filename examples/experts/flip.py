@@ -2,10 +2,10 @@
 
 The hand cannot turn, so it turns the cube in two other ways. A tap: with the fingers
 open around it, one of them knocks a corner, and the cube spins about z until the
-fingers close. A swing: held beside its centre in a grasp that
-loosens, the cube swings about y, the axis from finger to finger. A swing that ends
-with the cube hanging down can be set down: another face is up then. Last comes a
-swing that is held where it is best, or nothing more.
+fingers close. A swing: held beside its centre in a grasp that loosens, the cube swings
+about y, the axis from finger to finger. A swing that ends with the cube hanging down
+can be set down: another face is up then. Last comes a swing that is held where it is
+best, or nothing more.
 """
 
 import math
