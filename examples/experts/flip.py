@@ -1,11 +1,11 @@
 """The scripted expert for Flip: taps, drops and swings, planned from the quaternion.
 
 The hand cannot turn, so it turns the cube in two other ways. A tap: with the fingers
-open around it, one of them knocks a corner, and on the slippery table the cube spins
-about z until the fingers close. A swing: held beside its centre in a grasp that
-loosens, the cube swings about y, the axis from finger to finger. A swing that ends
-with the cube hanging down can be set down: another face is up then. Last comes a
-swing that is held where it is best, or nothing more.
+open around it, one of them knocks a corner, and the cube spins about z until the
+fingers close. A swing: held beside its centre in a grasp that loosens, the cube swings
+about y, the axis from finger to finger. A swing that ends with the cube hanging down
+can be set down: another face is up then. Last comes a swing that is held where it is
+best, or nothing more.
 """
 
 import math
@@ -217,7 +217,7 @@ def act(
     leave = ~swings & (plan.yaw == 0) | (left < DONE) & (turning < 0.5) & on_table
 
     # The fingers straighten a cube that they close on at its centre; straight, it is
-    # grasped aside.
+    # grasped aside. One that spins is caught when it is nearly straight as planned.
     now = straighten(cube)
     tilt = 2 * (cube * now).sum(-1, keepdim=True).abs().clamp(max=1.0).acos()
     slow, straight = spin_z.abs() < 1.5, tilt < TILT
@@ -233,6 +233,8 @@ def act(
     rise = torch.cat((zero, zero, rise, open_to(width, WIDE)), -1)
     action = torch.where(leave, rise, action)
 
+    # Just gripped on the table: crooked, the cube is squeezed at its centre; then the
+    # fingers open to grasp it aside.
     fresh = on_table & (offset[..., 2:].abs() < 0.012)
     centred = offset[..., :1].abs() < 0.008
     crooked = fresh & ~straight & centred
