@@ -12,7 +12,7 @@ from torchrl.record.loggers import Logger
 import torch_panda
 from tests.panda_gym_reference import make_reference, start
 from torch_panda import BulletError, Camera
-from torch_panda.bullet import visual
+from torch_panda.rendering.visual_client import VisualClient
 
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
 CLOSE = Camera(target=(0.0, 0.0, 0.0), distance=0.5, width=60, height=40)
@@ -123,13 +123,13 @@ def test_pictures_do_not_depend_on_threads():
 
 def test_nothing_is_built_before_something_is_drawn(monkeypatch):
     made = []
-    constructor = visual.VisualClient.__init__
+    constructor = VisualClient.__init__
 
     def count(self, *args, **kwargs):
         made.append(self)
         constructor(self, *args, **kwargs)
 
-    monkeypatch.setattr(visual.VisualClient, "__init__", count)
+    monkeypatch.setattr(VisualClient, "__init__", count)
     with torch_panda.make("PandaPush-v1", num_envs=3, num_threads=2, seed=0) as env:
         env.rollout(3)
         assert not made

@@ -1,0 +1,109 @@
+"""What Bullet reports of a body, as views of its memory.
+
+They are valid until the client's next command; copy what is to be kept. All numbers are
+float64 and in the world frame.
+"""
+
+from ctypes import byref, c_double, c_int, c_void_p
+
+import numpy as np
+import numpy.typing as npt
+
+from torch_panda.bullet import capi
+
+Doubles = npt.NDArray[np.float64]
+
+# Joints follow the base in Bullet's coordinates: 7 of its pose, 6 of its velocity.
+Q_OFFSET = 7
+U_OFFSET = 6
+
+_DOUBLE = 8  # bytes
+
+
+def _view(address: int | None, first: int, *shape: int) -> Doubles:
+    """Doubles from the one with number ``first`` on."""
+    assert address is not None  # Bullet has answered
+    count = shape[0] if len(shape) == 1 else shape[0] * shape[1]
+    array = (c_double * count).from_address(address + _DOUBLE * first)
+    view: Doubles = np.ctypeslib.as_array(array)
+    return view if len(shape) == 1 else view.reshape(shape)
+
+
+class BodyState:
+    """The state of a body with n joints of one degree of freedom and m links.
+
+    Args:
+        status: Bullet's answer to a request for the state.
+    """
+
+    def __init__(self, status: int) -> None:
+        links, q_size, u_size = c_int(), c_int(), c_int()
+        q, u, poses, velocities = c_void_p(), c_void_p(), c_void_p(), c_void_p()
+        wrenches, motors = c_void_p(), c_void_p()
+        capi.state_result(
+            status,
+            None,
+            byref(links),
+            byref(q_size),
+            byref(u_size),
+            None,
+            byref(q),
+            byref(u),
+            byref(wrenches),
+            None,
+            byref(motors),
+            byref(poses),
+            byref(velocities),
+        )
+        self._num_links = links.value
+        self._num_joints = q_size.value - Q_OFFSET
+        self._q, self._u = q.value, u.value
+        self._poses, self._velocities = poses.value, velocities.value
+        self._wrenches, self._motors = wrenches.value, motors.value
+
+    @property
+    def base_pose(self) -> Doubles:
+        """(7,): position [m] and quaternion xyzw."""
+        return _view(self._q, 0, 7)
+
+    @property
+    def base_velocity(self) -> Doubles:
+        """(6,): linear [m/s] and angular [rad/s]."""
+        return _view(self._u, 0, 6)
+
+    @property
+    def joint_positions(self) -> Doubles:
+        """(n,) [rad] or [m]."""
+        return _view(self._q, Q_OFFSET, self._num_joints)
+
+    @property
+    def joint_velocities(self) -> Doubles:
+        """(n,) [rad/s] or [m/s]."""
+        return _view(self._u, U_OFFSET, self._num_joints)
+
+    def link_pose(self, link: int) -> Doubles:
+        """(7,): of a link's centre of mass."""
+        return _view(self._poses, 7 * link, 7)
+
+    def link_velocity(self, link: int) -> Doubles:
+        """(6,): of a link's centre of mass; filled only if it was asked for."""
+        return _view(self._velocities, 6 * link, 6)
+
+    @property
+    def link_poses(self) -> Doubles:
+        """(m, 7): of the centres of mass."""
+        return _view(self._poses, 0, self._num_links, 7)
+
+    @property
+    def wrenches(self) -> Doubles:
+        """(m, 6): what each link's parent exerts on it in the last step.
+
+        Force [N] and torque [N m], at the joint and in the link's frame; zero without a
+        sensor.
+        """
+        return _view(self._wrenches, 0, self._num_links, 6)
+
+    @property
+    def motor_forces(self) -> Doubles:
+        """(m,): what each joint's motor exerts in the last step [N m] or [N]."""
+        return _view(self._motors, 0, self._num_links)
