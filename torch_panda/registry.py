@@ -23,6 +23,7 @@ from torch_panda.tasks import (
     Task,
 )
 from torch_panda.versions import (
+    NO_PAIRS,
     ROBOT_ARGUMENTS,
     TASK_ARGUMENTS,
     VERSIONS,
@@ -100,11 +101,11 @@ def make(
         robot=Panda(
             control_type=_CONTROL[control],
             block_gripper=task in _BLOCKED_GRIPPER,
-            **arguments_of(ROBOT_ARGUMENTS[task], version),
+            **arguments_of(ROBOT_ARGUMENTS.get(task, NO_PAIRS), version),
         ),
         task=_TASKS[task](
             reward_type=_REWARD[reward],
-            **arguments_of(TASK_ARGUMENTS[task], version),
+            **arguments_of(TASK_ARGUMENTS.get(task, NO_PAIRS), version),
         ),
         num_envs=num_envs,
         num_threads=num_threads,

@@ -436,7 +436,7 @@ physics_set_joint_feedback = bind(
     _cheap, "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
 )
 
-# Looks: shapes that are seen, and cameras that see them
+# Visuals: shapes that are seen, and cameras that see them
 visual_init = bind(_cheap, "b3CreateVisualShapeCommandInit", _command, _client)
 visual_add_box = bind(_cheap, "b3CreateVisualShapeAddBox", c_int, _command, _doubles)
 visual_add_sphere = bind(

@@ -287,32 +287,15 @@ class Episodes(Closing):
 
     def _replay(self, envs: list[int], given: GivenState) -> None:
         """Take the actions of an exact state, and make sure that they lead there."""
-        assert given.actions is not None and given.num_actions is not None
-        counts = given.num_actions.flatten()
-        shape = (self.num_envs, self.robot.action_dim)
-        for index in range(given.actions.shape[1]):
-            rows = (counts > index).nonzero().flatten()
-            if not len(rows):
-                break
-            acting = torch.tensor(envs, device="cpu")[rows]
-            action = torch.zeros(shape, device="cpu")
-            action[acting] = given.actions[rows, index]
+        for action, acting, last in given.steps(envs, self.num_envs):
             stepped = torch.zeros(self.num_envs, 1, dtype=torch.bool, device="cpu")
             stepped[acting] = True
             self._history.append(action, stepped)
-            self._act(action, acting.tolist())
-            last = acting[counts[rows] == index + 1].tolist()
+            self._act(action, acting)
             for reading in self._readings:
                 reading.after_step(last)
         self._step_count[envs] = given.values["step_count"]
-        for key, value in self._state().items():
-            wrong = (value[envs] != given.values[key]).flatten(1).any(dim=1).nonzero()
-            if len(wrong):
-                raise ValueError(
-                    f"the exact state of environment {envs[int(wrong[0])]} does not "
-                    f"lead to its {key}: it was changed, or is of another environment; "
-                    f"leave out its start and its actions to start from the rest"
-                )
+        given.check_arrival(envs, self._state())
 
     def _recover(self, envs: list[int]) -> None:
         """Start the next episode of environments whose physics has diverged."""

@@ -1,21 +1,21 @@
 """A robot and a task, as one batched TorchRL environment."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.closing import Closing
 from torch_panda.envs.checks import check_device
 from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
+from torch_panda.envs.persistence import PersistentEnv
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, PHYSICAL, holds_state
+from torch_panda.envs.state import EXACT_KEYS, means_state
 from torch_panda.rendering import Camera, RendererName, Window
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -24,7 +24,7 @@ from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
 
 
-class RobotTaskEnv(EnvBase, Closing):
+class RobotTaskEnv(PersistentEnv, Closing):
     """Goal-conditioned environments of one robot and one task, stepped in parallel.
 
     What an environment draws depends on (``seed``, its index, the number of its
@@ -73,12 +73,6 @@ class RobotTaskEnv(EnvBase, Closing):
 
     _supports_set_state = True
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> "RobotTaskEnv":  # noqa: ANN401 (a subclass's own)
-        """Remember the arguments, a subclass's too, for copies."""
-        env = super().__new__(cls, *args, **kwargs)
-        env._arguments = (args, kwargs)
-        return env
-
     @torch.inference_mode(False)  # or specs could not be used outside that mode
     def __init__(
         self,
@@ -112,8 +106,7 @@ class RobotTaskEnv(EnvBase, Closing):
             on_divergence=on_divergence,
         )
         super().__init__(device=device, batch_size=episodes.batch_shape)
-        self.episodes = episodes
-        self.num_envs = num_envs
+        self.episodes, self.num_envs = episodes, num_envs
         self.robot, self.task = robot, task
         self.physics = episodes.physics
         self.max_episode_steps = episodes.max_episode_steps
@@ -125,8 +118,6 @@ class RobotTaskEnv(EnvBase, Closing):
         self.reward_spec, self.done_spec = specs.reward, specs.done
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
-
-    # ---- what it is --------------------------------------------------------------
 
     @property
     def num_threads(self) -> int:
@@ -158,9 +149,6 @@ class RobotTaskEnv(EnvBase, Closing):
         """Let environment ``env`` draw what the first one draws under ``seed``.
 
         For interfaces that seed environments one by one, such as Gymnasium's.
-
-        Raises:
-            ValueError: the seed is negative.
         """
         self.episodes.seeds.restart_one(env, seed)
 
@@ -260,50 +248,13 @@ class RobotTaskEnv(EnvBase, Closing):
                 `TransformedEnv` and `ParallelEnv` do not pass states on.
         """
         # Within a rollout torchrl resets with what was observed, and says so.
-        decide = set_state is None and not kwargs.get("select_reset_only", False)
-        if decide and tensordict is not None and holds_state(tensordict):
-            if "achieved_goal" in tensordict:
-                raise ValueError(
-                    f"the tensordict holds observations and a state (one of "
-                    f"{', '.join(PHYSICAL)}): say set_state=True to start from it, "
-                    "set_state=False to start a new episode"
-                )
-            set_state = True
+        if set_state is None and not kwargs.get("select_reset_only", False):
+            set_state = means_state(tensordict)
         if set_state and tensordict is not None:
             # torchrl writes what is observed into it, the goal as float32.
             tensordict = tensordict.copy()
         start = super().reset(tensordict, set_state=set_state, **kwargs)
         return start.exclude(*EXACT_KEYS) if set_state else start
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Seeds and numbers of episodes, which ``state_dict`` holds."""
-        return self.episodes.seeds.state()
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Draw the episodes that follow those of a ``state_dict``."""
-        self.episodes.seeds.load(state)
-
-    def load_state_dict(
-        self,
-        state_dict: Mapping[str, Any],
-        *args: Any,  # noqa: ANN401 (torch's signature)
-        **kwargs: Any,  # noqa: ANN401
-    ) -> object:
-        """Load a ``state_dict``; nothing if it is empty, as a collector's part for it.
-
-        torchrl's collectors leave an environment's own state out of theirs.
-
-        Raises:
-            ValueError: it is of another number of environments.
-        """
-        return (
-            super().load_state_dict(state_dict, *args, **kwargs) if state_dict else None
-        )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Physics cannot be copied: a pickle holds how to build the environment anew.
-        seed = self.episodes.seeds.seed
-        return _rebuild, (type(self), *self._arguments, seed, self.device)
 
     # ---- what torchrl calls ------------------------------------------------------
 
@@ -325,15 +276,8 @@ class RobotTaskEnv(EnvBase, Closing):
     ) -> TensorDict:
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = None if mask is None else indices(mask)
-        state = None
-        if set_state:
-            state = {} if tensordict is None else tensordict
-        return self._emit(self.episodes.reset(envs, state))
-
-    def _create_done_specs(self) -> None:
-        # They are complete. torchrl's method leaves a cycle of references behind, which
-        # keeps a forgotten environment alive until the garbage collector finds it.
-        pass
+        given = {} if tensordict is None else tensordict
+        return self._emit(self.episodes.reset(envs, given if set_state else None))
 
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)
@@ -354,16 +298,3 @@ class RobotTaskEnv(EnvBase, Closing):
         if self.num_envs is None:
             values = {key: value.squeeze(0) for key, value in values.items()}
         return TensorDict(values, batch_size=self.batch_size, device=self.device)
-
-
-def _rebuild(
-    kind: type[RobotTaskEnv],
-    args: tuple[Any, ...],
-    kwargs: dict[str, Any],
-    seed: int | None,
-    device: torch.device,
-) -> RobotTaskEnv:
-    """A new environment like one that was pickled."""
-    env = kind(*args, **kwargs)
-    env.episodes.seeds.restart(seed)
-    return env.to(device)

@@ -1,6 +1,6 @@
 """Reading a start state that a user gives."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,17 +36,66 @@ class GivenState:
     actions: Tensor | None = None
     num_actions: Tensor | None = None
 
+    def steps(
+        self, envs: list[int], num_envs: int
+    ) -> Iterator[tuple[Tensor, list[int], list[int]]]:
+        """The actions, step by step.
 
-def holds_state(entries: Mapping[str, Any]) -> bool:
-    """Whether a reset's argument can only be meant as a state.
+        Args:
+            envs: whose state it is, k of them.
+            num_envs: number of all environments, n.
+
+        Yields:
+            The action, (n, action_dim); which environments take it; and which of them
+            take no other.
+        """
+        if self.actions is None or self.num_actions is None:
+            return
+        counts = self.num_actions.flatten()
+        rows = torch.tensor(envs, device="cpu")
+        for index in range(int(counts.max())):
+            acting = counts > index
+            action = self.actions.new_zeros(num_envs, self.actions.shape[-1])
+            action[rows[acting]] = self.actions[acting, index]
+            last = rows[counts == index + 1]
+            yield action, rows[acting].tolist(), last.tolist()
+
+    def check_arrival(self, envs: list[int], state: dict[str, Tensor]) -> None:
+        """Make sure that the actions have led to the state.
+
+        Raises:
+            ValueError: they have not.
+        """
+        for key, value in state.items():
+            wrong = (value[envs] != self.values[key]).flatten(1).any(dim=1).nonzero()
+            if len(wrong):
+                raise ValueError(
+                    f"the exact state of environment {envs[int(wrong[0])]} does not "
+                    f"lead to its {key}: it was changed, or is of another environment; "
+                    f"leave out its start and its actions to start from the rest"
+                )
+
+
+def means_state(entries: Mapping[str, Any] | None) -> bool:
+    """Whether a reset's argument is a state to start from, though nobody has said so.
 
     What torchrl passes to an ordinary reset may have a ``desired_goal`` too, and from
     torchrl's `StepCounter` a ``step_count``, but it then has an ``achieved_goal``.
+
+    Raises:
+        ValueError: it holds a state and observations, so that it may mean either.
     """
-    keys = set(entries.keys())
-    return bool(keys.intersection(PHYSICAL)) or (
-        "desired_goal" in keys and "achieved_goal" not in keys
-    )
+    keys = set() if entries is None else set(entries.keys())
+    observed = "achieved_goal" in keys
+    if not keys.intersection(PHYSICAL):
+        return "desired_goal" in keys and not observed
+    if observed:
+        raise ValueError(
+            f"the tensordict holds observations and a state (one of "
+            f"{', '.join(PHYSICAL)}): say set_state=True to start from it, "
+            "set_state=False to start a new episode"
+        )
+    return True
 
 
 def read_state(
