@@ -6,6 +6,7 @@ import torch
 
 import torch_panda
 from tests.envs.test_parity import choose_action
+from torch_panda.envs import history
 from torch_panda.gymnasium_envs import GoalEnv
 
 NUM_ENVS = 4
@@ -128,6 +129,21 @@ def test_what_is_no_exact_state(change, message):
         with pytest.raises(ValueError, match=message):
             env.reset(change(state.clone()), set_state=True)
         env.rollout(3)
+
+
+def test_episodes_without_end_are_forgotten(monkeypatch):
+    monkeypatch.setattr(history, "_MOST", 10)
+    with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
+        td = env.reset().set("action", torch.zeros(2, 3))
+        for _ in range(10):
+            env.step(td.clone())
+        assert env.get_state(exact=True)["actions"].shape == (2, 10, 3)
+        env.step(td.clone())
+        with pytest.raises(torch_panda.BulletError, match=r"\[0, 1\] are too long"):
+            env.get_state(exact=True)
+        env.reset()
+        env.step(td.clone())
+        assert env.get_state(exact=True)["actions"].shape == (2, 1, 3)
 
 
 def test_long_histories_are_forgotten_with_their_episodes():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torch_panda.bullet.scene_client import find_urdf
+from torch_panda.bullet.urdf import find_urdf
 from torch_panda.rendering import Camera
 from torch_panda.rendering.mesh_decimation import decimated_urdf, merge_vertices
 from torch_panda.rendering.visual_client import VisualClient

@@ -1,8 +1,6 @@
 """Building a world of bodies in a client, and asking what it is made of."""
 
-import importlib.util
 import math
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from ctypes import byref
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ from pathlib import Path
 from torch_panda.bullet import capi
 from torch_panda.bullet.connection import Connection, doubles
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
+from torch_panda.bullet.urdf import check_collision_filters, find_urdf
 
 ORIGIN = (0.0, 0.0, 0.0)
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -76,7 +75,7 @@ class SceneClient(Connection):
             BulletError: Bullet cannot read it.
         """
         file = find_urdf(path)
-        _check_collision_filters(file)
+        check_collision_filters(file)
         check_quaternion("orientation", orientation)
         pose = tuple(map(float, (*position, *orientation)))
         self._blueprint.append(("load_urdf", file, pose, fixed_base))
@@ -284,21 +283,6 @@ class SceneClient(Connection):
         return -1
 
 
-def find_urdf(path: str | Path) -> str:
-    """A URDF file by its path, or by its place among those pybullet ships.
-
-    Raises:
-        FileNotFoundError: there is no such file in either place.
-    """
-    spec = importlib.util.find_spec("pybullet_data")
-    assert spec is not None and spec.origin is not None  # part of pybullet's wheel
-    shipped = Path(spec.origin).parent
-    for candidate in (Path(path), shipped / path):
-        if candidate.is_file():
-            return str(candidate)
-    raise FileNotFoundError(f"no URDF file at {path}, nor at {shipped / path}")
-
-
 def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
     """Make sure that a quaternion xyzw stands for a rotation.
 
@@ -314,18 +298,3 @@ def _check_not_negative(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not 0 <= value < math.inf:
             raise ValueError(f"{name} must be finite and at least 0, got {value}")
-
-
-def _check_collision_filters(file: str) -> None:
-    """Raise ValueError if a URDF chooses its own collision groups or masks."""
-    try:
-        tree = ElementTree.parse(file)
-    except ElementTree.ParseError:
-        return  # Bullet says what is wrong
-    for shape in tree.iter("collision"):
-        chosen = {"group", "mask"} & set(shape.attrib)
-        if chosen:
-            raise ValueError(
-                f"the collision shapes of a URDF must not have a group or a mask, "
-                f"got {sorted(chosen)} in {file}"
-            )

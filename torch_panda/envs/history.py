@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torch_panda.bullet import BulletError
+
 # Keys of an exact state beside those of a state.
 START = "start_"  # followed by a key of the state
 ACTIONS = "actions"
@@ -16,6 +18,9 @@ NUM_ACTIONS = "num_actions"
 
 # Steps that all environments have left behind are dropped in pieces of this size.
 _PIECE = 1000
+# Longer episodes have no exact state: some end never, and would take all memory.
+_MOST = 20_000  # steps
+_LOST = -1
 
 
 class History:
@@ -50,13 +55,24 @@ class History:
             action: (n, action_dim) float32, which nobody changes later.
             stepped: which environments took it, (n, 1) bool; None: all.
         """
+        if len(self._steps) == _MOST:
+            self._steps = []
+            self._begun = [_LOST] * len(self._begun)
         self._steps.append((action, stepped))
 
     def export(self) -> dict[str, Tensor]:
         """Starts, ``actions`` (n, most, action_dim) and ``num_actions`` (n, 1).
 
         Of environment i the first ``num_actions[i]`` actions count; the rest are zero.
+
+        Raises:
+            BulletError: an episode has been so long that its actions are forgotten.
         """
+        if lost := [env for env, begun in enumerate(self._begun) if begun == _LOST]:
+            raise BulletError(
+                f"the episodes of environments {lost} are too long for an exact state, "
+                f"which holds at most {_MOST} actions"
+            )
         begun = torch.tensor(self._begun, device="cpu")
         first = int(begun.min())
         taken = [
