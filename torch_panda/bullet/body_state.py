@@ -37,29 +37,27 @@ class BodyState:
     """
 
     def __init__(self, status: int) -> None:
-        links, q_size, u_size = c_int(), c_int(), c_int()
+        self._status = status
+        q_size = c_int()
         q, u, poses, velocities = c_void_p(), c_void_p(), c_void_p(), c_void_p()
-        wrenches, motors = c_void_p(), c_void_p()
         capi.state_result(
             status,
             None,
-            byref(links),
+            None,
             byref(q_size),
-            byref(u_size),
+            None,
             None,
             byref(q),
             byref(u),
-            byref(wrenches),
             None,
-            byref(motors),
+            None,
+            None,
             byref(poses),
             byref(velocities),
         )
-        self._num_links = links.value
         self._num_joints = q_size.value - Q_OFFSET
         self._q, self._u = q.value, u.value
         self._poses, self._velocities = poses.value, velocities.value
-        self._wrenches, self._motors = wrenches.value, motors.value
 
     @property
     def base_pose(self) -> Doubles:
@@ -92,7 +90,7 @@ class BodyState:
     @property
     def link_poses(self) -> Doubles:
         """(m, 7): of the centres of mass."""
-        return _view(self._poses, 0, self._num_links, 7)
+        return _view(self._poses, 0, self._read_forces()[0], 7)
 
     @property
     def wrenches(self) -> Doubles:
@@ -101,9 +99,28 @@ class BodyState:
         Force [N] and torque [N m], at the joint and in the link's frame; zero without a
         sensor.
         """
-        return _view(self._wrenches, 0, self._num_links, 6)
+        num_links, wrenches, _ = self._read_forces()
+        return _view(wrenches, 0, num_links, 6)
 
     @property
     def motor_forces(self) -> Doubles:
         """(m,): what each joint's motor exerts in the last step [N m] or [N]."""
-        return _view(self._motors, 0, self._num_links)
+        num_links, _, motors = self._read_forces()
+        return _view(motors, 0, num_links)
+
+    def _read_forces(self) -> tuple[int, int | None, int | None]:
+        """Number of links, and where wrenches and motor forces are."""
+        links, wrenches, motors = c_int(), c_void_p(), c_void_p()
+        nothing = (None,) * 5
+        capi.state_result(
+            self._status,
+            None,
+            byref(links),
+            *nothing,
+            byref(wrenches),
+            None,
+            byref(motors),
+            None,
+            None,
+        )
+        return links.value, wrenches.value, motors.value

@@ -240,7 +240,8 @@ class VectorSimulation:
         self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
         self.marker_pose = zeros(len(scene.markers), 7)
         # The same memory, part by part, for `_read`: rows of tensors take longer.
-        self._columns = np.split(self._state.numpy(), np.cumsum(sizes)[:-1], axis=1)
+        ends = np.cumsum(sizes)[:-1]
+        self._rows = [np.split(row, ends) for row in self._state.numpy()]
 
     def _step_one(self, control: Control, env: int) -> None:
         self._begin_step(control, self.n_substeps, env)
@@ -276,16 +277,13 @@ class VectorSimulation:
     def _read(self, env: int) -> None:
         """Copy the state of one client into the tensors."""
         client, scene = self._clients[env], self.scene
-        rows = [column[env] for column in self._columns]
-        position, velocity, ee_position, ee_velocity, object_pose, object_velocity = (
-            rows
-        )
+        joints, speeds, ee_position, ee_velocity, poses, velocities = self._rows[env]
         state = client.state(scene.robot, link_velocities=True)
-        position[:] = state.joint_positions
-        velocity[:] = state.joint_velocities
+        joints[:] = state.joint_positions
+        speeds[:] = state.joint_velocities
         ee_position[:] = state.link_pose(scene.ee_link)[:3]
         ee_velocity[:] = state.link_velocity(scene.ee_link)[:3]
         for k, body in enumerate(scene.objects):
             state = client.state(body)
-            object_pose[7 * k : 7 * k + 7] = state.base_pose
-            object_velocity[6 * k : 6 * k + 6] = state.base_velocity
+            poses[7 * k : 7 * k + 7] = state.base_pose
+            velocities[6 * k : 6 * k + 6] = state.base_velocity

@@ -1,11 +1,13 @@
 """Drawing the start of an episode."""
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
-from torch_panda.envs.state import check_rotations
+from torch_panda.envs.state import QUATERNION_TOLERANCE
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 
@@ -37,7 +39,11 @@ def draw_start(
     if simulation.scene.objects:
         pose = simulation.object_pose
         _fill(pose[env], task.sample_objects(rng), "sample_objects")
-        check_rotations("sample_objects", pose[env : env + 1], [env])
+        for *_, x, y, z, w in pose[env].tolist():
+            if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
+                raise ValueError(
+                    f"sample_objects must return unit quaternions, got {[x, y, z, w]}"
+                )
         simulation.object_velocity[env] = 0.0
 
 
