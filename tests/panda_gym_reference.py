@@ -13,12 +13,12 @@ class _NoTextures(PyBullet):
         super().create_box(*args, **kwargs)
 
 
-def make_reference(env_id):
+def make_reference(env_id, **options):
     """A fresh panda-gym environment, without gymnasium's wrappers."""
     tasks = panda_gym.envs.panda_tasks
     tasks.PyBullet = _NoTextures
     try:
-        return gymnasium.make(env_id).unwrapped
+        return gymnasium.make(env_id, **options).unwrapped
     finally:
         tasks.PyBullet = PyBullet
 

@@ -1,15 +1,14 @@
 """``python -m torch_panda info``."""
 
 import re
-import subprocess
-import sys
 
 import torch_panda
+from torch_panda.__main__ import main
 
 
-def test_names_versions_ids_and_spaces():
-    command = (sys.executable, "-m", "torch_panda", "info")
-    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+def test_names_versions_ids_and_spaces(capsys):
+    main(["info"])
+    output = capsys.readouterr().out
     assert re.search(r"pybullet 3\.\d", output)
     assert "cores usable" in output
     assert "TinyRenderer" in output

@@ -1,16 +1,16 @@
 """Goal-conditioned Franka Panda tasks as one vectorised TorchRL environment."""
 
-from torch_panda.bullet import (
-    BulletError,
-    Camera,
-    PhysicsName,
-    PhysicsParams,
-    WorkerError,
-)
+from torch_panda.bullet import BulletError, PhysicsName, PhysicsParams, WorkerError
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.gymnasium_envs import register_envs
-from torch_panda.registry import ENV_IDS, make, max_episode_steps
+from torch_panda.registry import (
+    ENV_IDS,
+    make,
+    max_episode_steps,
+    register_with_gymnasium,
+)
+from torch_panda.rendering import Camera
 from torch_panda.robots import Panda, Robot
+from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
     Flip,
     PickAndPlace,
@@ -25,7 +25,9 @@ __all__ = [
     "ENV_IDS",
     "BulletError",
     "Camera",
+    "CameraSensor",
     "Flip",
+    "ForceSensor",
     "Panda",
     "PhysicsName",
     "PhysicsParams",
@@ -34,6 +36,7 @@ __all__ = [
     "Reach",
     "Robot",
     "RobotTaskEnv",
+    "Sensor",
     "Slide",
     "Stack",
     "Task",
@@ -42,4 +45,5 @@ __all__ = [
     "max_episode_steps",
 ]
 
-register_envs()
+# So that `gymnasium.register_envs(torch_panda)` reads as for any other package.
+register_with_gymnasium()

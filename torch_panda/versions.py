@@ -79,6 +79,9 @@ ROBOT_ARGUMENTS: dict[str, Pairs] = {
 
 VERSIONS = ("v1", "v3")
 
+# Of a task that is the same in both.
+NO_PAIRS = _pairs()
+
 
 def arguments_of(pairs: Pairs, version: str) -> dict[str, Any]:
     """One version's values of some arguments."""

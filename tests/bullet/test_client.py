@@ -1,25 +1,17 @@
 """The layer against the pybullet module itself: the same commands, equal numbers."""
 
-import ctypes
-from ctypes import c_double
-
 import numpy as np
 import pybullet
 import pybullet_data
 import pytest
-import torch
 from pybullet_utils.bullet_client import BulletClient
 
-from torch_panda.bullet import BulletError, PhysicsClient, _capi
+from torch_panda.bullet import BulletError, PhysicsClient, capi, library
 
 JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
 NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 EE_LINK = 11
-
-
-def read(address, count):
-    return list((c_double * count).from_address(address))
 
 
 @pytest.fixture
@@ -74,9 +66,9 @@ def test_falling_bodies(reference, kind):
             client.step()
         state = client.state(body)
         position, orientation = reference.getBasePositionAndOrientation(body)
-        assert read(state.q, 7) == [*position, *orientation]
+        assert state.base_pose.tolist() == [*position, *orientation]
         linear, angular = reference.getBaseVelocity(body)
-        assert read(state.u, 6) == [*linear, *angular]
+        assert state.base_velocity.tolist() == [*linear, *angular]
         theirs = reference.getContactPoints(body, ground)
         ours = client.contact_points(body, ground)
         assert len(theirs) > 0
@@ -98,25 +90,17 @@ def test_arm_with_kinematics_and_motors(reference):
         for joint, position in zip(JOINTS, NEUTRAL, strict=True):
             reference.resetJointState(arm, joint, position)
             client.set_joint(arm, joint, position, 0.0)
-        target = torch.zeros(3, dtype=torch.float64)
-        rotation = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-        joints = torch.zeros(9, dtype=torch.float64)
-        forces = (c_double * 9)(*FORCES)
+        target, joints = np.zeros(3), np.zeros(9)
+        rotation = (1.0, 0.0, 0.0, 0.0)
         for _ in range(40):
             ee = np.array(reference.getLinkState(arm, EE_LINK)[0])
             goal = np.array(reference.getBasePositionAndOrientation(body)[0])
             step = np.clip((goal - ee) * 20 + rng.normal(size=3) * 0.3, -1, 1)
-            target[:] = torch.from_numpy(ee + step * 0.05)
+            target[:] = ee + step * 0.05
             theirs = reference.calculateInverseKinematics(
-                arm, EE_LINK, target.tolist(), rotation.tolist()
+                arm, EE_LINK, target.tolist(), rotation
             )
-            client.inverse_kinematics(
-                arm,
-                EE_LINK,
-                target.data_ptr(),
-                rotation.data_ptr(),
-                joints.data_ptr(),
-            )
+            client.inverse_kinematics(arm, EE_LINK, target, rotation, joints)
             assert joints.tolist() == list(theirs)
             reference.setJointMotorControlArray(
                 arm,
@@ -125,17 +109,17 @@ def test_arm_with_kinematics_and_motors(reference):
                 targetPositions=joints.tolist(),
                 forces=FORCES,
             )
-            client.control_joints(arm, joints.data_ptr(), forces)
+            client.control_joints(arm, joints, FORCES)
             client.step(20)
             for _ in range(20):
                 reference.stepSimulation()
             state = client.state(arm, link_velocities=True)
             states = reference.getJointStates(arm, JOINTS)
-            assert read(state.joint_positions, 9) == [s[0] for s in states]
-            assert read(state.joint_velocities, 9) == [s[1] for s in states]
+            assert state.joint_positions.tolist() == [s[0] for s in states]
+            assert state.joint_velocities.tolist() == [s[1] for s in states]
             link = reference.getLinkState(arm, EE_LINK, computeLinkVelocity=True)
-            assert read(state.link_pose(EE_LINK), 7) == [*link[0], *link[1]]
-            assert read(state.link_velocity(EE_LINK), 6) == [*link[6], *link[7]]
+            assert state.link_pose(EE_LINK).tolist() == [*link[0], *link[1]]
+            assert state.link_velocity(EE_LINK).tolist() == [*link[6], *link[7]]
         assert reference.getContactPoints(arm, body), "the arm must touch the box"
 
 
@@ -165,16 +149,16 @@ def test_unknown_body_raises():
 
 def test_missing_symbol_names_the_version_that_works():
     with pytest.raises(ImportError, match=r"b3NoSuch.*pybullet==3\.2\.7"):
-        _capi.bind(ctypes.CDLL(_capi.library_path()), "b3NoSuch", None)
+        library.bind(library.WORK, "b3NoSuch", None)
 
 
 def test_missing_pybullet_names_the_version_that_works():
     with pytest.raises(ImportError, match=r"not installed.*pybullet==3\.2\.7"):
-        _capi.library_path("no_such_pybullet")
+        library.library_path("no_such_pybullet")
 
 
 def test_other_status_codes_are_refused(monkeypatch):
-    monkeypatch.setattr(_capi, "CMD_PERFORM_COLLISION_DETECTION_COMPLETED", 111)
+    monkeypatch.setattr(capi, "CMD_PERFORM_COLLISION_DETECTION_COMPLETED", 111)
     with pytest.raises(ImportError, match=r"status codes differ.*3\.2\.7"):
         PhysicsClient()
 
@@ -193,8 +177,8 @@ def test_mass(reference):
 @pytest.mark.parametrize(
     ("group", "mask", "falls"),
     [
-        (*_capi.FILTER_DYNAMIC, False),
-        (*_capi.FILTER_STATIC, True),  # what cannot move does not touch the ground
+        (*capi.FILTER_DYNAMIC, False),
+        (*capi.FILTER_STATIC, True),  # what cannot move does not touch the ground
         (0, -1, False),
         (1, 0, False),
         (0, 0, True),
@@ -210,7 +194,7 @@ def test_collision_filter(reference, group, mask, falls):
             client.step()
             reference.stepSimulation()
         position, _ = reference.getBasePositionAndOrientation(cube)
-        assert read(client.state(cube).q, 3) == list(position)
+        assert client.state(cube).base_pose[:3].tolist() == list(position)
         assert (position[2] < -0.1) == falls
 
 
@@ -267,8 +251,6 @@ def test_joint_forces(reference):
             jointFeedbackMode=reference.JOINT_FEEDBACK_IN_JOINT_FRAME
         )
         client.enable_wrench_sensor(arm, 8)
-        targets = torch.tensor(NEUTRAL, dtype=torch.float64)
-        forces = (c_double * 9)(*FORCES)
         reference.setJointMotorControlArray(
             arm,
             JOINTS,
@@ -276,14 +258,14 @@ def test_joint_forces(reference):
             targetPositions=NEUTRAL,
             forces=FORCES,
         )
-        client.control_joints(arm, targets.data_ptr(), forces)
+        client.control_joints(arm, np.array(NEUTRAL), FORCES)
         for _ in range(20):
             reference.stepSimulation()
         client.step(20)
-        ours = client.joint_forces(arm)
+        ours = client.state(arm)
         _, _, theirs, _ = reference.getJointState(arm, 8)
-        assert read(ours.wrench(8), 6) == list(theirs)
+        assert ours.wrenches[8].tolist() == list(theirs)
         torques = [reference.getJointState(arm, joint)[3] for joint in JOINTS]
-        motors = read(ours.motor_forces, 12)
+        motors = ours.motor_forces.tolist()
         assert [motors[joint] for joint in JOINTS] == torques
         assert max(map(abs, torques)) > 1

@@ -52,7 +52,7 @@ def test_scenes_must_be_the_same():
     def build(client: PhysicsClient) -> Scene:
         robot = client.create_sphere(0.1, mass=1.0, position=(0.0, 0.0, len(bodies)))
         bodies.append(robot)
-        return Scene(robot, (), 0, (0.0, 0.0, 0.0, 1.0), len(bodies), ())
+        return Scene(robot, (), ee_link=len(bodies))
 
     with pytest.raises(torch_panda.BulletError, match="same in every client"):
         VectorSimulation(build, 2)

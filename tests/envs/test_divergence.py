@@ -21,8 +21,8 @@ def env(request):
 
 def blow_up(env, index, body):
     """Give a body a velocity whose square overflows, behind the environment's back."""
-    simulation = env._simulation
-    client, scene = simulation._clients[index], simulation.scene
+    simulation = env.episodes.simulation
+    client, scene = simulation.clients[index], simulation.scene
     if body == "object":
         (cube,) = scene.objects
         client.set_base(cube, (0, 0, 0.02), (0, 0, 0, 1), (1e300, 0, 0), (0, 0, 0))

@@ -1,5 +1,13 @@
-"""-v1 against panda-gym 1.1.0 and every -v3 id against 3.0.7, bit for bit."""
+"""-v1 against panda-gym 1.1.0 and -v3 against 3.0.7, bit for bit.
 
+Every -v3 id: those with dense rewards have the physics of the others
+(`test_suite.test_reward_types_share_their_physics`), and rewards of both types are
+compared here.
+"""
+
+import copy
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -7,9 +15,11 @@ from tensordict import TensorDict
 
 import torch_panda
 from tests.envs import record_panda_gym_1_1_0 as old
+from tests.ids import PHYSICS_IDS
 from tests.panda_gym_reference import make_reference, start
 
-V3_IDS = [env_id for env_id in torch_panda.ENV_IDS if env_id.endswith("-v3")]
+# Those of ours that panda-gym, which the reference imports, has registered.
+V3_IDS = [env_id for env_id in PHYSICS_IDS if env_id in gymnasium.registry]
 STEPS = 60
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
@@ -51,6 +61,10 @@ def make_v1(task, **options):
     )
 
 
+def test_all_ids_of_panda_gym_are_compared():
+    assert len(V3_IDS) == 12
+
+
 @pytest.mark.parametrize("task", old.TASKS)
 def test_v1_equals_panda_gym_1_1_0(task):
     with np.load(old.FILE) as file:
@@ -86,6 +100,15 @@ def test_v1_equals_panda_gym_1_1_0(task):
     assert not differing
 
 
+def dense_reward(reference):
+    """What panda-gym's id with dense rewards would give now."""
+    task = reference.task
+    before, task.reward_type = task.reward_type, "dense"
+    reward = task.compute_reward(task.get_achieved_goal(), task.get_goal(), {})
+    task.reward_type = before
+    return float(reward)
+
+
 def set_table_friction(reference, friction):
     sim = reference.sim
     table = sim._bodies_idx["table"]
@@ -104,6 +127,8 @@ def test_equals_panda_gym(env_id):
         if env_id.endswith("-v1"):
             for reference in references:
                 set_table_friction(reference, 0.1)
+        dense_task = copy.copy(env.task)
+        dense_task.reward_type = "dense"
         rngs = [np.random.default_rng(k) for k in range(episodes)]
         starts = [start(references[k], seed=k) for k in range(episodes)]
         theirs = [observation for observation, _, _ in starts]
@@ -131,11 +156,13 @@ def test_equals_panda_gym(env_id):
             ours = env.step(ours)["next"]
             theirs = [result[0] for result in results]
             rewards = torch.tensor([[result[1]] for result in results])
+            assert torch.equal(ours["reward"], rewards.float())
+            goals = ours["achieved_goal"], ours["desired_goal"]
+            rewards = torch.tensor([[dense_reward(r)] for r in references])
             # panda-gym measures to the float64 goal, we to the float32 goal that both
             # emit: a dense reward may differ in its last bits.
-            tolerance = 1e-6 if "Dense" in env_id else 0.0
             torch.testing.assert_close(
-                ours["reward"], rewards, rtol=0.0, atol=tolerance
+                dense_task.compute_reward(*goals), rewards.float(), rtol=0.0, atol=1e-6
             )
             terminated = torch.tensor([[result[2]] for result in results])
             if env_id.endswith("-v3"):
@@ -144,5 +171,5 @@ def test_equals_panda_gym(env_id):
             contacts += sum(had_contact(reference) for reference in references)
         for reference in references:
             reference.close()
-    if env_id not in ("PandaReach-v3", "PandaReachDense-v3"):
+    if env_id != "PandaReach-v3":
         assert contacts > 10, "the test must touch something"

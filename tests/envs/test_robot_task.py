@@ -401,7 +401,7 @@ def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):
 @pytest.mark.parametrize("index", [0, 1])
 def test_error_in_a_worker_names_the_environment(env, monkeypatch, index):
     td = env.reset()
-    broken = env._simulation._clients[index]
+    broken = env.episodes.simulation.clients[index]
     original = PhysicsClient.step
 
     def step(self, count=1):
@@ -422,7 +422,7 @@ def test_interrupt_in_a_step(env, monkeypatch):
     main = threading.main_thread().ident
 
     def step(self, count=1):
-        if self is env._simulation._clients[0]:
+        if self is env.episodes.simulation.clients[0]:
             signal.pthread_kill(main, signal.SIGINT)
         original(self, count)
 

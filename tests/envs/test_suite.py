@@ -1,88 +1,133 @@
-"""What holds for every id; a new task is tested without being named here."""
+"""What holds for every id; a new task is tested without being named here.
+
+What an id must have is read from its task and its robot. What the ids of the paper and
+of panda-gym must have is written down in `test_sizes_of_the_contract`.
+"""
+
+from itertools import product
 
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
+from tests.ids import PHYSICS_IDS, dense
 
-OBSERVATION = {
-    "Reach": 6,
-    "Push": 18,
-    "Slide": 18,
-    "PickAndPlace": 19,
-    "Stack": 31,
-    "Flip": 20,
+# Numbers of entries: observation, goal, action with end-effector control; and steps.
+SIZES = {
+    "Reach": (6, 3, 3, 50),
+    "Push": (18, 3, 3, 50),
+    "Slide": (18, 3, 3, 50),
+    "PickAndPlace": (19, 3, 4, 50),
+    "Stack": (31, 6, 4, 100),
+    "Flip": (20, 4, 4, 50),
 }
-GOAL = {"Stack": 6, "Flip": 4}
+NUM_ENVS = 3
 
 
-@pytest.fixture(params=torch_panda.ENV_IDS)
-def env_id(request):
-    return request.param
+@pytest.fixture(scope="module", params=PHYSICS_IDS)
+def made(request):
+    """An environment for all tests of an id."""
+    with torch_panda.make(request.param, num_envs=NUM_ENVS, num_threads=2) as env:
+        yield request.param, env
 
 
 @pytest.fixture
-def env(env_id):
-    with torch_panda.make(env_id, num_envs=3, num_threads=2, seed=0) as env:
-        yield env
+def env_id(made):
+    return made[0]
 
 
-def parts(env_id):
-    name, version = env_id.removeprefix("Panda").split("-")
-    is_dense = name.endswith("Dense")
-    name = name.removesuffix("Dense")
-    has_joints = name.endswith("Joints")
-    return name.removesuffix("Joints"), has_joints, is_dense, version
+@pytest.fixture
+def env(made):
+    made[1].set_seed(0)
+    return made[1]
 
 
-def test_ids_are_complete():
-    assert len(torch_panda.ENV_IDS) == len(set(torch_panda.ENV_IDS)) == 48
+# Task, control and version of the paper's and panda-gym's ids.
+@pytest.mark.parametrize("parts", product(SIZES, ("", "Joints"), ("v1", "v3")))
+def test_sizes_of_the_contract(parts):
+    task, control, version = parts
+    env_id = f"Panda{task}{control}-{version}"
+    observation, goal, action, steps = SIZES[task]
+    assert {env_id, dense(env_id)} <= set(torch_panda.ENV_IDS)
+    with torch_panda.make(env_id) as env:
+        assert env.observation_spec["observation"].shape == (observation,)
+        assert env.observation_spec["desired_goal"].shape == (goal,)
+        assert env.action_spec.shape == (action + 4 * (control == "Joints"),)
+        assert env.max_episode_steps == steps
+        assert env.terminate_on_success == (version == "v3")
+
+
+def test_ids_are_unique():
+    ids = torch_panda.ENV_IDS
+    assert len(ids) == len(set(ids)) == 2 * len(PHYSICS_IDS)
 
 
 def test_specs(env):
     check_env_specs(env)
 
 
-def test_shapes_and_dtypes(env, env_id):
-    task, has_joints, _, _ = parts(env_id)
+def test_shapes_and_dtypes(env):
+    robot, task = env.robot, env.task
     step = env.rollout(1)[:, 0]
-    goal = GOAL.get(task, 3)
-    gripper = task in ("PickAndPlace", "Stack", "Flip")
-    assert step["observation"].shape == (3, OBSERVATION[task])
-    assert step["action"].shape == (3, (7 if has_joints else 3) + gripper)
+    size = robot.observation_dim + task.observation_dim
+    assert step["observation"].shape == (NUM_ENVS, size)
+    assert step["action"].shape == (NUM_ENVS, robot.action_dim)
     for key in ("achieved_goal", "desired_goal"):
-        assert step["next", key].shape == (3, goal)
+        assert step["next", key].shape == (NUM_ENVS, task.goal_dim)
         assert step["next", key].dtype == torch.float32
     assert step["next", "reward"].dtype == torch.float32
     for key in ("success", "terminated", "truncated", "done"):
-        assert step["next", key].shape == (3, 1)
+        assert step["next", key].shape == (NUM_ENVS, 1)
         assert step["next", key].dtype == torch.bool
 
 
-def test_reward_and_success_follow_from_the_goals(env, env_id):
-    _, _, is_dense, version = parts(env_id)
+def test_reward_success_and_ends_follow_from_the_goals(env):
     after = env.rollout(10)["next"]
     goals = after["achieved_goal"], after["desired_goal"]
-    torch.testing.assert_close(after["reward"], env.compute_reward(*goals))
+    assert torch.equal(after["reward"], env.compute_reward(*goals))
     assert torch.equal(after["success"], env.is_success(*goals))
-    if not is_dense:
-        assert torch.equal(after["reward"], after["success"].float() - 1)
-    expected = after["success"] if version == "v3" else torch.zeros_like(after["done"])
-    assert torch.equal(after["terminated"], expected)
+    assert torch.equal(after["reward"], after["success"].float() - 1)
+    ends = env.terminate_on_success
+    assert torch.equal(after["terminated"], after["success"] & ends)
 
 
-def test_episode_is_truncated(env, env_id):
-    task, _, _, version = parts(env_id)
-    limit = 100 if task == "Stack" else 50
-    rollout = env.rollout(limit + 5, break_when_any_done=False)
-    if version == "v1":
-        truncated = rollout["next", "truncated"][0, :, 0].nonzero().flatten().tolist()
-        assert truncated == [limit - 1]
-        assert torch.equal(rollout["next", "done"], rollout["next", "truncated"])
-    else:
-        # Success starts a new episode, and the count with it.
-        assert not rollout["next", "truncated"][:, : limit - 1].any()
+def test_reward_types_share_their_physics(env, env_id):
+    actions = torch.rand(6, *env.action_spec.shape) * 2 - 1
+
+    def play(env):
+        td, steps = env.reset(), []
+        for action in actions:
+            td = env.step(td.clone().set("action", action))["next"]
+            steps.append(td)
+        return torch.stack(steps)
+
+    sparse = play(env)
+    with torch_panda.make(dense(env_id), num_envs=NUM_ENVS, seed=0) as other:
+        check_env_specs(other)
+        other.set_seed(0)
+        found = play(other)
+        goals = found["achieved_goal"], found["desired_goal"]
+        assert torch.equal(found["reward"], other.compute_reward(*goals))
+        assert len(found["reward"].unique()) > len(sparse["reward"].unique())
+    assert (found.exclude("reward") == sparse.exclude("reward")).all()
+
+
+def test_episode_is_truncated(env):
+    limit = env.max_episode_steps
+    assert limit == env.task.max_episode_steps
+    # From one step before: what an episode's steps are is the history test's.
+    env.reset()
+    state = env.get_state()
+    state["step_count"][:] = limit - 2
+    td = env.reset(state, set_state=True)
+    ends = []
+    for _ in range(2):
+        td["action"] = torch.zeros(env.action_spec.shape)
+        td = env.step(td)["next"]
+        ends.append(td["truncated"].flatten().tolist())
+        assert torch.equal(td["done"], td["truncated"] | td["terminated"])
+    assert ends == [[False] * NUM_ENVS, [True] * NUM_ENVS]
 
 
 def test_no_output_aliases_another(env):
@@ -92,7 +137,7 @@ def test_no_output_aliases_another(env):
     assert (td == before).all()
 
 
-def test_observations_are_finite_and_vary(env, env_id):
+def test_observations_are_finite_and_vary(env):
     rollout = env.rollout(20, break_when_any_done=False)
     observation = rollout["next", "observation"]
     assert observation.isfinite().all()
@@ -100,17 +145,28 @@ def test_observations_are_finite_and_vary(env, env_id):
     assert (observation[..., :6].std(dim=1) > 0).all()
 
 
-def test_starts_differ(env, env_id):
+def test_starts_differ(env):
     first, second = env.reset(), env.reset()
     assert not torch.equal(first["desired_goal"], second["desired_goal"])
     for td in (first, second):
-        assert len(td["desired_goal"].unique(dim=0)) == 3
+        assert len(td["desired_goal"].unique(dim=0)) == NUM_ENVS
 
 
-def test_same_seed_same_trajectory(env_id):
-    rollouts = []
-    for threads in (1, 2):
-        with torch_panda.make(env_id, num_envs=3, num_threads=threads, seed=7) as env:
-            torch.manual_seed(0)
-            rollouts.append(env.rollout(15, break_when_any_done=False))
-    assert (rollouts[0] == rollouts[1]).all()
+def test_same_seed_same_trajectory(env, env_id):
+    """And the number of threads changes nothing, nor what was before."""
+    torch.manual_seed(0)
+    expected = env.rollout(15, break_when_any_done=False)
+    with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=1, seed=0) as other:
+        torch.manual_seed(0)
+        found = other.rollout(15, break_when_any_done=False)
+    assert (found == expected).all()
+
+
+def test_an_exact_state_goes_on(env):
+    torch.manual_seed(0)
+    td = env.rollout(8, break_when_any_done=False)[:, -1]["next"].exclude("reward")
+    state = env.get_state(exact=True)
+    td["action"] = torch.rand(env.action_spec.shape) * 2 - 1
+    expected = env.step(td.clone())["next"]
+    again = env.reset(state, set_state=True)
+    assert (env.step(again.set("action", td["action"]))["next"] == expected).all()

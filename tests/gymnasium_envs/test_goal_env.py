@@ -13,7 +13,7 @@ from torch_panda.gymnasium_envs import GoalEnv
 
 # check_env advises against spaces without bounds; positions have none.
 NO_BOUNDS = "ignore:.*A Box observation space"
-# torch_panda ignores it too; pytest forgets such filters.
+# To Gymnasium -v3 is the successor of -v1; here they are different tasks.
 NOT_OLD = r"ignore:.*torch_panda/Panda\w+-v1 is out of date"
 
 

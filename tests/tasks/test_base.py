@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torch_panda import Flip, Push, Stack
-from torch_panda.tasks.base import quaternion_to_euler
+from torch_panda.tasks.rotations import quaternion_to_euler
 
 angle = st.floats(-math.pi, math.pi)
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from torch_panda.bullet._capi import library_path
-from torch_panda.bullet.client import find_urdf
+from torch_panda.bullet.library import library_path
+from torch_panda.bullet.urdf import find_urdf
 
 SOURCE = Path(__file__).with_suffix(".c")
 URDF = "franka_panda/panda.urdf"

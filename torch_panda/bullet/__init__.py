@@ -1,7 +1,8 @@
 """Bullet's C API: one client, and many of them stepped in parallel."""
 
-from torch_panda.bullet.camera import Camera
-from torch_panda.bullet.client import BulletError, PhysicsClient
+from torch_panda.bullet.client import PhysicsClient
+from torch_panda.bullet.connection import BulletError
+from torch_panda.bullet.guard import ThreadGuard
 from torch_panda.bullet.physics import (
     EXACT,
     FAST,
@@ -10,26 +11,23 @@ from torch_panda.bullet.physics import (
     read_physics,
 )
 from torch_panda.bullet.pool import WorkerError, WorkerPool
-from torch_panda.bullet.shapes import Box, Cylinder, Look, Sphere
-from torch_panda.bullet.simulation import ControlType, Scene, VectorSimulation
-from torch_panda.bullet.visual import VisualClient
+from torch_panda.bullet.shapes import Box, Cylinder, Sphere, Visual
+from torch_panda.bullet.simulation import Scene, VectorSimulation
 
 __all__ = [
     "EXACT",
     "FAST",
     "Box",
     "BulletError",
-    "Camera",
-    "ControlType",
     "Cylinder",
-    "Look",
     "PhysicsClient",
     "PhysicsName",
     "PhysicsParams",
     "Scene",
     "Sphere",
+    "ThreadGuard",
     "VectorSimulation",
-    "VisualClient",
+    "Visual",
     "WorkerError",
     "WorkerPool",
     "read_physics",

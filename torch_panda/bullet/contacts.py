@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from torch_panda.bullet import _capi
+from torch_panda.bullet import capi
 
 Vector = tuple[float, float, float]
 
@@ -46,7 +46,7 @@ class ContactPoint(NamedTuple):
         )
 
 
-def read_contact(point: _capi.ContactPoint) -> ContactPoint:
+def read_contact(point: capi.ContactPoint) -> ContactPoint:
     """A contact as Bullet reports it."""
     friction = (
         point.friction_force_1 * d1 + point.friction_force_2 * d2

@@ -55,8 +55,8 @@ class PhysicsParams:
             raise ValueError(f"gravity must be finite, got {self.gravity}")
 
     @property
-    def dt(self) -> float:
-        """Length of one step [s]."""
+    def ctrl_dt(self) -> float:
+        """Length of one step, in which a robot is controlled once [s]."""
         return self.timestep * self.n_substeps
 
 

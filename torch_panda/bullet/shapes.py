@@ -1,4 +1,4 @@
-"""What bodies are made of, and how they look."""
+"""The shapes of bodies, and their visuals."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +39,7 @@ Shape = Box | Cylinder | Sphere
 
 
 @dataclass(frozen=True)
-class Look:
+class Visual:
     """How a body is drawn.
 
     Attributes:

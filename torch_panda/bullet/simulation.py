@@ -3,23 +3,24 @@
 import os
 import threading
 from collections.abc import Callable, Sequence
-from ctypes import memmove
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet.built_world import BuiltWorld
-from torch_panda.bullet.client import BulletError, PhysicsClient, doubles
+from torch_panda.bullet.broad_phase import BroadPhase
+from torch_panda.bullet.client import PhysicsClient
+from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool
+from torch_panda.bullet.scene_client import Blueprint, SceneClient
 
-ControlType = Literal["ee", "joints"]
+# Sets the motors of an environment's robot, in the thread that steps its client.
+Control = Callable[[PhysicsClient, int], None]
 
-_DOUBLE = 8  # bytes
-# Share of a client's substeps. Of 0.3 and 0.5 the better, by the durations of Push.
+# Of a client's substeps. Of 0.3 and 0.5 the better, by the durations of Push.
 _LAST_PIECE = 0.3
 
 
@@ -38,27 +39,21 @@ class _Pieces:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a simulation drives and reads; the same ids in every client.
+    """What a simulation moves and reads; the same ids in every client.
 
     Attributes:
         robot: body id of the robot.
-        ee_link: its link whose centre of mass is the end-effector.
-        ee_orientation: quaternion xyzw that inverse kinematics aims at, world frame.
-        num_arm_joints: how many of its joints, the first ones, inverse kinematics sets.
-        joint_forces: the most each movable joint's motor may exert [N m] or [N].
         joints: indices of its movable joints.
+        ee_link: its link whose centre of mass is the end-effector.
         objects: body ids of the movable objects.
-        targets: body ids of the markers that show where the objects should go.
+        markers: body ids of the markers that show where the objects should go.
     """
 
     robot: int
     joints: tuple[int, ...]
     ee_link: int
-    ee_orientation: tuple[float, float, float, float]
-    num_arm_joints: int
-    joint_forces: tuple[float, ...]
     objects: tuple[int, ...] = ()
-    targets: tuple[int, ...] = ()
+    markers: tuple[int, ...] = ()
 
 
 class VectorSimulation:
@@ -81,10 +76,10 @@ class VectorSimulation:
         ee_velocity: (num_envs, 3) [m/s].
         object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
-        target_pose: (num_envs, n_targets, 7), where `reset` puts the markers.
-        joint_target: (num_envs, n_joints), what `step` drives the joints to.
-        ee_target: (num_envs, 3) [m], what `step` solves the arm's targets for when
-            the control type is "ee".
+        marker_pose: (num_envs, n_markers, 7), where `reset` puts the markers.
+
+    Raises:
+        BulletError: ``build`` does not build the same in every client.
     """
 
     def __init__(
@@ -98,25 +93,22 @@ class VectorSimulation:
         if num_threads is None:
             num_threads = os.cpu_count() or 1
         self.n_substeps = physics.n_substeps
-        self.dt = physics.dt
-        self._make_client = partial(PhysicsClient, physics=physics)
+        self.ctrl_dt = physics.ctrl_dt
+        self._physics = physics
         self._build = build
+        self._blueprint: Blueprint | None = None
         self._clients: list[PhysicsClient] = []
-        self._built_worlds: list[BuiltWorld] = []
+        self._broad_phases: list[BroadPhase] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
         try:
             for _ in range(num_envs):
-                client = self._make_client()
+                client = PhysicsClient(physics=physics)
                 self._clients.append(client)
                 scene = build(client)
-                self._built_worlds.append(BuiltWorld(client))
-                if client is self._clients[0]:
-                    self.scene = scene
-                elif scene != self.scene:
-                    raise BulletError(
-                        f"the scene must be the same in every client, got {scene} "
-                        f"after {self.scene}"
-                    )
+                if self._blueprint is None:
+                    self.scene, self._blueprint = scene, client.blueprint
+                self.check_same(client, scene)
+                self._broad_phases.append(BroadPhase(client))
             self._allocate()
         except BaseException:
             self.close()
@@ -132,20 +124,45 @@ class VectorSimulation:
         """Number of threads that step them."""
         return self._pool.num_threads
 
-    def step(
-        self, control_type: ControlType, envs: Sequence[int] | None = None
-    ) -> None:
-        """Control the joints, advance time and read the state.
+    @property
+    def clients(self) -> Sequence[PhysicsClient]:
+        """The clients, by environment."""
+        return self._clients
+
+    def check_same(self, client: SceneClient, scene: Scene) -> None:
+        """Make sure that another client holds the scene that these hold.
+
+        Raises:
+            BulletError: it does not.
+            TypeError: what built it returned no `Scene`.
+        """
+        if not isinstance(scene, Scene):
+            raise TypeError(f"what builds a scene must return a Scene, got {scene!r}")
+        assert self._blueprint is not None
+        found = (scene, *client.blueprint)
+        for there, here in zip(found, (self.scene, *self._blueprint), strict=False):
+            if there != here:
+                raise BulletError(
+                    f"the scene must be the same in every client, got {there} "
+                    f"after {here}"
+                )
+        if len(client.blueprint) != len(self._blueprint):
+            raise BulletError(
+                f"the scene must be the same in every client, got "
+                f"{len(client.blueprint)} commands that build it after "
+                f"{len(self._blueprint)}"
+            )
+
+    def step(self, control: Control, envs: Sequence[int] | None = None) -> None:
+        """Control the robots, advance time and read the state.
 
         Args:
-            control_type: "joints" drives the joints to ``joint_target``; "ee" first
-                replaces the arm's targets by the inverse kinematics of ``ee_target``.
+            control: sets the motors, given a client and its index.
             envs: which clients; None means all.
 
         Raises:
             WorkerError: Bullet failed in one client; it names the client.
         """
-        control = self._control_ee if control_type == "ee" else self._control_joints
         envs = range(self.num_envs) if envs is None else envs
         step_one = partial(self._step_one, control)
         if not 1 < self.num_threads < len(envs):
@@ -162,11 +179,6 @@ class VectorSimulation:
             lambda env: (pieces if env == envs[0] else step_one)(env), (*envs, envs[0])
         )
 
-    @property
-    def clients(self) -> Sequence[PhysicsClient]:
-        """The clients, by environment."""
-        return self._clients
-
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for these environments, in the threads that step them.
 
@@ -178,7 +190,7 @@ class VectorSimulation:
     def reset(self, envs: Sequence[int]) -> None:
         """Start an episode from what the state tensors hold for these clients.
 
-        Bullet remembers more than the state. `BuiltWorld` makes it forget, so that what
+        Bullet remembers more than the state. `BroadPhase` makes it forget, so that what
         follows depends on the start state and the actions alone.
 
         Raises:
@@ -196,9 +208,9 @@ class VectorSimulation:
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""
         self._clients[env].close()
-        client = self._clients[env] = self._make_client()
-        self._build(client)
-        self._built_worlds[env] = BuiltWorld(client)
+        client = self._clients[env] = PhysicsClient(physics=self._physics)
+        self.check_same(client, self._build(client))
+        self._broad_phases[env] = BroadPhase(client)
 
     def close(self) -> None:
         """Free all clients and end the threads. Closing again does nothing."""
@@ -208,13 +220,13 @@ class VectorSimulation:
 
     def _allocate(self) -> None:
         n, scene = self.num_envs, self.scene
-        n_joints, n_objects = len(scene.joint_forces), len(scene.objects)
+        n_joints, n_objects = len(scene.joints), len(scene.objects)
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
 
         sizes = (n_joints, n_joints, 3, 3, 7 * n_objects, 6 * n_objects)
-        # In one tensor, which one look finds finite or not.
+        # In one tensor, which one check finds finite or not.
         self._state = zeros(sum(sizes))
         (
             self.joint_position,
@@ -226,48 +238,26 @@ class VectorSimulation:
         ) = self._state.split(sizes, dim=1)
         self.object_pose = object_pose.unflatten(1, (n_objects, 7))
         self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
-        self.joint_target = zeros(n_joints)
-        self.ee_target = zeros(3)
-        self.target_pose = zeros(len(scene.targets), 7)
-        self._ik_result = zeros(n_joints)
-        self._forces = doubles(scene.joint_forces)
-        self._ee_orientation = torch.tensor(
-            scene.ee_orientation, dtype=torch.float64, device="cpu"
-        )
+        self.marker_pose = zeros(len(scene.markers), 7)
+        # The same memory, part by part, for `_read`: rows of tensors take longer.
+        ends = np.cumsum(sizes)[:-1]
+        self._rows = [np.split(row, ends) for row in self._state.numpy()]
 
-    def _step_one(self, control: Work, env: int) -> None:
+    def _step_one(self, control: Control, env: int) -> None:
         self._begin_step(control, self.n_substeps, env)
         self._read(env)
 
-    def _begin_step(self, control: Work, substeps: int, env: int) -> None:
-        control(env)
+    def _begin_step(self, control: Control, substeps: int, env: int) -> None:
+        control(self._clients[env], env)
         self._clients[env].step(substeps)
 
     def _end_step(self, substeps: int, env: int) -> None:
         self._clients[env].step(substeps)
         self._read(env)
 
-    def _control_ee(self, env: int) -> None:
-        scene = self.scene
-        solution = _row(self._ik_result, env)
-        self._clients[env].inverse_kinematics(
-            scene.robot,
-            scene.ee_link,
-            _row(self.ee_target, env),
-            self._ee_orientation.data_ptr(),
-            solution,
-        )
-        memmove(_row(self.joint_target, env), solution, _DOUBLE * scene.num_arm_joints)
-        self._control_joints(env)
-
-    def _control_joints(self, env: int) -> None:
-        self._clients[env].control_joints(
-            self.scene.robot, _row(self.joint_target, env), self._forces
-        )
-
     def _reset_one(self, env: int) -> None:
         client, scene = self._clients[env], self.scene
-        self._built_worlds[env].restore()
+        self._broad_phases[env].restore()
         positions = self.joint_position[env].tolist()
         velocities = self.joint_velocity[env].tolist()
         # One by one and in panda-gym's order: Bullet's broad phase remembers the way.
@@ -275,9 +265,8 @@ class VectorSimulation:
             scene.joints, positions, velocities, strict=True
         ):
             client.set_joint(scene.robot, joint, position, velocity)
-        for body, pose in zip(
-            scene.targets, self.target_pose[env].tolist(), strict=True
-        ):
+        markers = self.marker_pose[env].tolist()
+        for body, pose in zip(scene.markers, markers, strict=True):
             client.set_base(body, pose[:3], pose[3:])
         poses = self.object_pose[env].tolist()
         velocities = self.object_velocity[env].tolist()
@@ -288,22 +277,13 @@ class VectorSimulation:
     def _read(self, env: int) -> None:
         """Copy the state of one client into the tensors."""
         client, scene = self._clients[env], self.scene
+        joints, speeds, ee_position, ee_velocity, poses, velocities = self._rows[env]
         state = client.state(scene.robot, link_velocities=True)
-        size = _DOUBLE * len(scene.joint_forces)
-        memmove(_row(self.joint_position, env), state.joint_positions, size)
-        memmove(_row(self.joint_velocity, env), state.joint_velocities, size)
-        position, velocity = _row(self.ee_position, env), _row(self.ee_velocity, env)
-        memmove(position, state.link_pose(scene.ee_link), _DOUBLE * 3)
-        memmove(velocity, state.link_velocity(scene.ee_link), _DOUBLE * 3)
-        pose, velocity = _row(self.object_pose, env), _row(self.object_velocity, env)
-        for body in scene.objects:
+        joints[:] = state.joint_positions
+        speeds[:] = state.joint_velocities
+        ee_position[:] = state.link_pose(scene.ee_link)[:3]
+        ee_velocity[:] = state.link_velocity(scene.ee_link)[:3]
+        for k, body in enumerate(scene.objects):
             state = client.state(body)
-            memmove(pose, state.q, _DOUBLE * 7)
-            memmove(velocity, state.u, _DOUBLE * 6)
-            pose += _DOUBLE * 7
-            velocity += _DOUBLE * 6
-
-
-def _row(tensor: Tensor, env: int) -> int:
-    """Address of one environment's part of a float64 tensor, which is contiguous."""
-    return tensor.data_ptr() + _DOUBLE * tensor.stride(0) * env
+            poses[7 * k : 7 * k + 7] = state.base_pose
+            velocities[6 * k : 6 * k + 6] = state.base_velocity

@@ -1,4 +1,4 @@
-"""Between the TensorDicts of a `RobotTaskEnv` and the arrays of Gymnasium."""
+"""Between the tensors of an environment and the arrays of Gymnasium."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,9 +7,8 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
 
 from torch_panda.envs import RobotTaskEnv
 
@@ -25,8 +24,8 @@ def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     float32 without bounds, and integers with those of their type.
     """
     boxes: dict[str, spaces.Space[Any]] = {}
-    for key in _keys(env.observation_spec):
-        zero = env.observation_spec[key].zero().numpy()
+    for key in observed_keys(env):
+        zero = env.observation_spec[key].zero().cpu().numpy()
         shape = zero.shape[env.batch_dims :]
         bounds = np.iinfo(zero.dtype) if zero.dtype.kind in "iu" else None
         low, high = (bounds.min, bounds.max) if bounds else (-np.inf, np.inf)
@@ -34,18 +33,14 @@ def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     return spaces.Dict(boxes)
 
 
-def _keys(observed: Composite | TensorDictBase) -> list[str]:
-    return sorted(set(observed.keys()) - _OUTCOME)
-
-
 def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     """The space of one environment's action, float32 in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (env.robot.action_dim,))
 
 
-def observation(tensordict: TensorDictBase) -> Observation:
-    """What is observed, and the goals, as arrays of the tensordict's batch size."""
-    return {key: tensordict[key].numpy() for key in _keys(tensordict)}
+def observed_keys(env: RobotTaskEnv) -> list[str]:
+    """What is observed, and the goals, in the order of Gymnasium's spaces."""
+    return sorted(set(env.observation_spec.keys()) - _OUTCOME)
 
 
 def action(values: ArrayLike) -> Tensor:
@@ -53,7 +48,7 @@ def action(values: ArrayLike) -> Tensor:
     return torch.from_numpy(np.asarray(values).astype(np.float64))
 
 
-def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> TensorDict:
+def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> dict[str, Tensor]:
     """The state to start from that the options of a reset give: maybe empty.
 
     Raises:
@@ -63,18 +58,11 @@ def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> TensorDict:
     if unknown := set(options) - {"state"}:
         raise ValueError(f"accepted options are state, got {sorted(map(str, unknown))}")
     given = options.get("state", {})
-    if not isinstance(given, Mapping | TensorDict):
+    if not isinstance(given, Mapping | TensorDictBase):
         raise TypeError(f"the state must be a mapping to arrays, got {given!r}")
-    state = TensorDict(batch_size=env.batch_size)
-    for key, value in given.items():
-        tensor = torch.from_numpy(np.asarray(value).copy())
-        if tensor.shape[: env.batch_dims] != env.batch_size:
-            raise ValueError(
-                f"{key} must have shape ({env.num_envs}, ...), "
-                f"got {tuple(tensor.shape)}"
-            )
-        state[key] = tensor
-    return state
+    return {
+        key: torch.from_numpy(np.asarray(value).copy()) for key, value in given.items()
+    }
 
 
 class GoalFunctions:

@@ -6,12 +6,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDict
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.envs.episodes import Observed
 from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
+from torch_panda.gymnasium_envs.rendering import (
+    RENDER_MODES,
+    check_render_mode,
+    take_camera,
+)
 from torch_panda.registry import make
+from torch_panda.rendering import Camera
 
 
 class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -25,17 +31,21 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         env: an id of `torch_panda.ENV_IDS`, whose episodes ``gymnasium.make``
             truncates, or an environment of batch size [].
         render_mode: "rgb_array" or None.
-        **arguments: of `torch_panda.make`, for an id.
+        render_camera: of `render`; None means panda-gym's view in 720 x 480 pixels.
+        **arguments: panda-gym's ``render_width``, ``render_height``,
+            ``render_target_position``, ``render_distance``, ``render_yaw``,
+            ``render_pitch`` and ``render_roll``, which change that camera; and, for an
+            id, those of `torch_panda.make`.
 
     Raises:
-        ValueError: the environment is batched.
+        ValueError: the environment is batched, or the render mode is unknown.
 
     Attributes:
         torch_env: the environment behind it.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as declared by Gymnasium)
-        "render_modes": ["rgb_array"],
+        "render_modes": list(RENDER_MODES),
         "render_fps": 25,
     }
 
@@ -44,8 +54,12 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         env: str | RobotTaskEnv,
         *,
         render_mode: str | None = None,
+        render_camera: Camera | None = None,
         **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
     ) -> None:
+        check_render_mode(render_mode)
+        camera, arguments = take_camera(render_camera, arguments)
+        self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
         if isinstance(env, str):
             env = make(env, max_episode_steps=sys.maxsize, **arguments)
         if env.batch_size:
@@ -54,6 +68,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self.observation_space = arrays.observation_space(env)
         self.action_space = arrays.action_space(env)
+        self._keys = arrays.observed_keys(env)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -74,20 +89,19 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         if seed is not None:
             self.torch_env.set_env_seed(0, seed)
-        start = self.torch_env._reset(state, set_state=not state.is_empty())
-        return arrays.observation(start), {"is_success": start["success"].item()}
+        start = self.torch_env.episodes.reset(state=state or None)
+        return self._observation(start), {"is_success": start["success"].item()}
 
     def step(
         self, action: ArrayLike
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one step; see `RobotTaskEnv` for what is raised."""
-        # The method that torchrl's `step` calls, without its checks of specs.
-        after = self.torch_env._step(TensorDict({"action": arrays.action(action)}))
+        after = self.torch_env.episodes.step(arrays.action(action))
         return (
-            arrays.observation(after),
-            after["reward"].item(),
-            after["terminated"].item(),
-            after["truncated"].item(),
+            self._observation(after),
+            float(after["reward"]),
+            bool(after["terminated"]),
+            bool(after["truncated"]),
             {"is_success": after["success"].item()},
         )
 
@@ -95,8 +109,11 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         """An image (height, width, 3), if the render mode is "rgb_array"."""
         if self.render_mode is None:
             return None
-        return np.asarray(self.torch_env.render())
+        return self.torch_env.render(**self._view).cpu().numpy()
 
     def close(self) -> None:
         """Free the client. Closing again does nothing."""
         self.torch_env.close()
+
+    def _observation(self, observed: Observed) -> Observation:
+        return {key: observed[key][0].numpy() for key in self._keys}

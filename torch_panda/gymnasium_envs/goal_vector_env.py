@@ -9,14 +9,16 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDict
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.envs.episodes import Observed
 from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
 from torch_panda.gymnasium_envs.goal_env import GoalEnv
+from torch_panda.gymnasium_envs.rendering import check_render_mode, take_camera
 from torch_panda.registry import make
+from torch_panda.rendering import Camera
 
 
 class GoalVectorEnv(
@@ -36,10 +38,11 @@ class GoalVectorEnv(
             ``final_obs`` and ``final_info`` in the infos), or only by `reset` with
             ``options={"reset_mask": ...}`` (DISABLED).
         render_mode: "rgb_array" or None.
-        **arguments: of `torch_panda.make`, for an id.
+        render_camera: of `render`, with the same keywords as for `GoalEnv`.
+        **arguments: of `GoalEnv`.
 
     Raises:
-        ValueError: the environment is not batched, or the autoreset mode is unknown.
+        ValueError: the environment is not batched, or a mode is unknown.
 
     Attributes:
         torch_env: the environment behind it.
@@ -52,10 +55,14 @@ class GoalVectorEnv(
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
+        render_camera: Camera | None = None,
+        **arguments: Any,  # noqa: ANN401 (of GoalEnv)
     ) -> None:
         self.closed = True  # there is nothing to close until all is built
         self._autoreset_mode = AutoresetMode(autoreset_mode)
+        check_render_mode(render_mode)
+        camera, arguments = take_camera(render_camera, arguments)
+        self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
         if isinstance(env, str):
             env = make(env, num_envs=num_envs, **arguments)
         if env.num_envs is None:
@@ -66,6 +73,7 @@ class GoalVectorEnv(
         self.metadata = {**GoalEnv.metadata, "autoreset_mode": self._autoreset_mode}
         self.single_observation_space = arrays.observation_space(env)
         self.single_action_space = arrays.action_space(env)
+        self._keys = arrays.observed_keys(env)
         self.observation_space = batch_space(
             self.single_observation_space, self.num_envs
         )
@@ -104,10 +112,10 @@ class GoalVectorEnv(
             own_seed = seeds[index]
             if own_seed is not None:
                 self.torch_env.set_env_seed(index, own_seed)
-        begun = self._reset_torch_env(mask, state)
+        begun = self.torch_env.episodes.reset(_indices(mask), state or None)
         self._ended = self._ended & ~mask
         self._was_reset = True
-        return arrays.observation(begun), self._infos(begun, mask)
+        return self._observation(begun), self._infos(begun, mask)
 
     def step(
         self, actions: ArrayLike
@@ -130,13 +138,12 @@ class GoalVectorEnv(
                 f"reset environments {_indices(ended)} before they are stepped"
             )
         resets_now = mode is AutoresetMode.NEXT_STEP and bool(ended.any())
-        taken = TensorDict({"action": arrays.action(actions)})
-        if resets_now:
-            taken["_step"] = ~ended
-        after = self.torch_env._step(taken)
+        episodes = self.torch_env.episodes
+        stepped = ~ended.unsqueeze(1) if resets_now else None
+        after = episodes.step(arrays.action(actions), stepped)
         if resets_now:
             # Gives the others once more what the step gave them.
-            after.update(self._reset_torch_env(ended))
+            after |= episodes.reset(_indices(ended))
         outcome = (
             after["reward"].squeeze(1).double().numpy(),
             after["terminated"].squeeze(1).numpy(),
@@ -146,42 +153,34 @@ class GoalVectorEnv(
         infos: dict[str, Any] = {}
         if mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._final_infos(after, self._ended)
-            after = self._reset_torch_env(self._ended)
+            after = episodes.reset(_indices(self._ended))
             self._ended = torch.zeros_like(self._ended)
         infos |= self._infos(after, self._all)
-        return arrays.observation(after), *outcome, infos
+        return self._observation(after), *outcome, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """An image (height, width, 3) of each, if the render mode is "rgb_array"."""
         if self.render_mode is None:
             return None
-        return tuple(np.asarray(self.torch_env.render()))
+        return tuple(self.torch_env.render(**self._view).cpu().numpy())
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ANN401 (Gymnasium's)
         """Free all clients and threads."""
         self.torch_env.close()
 
-    def _reset_torch_env(
-        self, mask: Tensor, state: TensorDict | None = None
-    ) -> TensorDict:
-        """Reset some environments; what all of them observe then.
+    def _observation(self, observed: Observed) -> Observation:
+        return {key: observed[key].numpy() for key in self._keys}
 
-        torchrl's own `reset` would have to be given what the others observed.
-        """
-        start = TensorDict() if state is None else state
-        given = not start.is_empty()
-        return self.torch_env._reset(start.set("_reset", mask), set_state=given)
-
-    def _infos(self, after: TensorDict, mask: Tensor) -> dict[str, Any]:
+    def _infos(self, after: Observed, mask: Tensor) -> dict[str, Any]:
         success = after["success"].squeeze(1) & mask
         return {"is_success": success.numpy(), "_is_success": mask.clone().numpy()}
 
-    def _final_infos(self, after: TensorDict, mask: Tensor) -> dict[str, Any]:
+    def _final_infos(self, after: Observed, mask: Tensor) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         for index in _indices(mask):
-            last = after[index]
+            last = {key: values[index] for key, values in after.items()}
             final = {
-                "final_obs": arrays.observation(last),
+                "final_obs": self._observation(last),
                 "final_info": {"is_success": last["success"].item()},
             }
             infos = self._add_info(infos, final, index)

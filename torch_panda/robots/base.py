@@ -2,12 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import ControlType, PhysicsClient, VectorSimulation
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet.scene_client import check_quaternion
+
+# What an action displaces: the end-effector along x, y, z, or the arm's joints.
+ControlType = Literal["ee", "joints"]
 
 # An action of 1 moves the end-effector by this [m], or a joint by this [rad].
 ACTION_SCALE = 0.05
@@ -59,6 +65,7 @@ class Robot:
                 f"neutral_joint_position and joint_forces must name the same joints, "
                 f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
             )
+        check_quaternion("ee_orientation", ee_orientation)
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
         self.joint_forces = tuple(map(float, joint_forces))
@@ -103,23 +110,50 @@ class Robot:
             )
         return body
 
-    def set_action(self, action: Tensor, simulation: VectorSimulation) -> None:
-        """Turn actions into the targets of the next step.
+    def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
+        """What actions ask the motors for, as `control` reads it.
 
         Args:
             action: (num_envs, action_dim) float32 in [-1, 1].
-            simulation: whose ``ee_target`` or ``joint_target`` is set.
+            simulation: whose robots are to act.
+
+        Returns:
+            (num_envs, k), float64: the end-effector's position [m] or the arm's joint
+            positions [rad], and behind it the positions of the other joints, here 0.
         """
+        arm = self.arm_setpoint(action, simulation)
+        others = len(self.joint_forces) - self.num_arm_joints
+        return torch.cat((arm, arm.new_zeros(len(arm), others)), dim=1)
+
+    def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
+        """The part of `setpoint` that is the arm's: (num_envs, 3 or arm joints)."""
         if self.control_type == "ee":
-            target = simulation.ee_target
-            torch.add(simulation.ee_position, action[:, :3] * ACTION_SCALE, out=target)
+            position = simulation.ee_position + action[:, :3] * ACTION_SCALE
             # The end-effector must not be sent below the table.
-            target[:, 2].clamp_(min=0.0)
-        else:
-            arm = self.num_arm_joints
-            simulation.joint_target[:, :arm] = (
-                simulation.joint_position[:, :arm] + action[:, :arm] * ACTION_SCALE
-            )
+            position[:, 2].clamp_(min=0.0)
+            return position
+        arm = self.num_arm_joints
+        return simulation.joint_position[:, :arm] + action[:, :arm] * ACTION_SCALE
+
+    def control(
+        self, client: PhysicsClient, body: int, setpoint: npt.NDArray[np.float64]
+    ) -> None:
+        """Set the motors of one client's robot, in the thread that steps the client.
+
+        Args:
+            client: where the robot is ``body``.
+            body: its id.
+            setpoint: (k,), a row of what `setpoint` gives.
+        """
+        if self.control_type == "joints":
+            client.control_joints(body, setpoint, self.joint_forces)
+            return
+        joints = np.empty(len(self.joint_forces))
+        client.inverse_kinematics(
+            body, self.ee_link, setpoint[:3], self.ee_orientation, joints
+        )
+        joints[self.num_arm_joints :] = setpoint[3:]
+        client.control_joints(body, joints, self.joint_forces)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """End-effector position [m] and velocity [m/s]: (num_envs, 6), float64."""

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import ControlType, PhysicsClient, VectorSimulation
-from torch_panda.robots.base import Robot
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.robots.base import ControlType, Robot
 
 # The same in panda-gym 1.1.0 and 3.0.7.
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
@@ -81,16 +81,15 @@ class Panda(Robot):
             )
         return body
 
-    def set_action(self, action: Tensor, simulation: VectorSimulation) -> None:
-        """Turn actions into targets; see `Robot.set_action`."""
-        super().set_action(action, simulation)
-        fingers = simulation.joint_target[:, self.num_arm_joints :]
-        if self.block_gripper:
-            fingers.zero_()
-        else:
-            # In float32 throughout: so panda-gym computes it under NumPy 2.
-            width = self.fingers_width(simulation).float()
-            fingers.copy_((width + action[:, -1:] * GRIPPER_SCALE) / 2)
+    def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
+        """What actions ask the motors for; see `Robot.setpoint`."""
+        if self.block_gripper:  # closed: at 0
+            return super().setpoint(action, simulation)
+        arm = self.arm_setpoint(action, simulation)
+        # In float32 throughout: so panda-gym computes it under NumPy 2.
+        width = self.fingers_width(simulation).float()
+        finger = (width + action[:, -1:] * GRIPPER_SCALE) / 2
+        return torch.cat((arm, finger.double().expand(-1, 2)), dim=1)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""

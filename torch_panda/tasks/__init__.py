@@ -1,14 +1,16 @@
 """Tasks: their scene, goals, observation, success and reward."""
 
-from torch_panda.tasks.base import RewardType, Task
+from torch_panda.tasks.base import Bodies, RewardType, Task, object_observation
 from torch_panda.tasks.flip import Flip
 from torch_panda.tasks.pick_and_place import PickAndPlace
 from torch_panda.tasks.push import Push
 from torch_panda.tasks.reach import Reach
 from torch_panda.tasks.slide import Slide
 from torch_panda.tasks.stack import Stack
+from torch_panda.tasks.table import create_table
 
 __all__ = [
+    "Bodies",
     "Flip",
     "PickAndPlace",
     "Push",
@@ -17,4 +19,6 @@ __all__ = [
     "Slide",
     "Stack",
     "Task",
+    "create_table",
+    "object_observation",
 ]

@@ -1,6 +1,5 @@
 """A goal-conditioned task."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, get_args
@@ -9,21 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
-from torch_panda.bullet.shapes import DARK_GREY, LIGHT_GREY
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.tasks.rotations import NO_ROTATION, quaternion_to_euler
+from torch_panda.tasks.table import create_table
+
+# What tasks of users are made of is found here.
+__all__ = ["NO_ROTATION", "Bodies", "Task", "create_table", "object_observation"]
 
 RewardType = Literal["sparse", "dense"]
 # (achieved_goal, desired_goal), both (..., goal_dim), to (..., 1).
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
-
-NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
-
-# panda-gym's table; its top is the plane z = 0.
-TABLE_LENGTH = 1.1  # [m], along x
-TABLE_X_OFFSET = -0.3  # [m], of its centre
-TABLE_WIDTH = 0.7  # [m]
-TABLE_HEIGHT = 0.4  # [m]
-TABLE_FRICTION = 0.1  # lateral, panda-gym 1.1.0's
 
 
 class Bodies(NamedTuple):
@@ -31,11 +25,11 @@ class Bodies(NamedTuple):
 
     Attributes:
         objects: movable objects, in the order in which observations name them.
-        targets: markers that show the goal.
+        markers: bodies that nothing touches, which show the goal.
     """
 
     objects: tuple[int, ...] = ()
-    targets: tuple[int, ...] = ()
+    markers: tuple[int, ...] = ()
 
 
 class Task(ABC):
@@ -81,8 +75,8 @@ class Task(ABC):
         """Draw start poses: (n_objects, 7), position and quaternion xyzw."""
         return ()
 
-    def target_pose(self, goal: Tensor) -> Tensor:
-        """Where goals put the markers: (..., goal_dim) -> (..., n_targets, 7).
+    def marker_pose(self, goal: Tensor) -> Tensor:
+        """Where goals put the markers: (..., goal_dim) -> (..., n_markers, 7).
 
         By default a goal is one position for each marker. Unused without markers.
         """
@@ -148,61 +142,8 @@ class Task(ABC):
             )
 
 
-def create_table(
-    client: PhysicsClient,
-    *,
-    length: float = TABLE_LENGTH,
-    x_offset: float = TABLE_X_OFFSET,
-    friction: float = TABLE_FRICTION,
-) -> None:
-    """Create the ground, and a table whose top is the plane z = 0.
-
-    Args:
-        client: where to.
-        length: of the table along x [m].
-        x_offset: x of its centre [m].
-        friction: its lateral friction. Bullet multiplies that of both bodies.
-    """
-    client.create_box(
-        (3.0, 3.0, 0.01),
-        mass=0.0,
-        position=(0.0, 0.0, -TABLE_HEIGHT - 0.01),
-        look=Look(DARK_GREY, name="ground"),
-    )
-    table = client.create_box(
-        (length / 2, TABLE_WIDTH / 2, TABLE_HEIGHT / 2),
-        mass=0.0,
-        position=(x_offset, 0.0, -TABLE_HEIGHT / 2),
-        look=Look(LIGHT_GREY, name="table"),
-    )
-    client.set_friction(table, lateral=friction)
-
-
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
     """Position, Euler angles [rad] and velocity of an object: (num_envs, 12)."""
     pose = simulation.object_pose[:, index]  # (num_envs, 7)
     velocity = simulation.object_velocity[:, index]  # (num_envs, 6)
     return torch.cat((pose[:, :3], quaternion_to_euler(pose[:, 3:]), velocity), dim=1)
-
-
-def quaternion_to_euler(quaternion: Tensor) -> Tensor:
-    """Roll, pitch and yaw [rad] of quaternions xyzw: (..., 4) -> (..., 3).
-
-    As pybullet's ``getEulerFromQuaternion``: near a pitch of 90 degrees, where only the
-    sum or difference of the others is defined, roll is 0.
-    """
-    # Some 30 operations on a few numbers each: plain floats take a third of the time
-    # of tensors, and give the bits of the C library's functions.
-    angles = [_euler_angles(*row) for row in quaternion.reshape(-1, 4).tolist()]
-    return quaternion.new_tensor(angles).reshape(*quaternion.shape[:-1], 3)
-
-
-def _euler_angles(x: float, y: float, z: float, w: float) -> tuple[float, float, float]:
-    sine = -2 * (x * z - w * y)
-    if abs(sine) >= 0.99999:
-        side = math.copysign(1.0, sine)
-        return 0.0, side * (math.pi / 2), 2 * math.atan2(-side * x, side * y)
-    xx, yy, zz, ww = x * x, y * y, z * z, w * w
-    roll = math.atan2(2 * (y * z + w * x), ww - xx - yy + zz)
-    yaw = math.atan2(2 * (x * y + w * z), ww + xx - yy - zz)
-    return roll, math.asin(sine), yaw

@@ -7,21 +7,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
+from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.tasks.base import (
-    NO_ROTATION,
-    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
-    create_table,
 )
-from torch_panda.tasks.push import CUBE, CUBE_SIZE, create_cube, sample_on_table
+from torch_panda.tasks.rotations import NO_ROTATION
+from torch_panda.tasks.table import (
+    CUBE,
+    CUBE_SIZE,
+    TABLE_FRICTION,
+    create_cube,
+    create_table,
+    sample_on_table,
+)
 
-# Where the target turns, out of the cube's way.
-TARGET_POSITION = (0.0, 0.0, 3 * CUBE_SIZE / 2)  # [m]
+# Where the marker turns, out of the cube's way.
+MARKER_POSITION = (0.0, 0.0, 3 * CUBE_SIZE / 2)  # [m]
 # Six faces that differ in colour and, as those of a die, in their number of pips.
-LOOK = Look(texture=Path(__file__).with_name("flip_cube.png"), opacity=0.5)
+VISUAL = Visual(texture=Path(__file__).with_name("flip_cube.png"), opacity=0.5)
 
 
 class Flip(Task):
@@ -59,19 +64,19 @@ class Flip(Task):
         self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the cube and the target."""
+        """Build the table, the cube and the marker."""
         create_table(client, friction=self.table_friction)
         cube = create_cube(
-            client, mass=self.object_mass, friction=self.object_friction, look=LOOK
+            client, mass=self.object_mass, friction=self.object_friction, visual=VISUAL
         )
         return Bodies(
             objects=(cube,),
-            targets=(client.create_marker(TARGET_POSITION, CUBE, look=LOOK),),
+            markers=(client.create_marker(MARKER_POSITION, CUBE, visual=VISUAL),),
         )
 
-    def target_pose(self, goal: Tensor) -> Tensor:
+    def marker_pose(self, goal: Tensor) -> Tensor:
         """The goal's orientation above the table: (..., 4) -> (..., 1, 7)."""
-        position = goal.new_tensor(TARGET_POSITION).expand(*goal.shape[:-1], 3)
+        position = goal.new_tensor(MARKER_POSITION).expand(*goal.shape[:-1], 3)
         return torch.cat((position, goal), dim=-1).unsqueeze(-2)
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:

@@ -4,8 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torch_panda.tasks.base import TABLE_FRICTION, RewardType
-from torch_panda.tasks.push import CUBE_SIZE, Push, sample_on_table
+from torch_panda.tasks.base import (
+    RewardType,
+)
+from torch_panda.tasks.push import Push
+from torch_panda.tasks.table import (
+    CUBE_SIZE,
+    TABLE_FRICTION,
+    sample_on_table,
+)
 
 # Fraction of the goals that lie on the table, in the authors' code.
 GOALS_ON_TABLE = 0.3

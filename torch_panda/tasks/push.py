@@ -5,20 +5,22 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import Box, Look, PhysicsClient, VectorSimulation
-from torch_panda.bullet.shapes import GREEN
+from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
-    NO_ROTATION,
-    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
-    create_table,
     object_observation,
 )
-
-CUBE_SIZE = 0.04  # [m]
-CUBE = Box((CUBE_SIZE / 2,) * 3)
+from torch_panda.tasks.rotations import NO_ROTATION
+from torch_panda.tasks.table import (
+    CUBE,
+    CUBE_SIZE,
+    TABLE_FRICTION,
+    create_cube,
+    create_table,
+    sample_on_table,
+)
 
 
 class Push(Task):
@@ -36,7 +38,7 @@ class Push(Task):
 
     goal_dim = 3
     observation_dim = 12
-    # Where panda-gym creates the target, before it moves to the first goal [m].
+    # Where panda-gym creates the marker, before it moves to the first goal [m].
     marker_height = CUBE_SIZE / 2
 
     def __init__(
@@ -58,12 +60,12 @@ class Push(Task):
         self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the cube and the target."""
+        """Build the table, the cube and the marker."""
         create_table(client, friction=self.table_friction)
         cube = create_cube(client, mass=self.object_mass, friction=self.object_friction)
         return Bodies(
             objects=(cube,),
-            targets=(client.create_marker((0.0, 0.0, self.marker_height), CUBE),),
+            markers=(client.create_marker((0.0, 0.0, self.marker_height), CUBE),),
         )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
@@ -82,35 +84,3 @@ class Push(Task):
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """The cube's position: (num_envs, 3)."""
         return simulation.object_pose[:, 0, :3]
-
-
-def create_cube(
-    client: PhysicsClient,
-    *,
-    mass: float,
-    friction: float,
-    x: float = 0.0,
-    look: Look = Look(GREEN),  # noqa: B008 (frozen)
-) -> int:
-    """Create a cube on the table and return its body id.
-
-    Args:
-        client: where to.
-        mass: [kg].
-        friction: its lateral friction.
-        x: of its centre [m].
-        look: how it is drawn.
-    """
-    cube = client.create_box(
-        CUBE.half_extents, mass=mass, position=(x, 0.0, CUBE_SIZE / 2), look=look
-    )
-    client.set_friction(cube, lateral=friction)
-    return cube
-
-
-def sample_on_table(
-    rng: np.random.Generator, xy_range: float, *, height: float, x_offset: float = 0.0
-) -> tuple[float, float, float]:
-    """Draw a point at a height, in a square centred at (x_offset, 0) [m]."""
-    x, y = rng.uniform(-xy_range / 2, xy_range / 2, size=2)
-    return float(x) + x_offset, float(y), height

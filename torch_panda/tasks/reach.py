@@ -7,10 +7,12 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation
 from torch_panda.tasks.base import (
-    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
+)
+from torch_panda.tasks.table import (
+    TABLE_FRICTION,
     create_table,
 )
 
@@ -43,9 +45,9 @@ class Reach(Task):
         self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table and the target."""
+        """Build the table and the marker."""
         create_table(client, friction=self.table_friction)
-        return Bodies(targets=(client.create_marker((0.0, 0.0, 0.0), MARKER),))
+        return Bodies(markers=(client.create_marker((0.0, 0.0, 0.0), MARKER),))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a point of the cube: (3,)."""

@@ -7,15 +7,17 @@ from torch import Tensor
 
 from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
 from torch_panda.tasks.base import (
-    NO_ROTATION,
-    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
-    create_table,
     object_observation,
 )
-from torch_panda.tasks.push import sample_on_table
+from torch_panda.tasks.rotations import NO_ROTATION
+from torch_panda.tasks.table import (
+    TABLE_FRICTION,
+    create_table,
+    sample_on_table,
+)
 
 PUCK_RADIUS = 0.03  # [m]
 PUCK_HEIGHT = 0.03  # [m]
@@ -70,7 +72,7 @@ class Slide(Task):
         self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the puck and the target."""
+        """Build the table, the puck and the marker."""
         create_table(
             client,
             length=self.table_length,
@@ -84,10 +86,10 @@ class Slide(Task):
             position=(0.0, 0.0, PUCK_START_HEIGHT),
         )
         client.set_friction(puck, lateral=self.object_friction)
-        target = client.create_marker(
+        marker = client.create_marker(
             (0.0, 0.0, PUCK_START_HEIGHT), Cylinder(PUCK_RADIUS, PUCK_HEIGHT)
         )
-        return Bodies(objects=(puck,), targets=(target,))
+        return Bodies(objects=(puck,), markers=(marker,))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a position of the puck out of reach: (3,)."""

@@ -6,18 +6,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import Look, PhysicsClient, VectorSimulation
+from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import GREEN, RED, Color
 from torch_panda.tasks.base import (
-    NO_ROTATION,
-    TABLE_FRICTION,
     Bodies,
     RewardType,
     Task,
-    create_table,
     object_observation,
 )
-from torch_panda.tasks.push import CUBE, CUBE_SIZE, create_cube, sample_on_table
+from torch_panda.tasks.rotations import NO_ROTATION
+from torch_panda.tasks.table import (
+    CUBE,
+    CUBE_SIZE,
+    TABLE_FRICTION,
+    create_cube,
+    create_table,
+    sample_on_table,
+)
 
 LOWER_HEIGHT = CUBE_SIZE / 2  # [m], of the centre
 UPPER_HEIGHT = 3 * CUBE_SIZE / 2  # [m]
@@ -36,8 +41,8 @@ class Stack(Task):
             does; otherwise the norm of both, as panda-gym 3.
         goal_xy_range: edge length of the square of goals [m].
         obj_xy_range: edge length of the square of start positions [m].
-        lower_color: of the lower cube and its target.
-        upper_color: of the upper cube and its target.
+        lower_color: of the lower cube and its marker.
+        upper_color: of the upper cube and its marker.
         object_mass: of the lower and of the upper cube [kg].
         object_friction: lateral friction of both cubes.
         table_friction: lateral friction of the table.
@@ -65,29 +70,29 @@ class Stack(Task):
         self.per_object = per_object
         self.goal_xy_range = goal_xy_range
         self.obj_xy_range = obj_xy_range
-        self.lower_look, self.upper_look = Look(lower_color), Look(upper_color)
+        self.lower_visual, self.upper_visual = Visual(lower_color), Visual(upper_color)
         self.object_mass = object_mass
         self.object_friction = object_friction
         self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the cubes, the lower one first, and their targets."""
+        """Build the table, the cubes, the lower one first, and their markers."""
         create_table(client, friction=self.table_friction)
         lower_mass, upper_mass = self.object_mass
         friction = self.object_friction
         lower = create_cube(
-            client, mass=lower_mass, friction=friction, look=self.lower_look
+            client, mass=lower_mass, friction=friction, visual=self.lower_visual
         )
-        lower_target = client.create_marker(
-            (0.0, 0.0, 0.05), CUBE, look=self.lower_look
+        lower_marker = client.create_marker(
+            (0.0, 0.0, 0.05), CUBE, visual=self.lower_visual
         )
         upper = create_cube(
-            client, mass=upper_mass, friction=friction, x=0.5, look=self.upper_look
+            client, mass=upper_mass, friction=friction, x=0.5, visual=self.upper_visual
         )
-        upper_target = client.create_marker(
-            (0.5, 0.0, 0.05), CUBE, look=self.upper_look
+        upper_marker = client.create_marker(
+            (0.5, 0.0, 0.05), CUBE, visual=self.upper_visual
         )
-        return Bodies(objects=(lower, upper), targets=(lower_target, upper_target))
+        return Bodies(objects=(lower, upper), markers=(lower_marker, upper_marker))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw where the stack should be: (6,)."""

@@ -4,11 +4,12 @@ import numpy as np
 import pybullet
 import pytest
 
-from torch_panda.bullet import BulletError, Camera, Look, PhysicsClient, VisualClient
-from torch_panda.bullet.camera import resized, to_metres
-from torch_panda.bullet.renderers import check_renderer
+from torch_panda.bullet import BulletError, PhysicsClient, Visual
 from torch_panda.bullet.shapes import Box, Cylinder, Sphere
-from torch_panda.tasks.flip import LOOK
+from torch_panda.rendering.camera import Camera, resized, to_metres
+from torch_panda.rendering.egl import check_renderer
+from torch_panda.rendering.visual_client import VisualClient
+from torch_panda.tasks.flip import VISUAL
 
 BLUE, RED = (0.1, 0.2, 0.9), (0.8, 0.1, 0.1)
 CAMERA = Camera(
@@ -23,10 +24,12 @@ CAMERA = Camera(
 
 
 def build(client):
-    client.create_box((1, 1, 0.1), mass=0, position=(0, 0, -0.1), look=Look(BLUE))
-    client.create_cylinder(0.1, 0.3, mass=1, position=(0.2, 0, 0.15), look=Look(RED))
+    client.create_box((1, 1, 0.1), mass=0, position=(0, 0, -0.1), visual=Visual(BLUE))
+    client.create_cylinder(
+        0.1, 0.3, mass=1, position=(0.2, 0, 0.15), visual=Visual(RED)
+    )
     client.create_sphere(0.15, mass=1, position=(-0.1, 0.2, 0.15))
-    client.create_marker((0, -0.2, 0.2), Box((0.1, 0.1, 0.1)), look=Look(BLUE))
+    client.create_marker((0, -0.2, 0.2), Box((0.1, 0.1, 0.1)), visual=Visual(BLUE))
 
 
 def build_reference(p):
@@ -67,7 +70,9 @@ def test_layers_hold_the_same_bodies_and_draw_their_own():
     with PhysicsClient() as physics, VisualClient("markers") as markers:
         build(physics)
         build(markers)
-        assert physics.state(3).q and markers.state(3).q
+        assert physics.blueprint == markers.blueprint
+        for client in (physics, markers):
+            assert client.state(3).base_pose[1] == -0.2
         image = markers.draw(CAMERA, segmentation=True)
         assert set(np.unique(image.segmentation)) == {-1, 3}
 
@@ -86,7 +91,7 @@ def test_depth_in_metres():
 def test_six_faces_differ():
     views = [(90, 0), (180, 0), (0, -90), (-90, 0), (0, 0), (0, 90)]
     with VisualClient() as client:
-        client.create_box((0.02,) * 3, mass=0, position=(0, 0, 0), look=LOOK)
+        client.create_box((0.02,) * 3, mass=0, position=(0, 0, 0), visual=VISUAL)
         colors = []
         for yaw, pitch in views:
             # So narrow a view that a face fills the picture.
@@ -114,9 +119,9 @@ def test_bad_cameras_are_named():
 
 
 def test_missing_texture_is_named(tmp_path):
-    look = Look(texture=tmp_path / "none.png")
+    visual = Visual(texture=tmp_path / "none.png")
     with VisualClient() as client, pytest.raises(BulletError, match=r"none\.png"):
-        client.create_box((1, 1, 1), mass=0, position=(0, 0, 0), look=look)
+        client.create_box((1, 1, 1), mass=0, position=(0, 0, 0), visual=visual)
 
 
 def test_unknown_renderer_is_named():

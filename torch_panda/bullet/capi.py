@@ -2,20 +2,9 @@
 
 Every line binds one function of ``PhysicsClientC_API.h`` (pybullet 3.2.7): name,
 result and arguments together. No logic lives here.
-
-The module is opened twice, because ctypes ties the lock to the library object:
-
-* ``CDLL`` releases the GIL around a call. It serves the calls that do real work, so
-  that clients in different threads step at the same time.
-* ``PyDLL`` keeps the GIL. It serves the setters, which take less time than handing
-  the lock over; through ``CDLL`` two threads would pass it back and forth.
-
-The file is found, not imported: importing pybullet prints a line on stdout.
 """
 
 import ctypes
-import importlib.metadata
-import importlib.util
 import sys
 from ctypes import (
     POINTER,
@@ -28,9 +17,10 @@ from ctypes import (
     c_ubyte,
     c_void_p,
 )
-from typing import Any
 
-SUPPORTED_VERSION = "3.2.7"
+from torch_panda.bullet.library import CHEAP as _cheap
+from torch_panda.bullet.library import WORK as _work
+from torch_panda.bullet.library import bind
 
 # enum EnumSharedMemoryServerStatus
 CMD_CLIENT_COMMAND_COMPLETED = 2
@@ -161,46 +151,6 @@ class CameraImage(ctypes.Structure):
         ("segmentation", POINTER(c_int)),
     )
 
-
-def wrong_pybullet(reason: str) -> ImportError:
-    """The one error for a pybullet whose C API is not the one declared here."""
-    try:
-        installed = importlib.metadata.version("pybullet")
-    except importlib.metadata.PackageNotFoundError:
-        installed = "none"
-    return ImportError(
-        f"torch_panda calls Bullet's C API through pybullet, and {reason} "
-        f"(installed: {installed}). Version {SUPPORTED_VERSION} works: "
-        f"pip install pybullet=={SUPPORTED_VERSION}"
-    )
-
-
-def library_path(module: str = "pybullet") -> str:
-    """Path of the extension module, without importing it."""
-    spec = importlib.util.find_spec(module)
-    if spec is None or spec.origin is None:
-        raise wrong_pybullet("pybullet is not installed")
-    return spec.origin
-
-
-def bind(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any:  # noqa: ANN401 (ctypes function types)
-    """Declare one C function.
-
-    Raises:
-        ImportError: the library does not export the name.
-    """
-    try:
-        function = getattr(library, name)
-    except AttributeError:
-        raise wrong_pybullet(f"it does not export {name}") from None
-    function.restype = result
-    function.argtypes = arguments
-    return function
-
-
-_path = library_path()
-_work = ctypes.CDLL(_path)
-_cheap = ctypes.PyDLL(_path)
 
 _client = _command = _status = c_void_p
 # Doubles are passed as a ctypes array or as an address, for instance of a tensor.
@@ -486,7 +436,7 @@ physics_set_joint_feedback = bind(
     _cheap, "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
 )
 
-# Looks: shapes that are seen, and cameras that see them
+# Visuals: shapes that are seen, and cameras that see them
 visual_init = bind(_cheap, "b3CreateVisualShapeCommandInit", _command, _client)
 visual_add_box = bind(_cheap, "b3CreateVisualShapeAddBox", c_int, _command, _doubles)
 visual_add_sphere = bind(
@@ -520,10 +470,12 @@ visual_set_specular = bind(
 status_visual = bind(_cheap, "b3GetStatusVisualShapeUniqueId", c_int, _status)
 texture_init = bind(_cheap, "b3InitLoadTexture", _command, _client, c_char_p)
 status_texture = bind(_cheap, "b3GetStatusTextureUniqueId", c_int, _status)
-look_init = bind(
+visual_update_init = bind(
     _cheap, "b3InitUpdateVisualShape2", _command, _client, c_int, c_int, c_int
 )
-look_set_texture = bind(_cheap, "b3UpdateVisualShapeTexture", None, _command, c_int)
+visual_update_texture = bind(
+    _cheap, "b3UpdateVisualShapeTexture", None, _command, c_int
+)
 view_matrix = bind(
     _cheap,
     "b3ComputeViewMatrixFromYawPitchRoll",

@@ -8,7 +8,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from torch_panda import Camera
-from torch_panda.bullet import renderers
+from torch_panda.rendering import egl
 
 SIZE = 48
 IMAGES = {"from_pixels": True, "depth": True, "segmentation": True, "render_size": SIZE}
@@ -177,11 +177,11 @@ def test_egl_where_it_works_and_a_clear_error_elsewhere():
 
 
 def test_no_blank_frames_without_egl(monkeypatch):
-    renderers._check_egl.cache_clear()
-    monkeypatch.setattr(renderers, "_EGL_PROBE", "raise SystemExit('no EGL device')")
+    egl._check_egl.cache_clear()
+    monkeypatch.setattr(egl, "_EGL_PROBE", "raise SystemExit('no EGL device')")
     with pytest.raises(RuntimeError, match=r"use 'tiny'.*no EGL device"):
         make(renderer="egl")
-    renderers._check_egl.cache_clear()
+    egl._check_egl.cache_clear()
 
 
 def test_unknown_renderer():

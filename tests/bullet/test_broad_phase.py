@@ -1,29 +1,23 @@
 """Restoring a world: bodies are back, and Bullet has forgotten the rest."""
 
 import random
-from ctypes import c_double
 
 import pytest
 
 from torch_panda.bullet import PhysicsClient
-from torch_panda.bullet.built_world import BuiltWorld
+from torch_panda.bullet.broad_phase import BroadPhase
 
 CUBE = (0.02, 0.02, 0.02)
-
-
-def read(address, count):
-    return list((c_double * count).from_address(address))
 
 
 def poses(client):
     """Base, joints and links of all bodies."""
     found = []
     for body in client.bodies:
-        state, num_joints = client.state(body), len(client.joints(body))
-        found.append(read(state.q, 7))
-        if num_joints:
-            found.append(read(state.joint_positions, 9))
-            found.append(read(state.link_poses, 7 * num_joints))
+        state = client.state(body)
+        found.append(state.base_pose.tolist())
+        found.append(state.joint_positions.tolist())
+        found.append(state.link_poses.tolist())
     return found
 
 
@@ -50,7 +44,7 @@ def disturb(client, num_steps):
 
 def test_bodies_are_where_they_were_built(client):
     built = poses(client)
-    world = BuiltWorld(client)
+    world = BroadPhase(client)
     disturb(client, 30)
     assert poses(client) != built
     world.restore()
@@ -58,7 +52,7 @@ def test_bodies_are_where_they_were_built(client):
 
 
 def test_contacts_are_forgotten(client):
-    world = BuiltWorld(client)
+    world = BroadPhase(client)
     client.step()
     assert client.contact_points()
     world.restore()
@@ -66,7 +60,7 @@ def test_contacts_are_forgotten(client):
 
 
 def test_links_touch_what_they_touched(client):
-    world = BuiltWorld(client)
+    world = BroadPhase(client)
     client.step()
 
     def touching():
@@ -81,7 +75,7 @@ def test_links_touch_what_they_touched(client):
 
 
 def test_what_follows_does_not_depend_on_what_was(client):
-    world = BuiltWorld(client)
+    world = BroadPhase(client)
     ends = []
     for num_steps in (0, 7, 40, 300):
         disturb(client, num_steps)
@@ -112,7 +106,7 @@ def test_what_follows_is_what_follows_in_a_new_client():
     with PhysicsClient() as new, PhysicsClient() as used:
         build(new)
         build(used)
-        world = BuiltWorld(used)
+        world = BroadPhase(used)
         for num_steps in (0, 7, 40, 300):
             used.set_joint(used.bodies[0], 1, 1.2, 0.5)
             used.step(num_steps)
@@ -131,7 +125,7 @@ def test_cubes_that_fly_apart_do_so_again(seed):
     with PhysicsClient() as client:
         client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
         cubes = [client.create_box(CUBE, mass=1.0, position=start) for start in starts]
-        world = BuiltWorld(client)
+        world = BroadPhase(client)
         ends = []
         for _ in range(8):
             world.restore()

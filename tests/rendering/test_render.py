@@ -12,9 +12,11 @@ from torchrl.record.loggers import Logger
 import torch_panda
 from tests.panda_gym_reference import make_reference, start
 from torch_panda import BulletError, Camera
-from torch_panda.bullet import visual
+from torch_panda.rendering.visual_client import VisualClient
 
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+# panda-gym's view in half its size; above 200 pixels, meshes have all their details.
+WIDTH, HEIGHT = 360, 240
 CLOSE = Camera(target=(0.0, 0.0, 0.0), distance=0.5, width=60, height=40)
 
 
@@ -22,19 +24,21 @@ def render_reference(reference):
     """panda-gym's picture, and which of its pixels show a target."""
     client = reference.sim.physics_client
     view = client.computeViewMatrixFromYawPitchRoll((0, 0, 0), 1.4, 45, -30, 0, 2)
-    projection = client.computeProjectionMatrixFOV(60, 720 / 480, 0.1, 100)
+    projection = client.computeProjectionMatrixFOV(60, WIDTH / HEIGHT, 0.1, 100)
     ids = client.getCameraImage(
-        720, 480, view, projection, shadow=True, renderer=pybullet.ER_TINY_RENDERER
+        WIDTH, HEIGHT, view, projection, renderer=pybullet.ER_TINY_RENDERER
     )[4]
     bodies = reference.sim._bodies_idx
     targets = [body for name, body in bodies.items() if name.startswith("target")]
-    return reference.render(), np.isin(np.reshape(ids, (480, 720)), targets)
+    return reference.render(), np.isin(np.reshape(ids, (HEIGHT, WIDTH)), targets)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_as_panda_gym_draws(task):
     """Every pixel but those of targets, which panda-gym draws opaque here."""
-    reference = make_reference(f"Panda{task}-v3")
+    reference = make_reference(
+        f"Panda{task}-v3", render_width=WIDTH, render_height=HEIGHT
+    )
     _, poses, goal = start(reference, seed=3)
     theirs, is_target = render_reference(reference)
     reference.close()
@@ -43,15 +47,15 @@ def test_as_panda_gym_draws(task):
         if len(poses):
             state["object_pose"] = torch.as_tensor(poses)
         env.reset(state, set_state=True)
-        ours = env.render().numpy()
-    assert ours.shape == (480, 720, 3)
+        ours = env.render(size=(HEIGHT, WIDTH)).numpy()
+    assert ours.shape == (HEIGHT, WIDTH, 3)
     difference = np.abs(ours.astype(int) - theirs.astype(int))
     differs = difference.max(axis=-1) > 0
     if task == "Flip":  # its cube cannot be seen: panda-gym's wheel lacks the texture
-        assert 0 < differs[~is_target].sum() < 600
+        assert 0 < differs[~is_target].sum() < 600 * (HEIGHT / 480) ** 2
     else:
         assert not differs[~is_target].any()
-        assert is_target.sum() > 50
+        assert is_target.sum() > 12
         # Translucent: between what panda-gym draws and what lies behind.
         assert differs[is_target].mean() > 0.9
 
@@ -123,13 +127,13 @@ def test_pictures_do_not_depend_on_threads():
 
 def test_nothing_is_built_before_something_is_drawn(monkeypatch):
     made = []
-    constructor = visual.VisualClient.__init__
+    constructor = VisualClient.__init__
 
     def count(self, *args, **kwargs):
         made.append(self)
         constructor(self, *args, **kwargs)
 
-    monkeypatch.setattr(visual.VisualClient, "__init__", count)
+    monkeypatch.setattr(VisualClient, "__init__", count)
     with torch_panda.make("PandaPush-v1", num_envs=3, num_threads=2, seed=0) as env:
         env.rollout(3)
         assert not made

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from torch_panda.bullet import Camera, VisualClient
-from torch_panda.bullet.client import find_urdf
-from torch_panda.bullet.coarse import coarse_urdf, merge_vertices
+from torch_panda.bullet.urdf import find_urdf
+from torch_panda.rendering import Camera
+from torch_panda.rendering.mesh_decimation import decimated_urdf, merge_vertices
+from torch_panda.rendering.visual_client import VisualClient
 
 
 def make_ball(n=40):
@@ -92,8 +93,8 @@ def test_the_arm_looks_the_same_from_afar():
 
 def test_coarse_files_are_made_once_and_small():
     urdf = find_urdf("franka_panda/panda.urdf")
-    path = coarse_urdf(urdf, 0.013)
-    assert coarse_urdf(urdf, 0.013) == path
+    path = decimated_urdf(urdf, 0.013)
+    assert decimated_urdf(urdf, 0.013) == path
     faces = [
         line
         for mesh in path.parent.glob("*.obj")

@@ -2,27 +2,29 @@
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from torch import Tensor
 
-from torch_panda.bullet import Camera, VectorSimulation, WorkerPool
-from torch_panda.bullet.renderers import RendererName
-from torch_panda.envs.twin import Frames, VisualTwin
+from torch_panda.bullet import VectorSimulation, WorkerPool
+from torch_panda.rendering.camera import Camera
+from torch_panda.rendering.egl import RendererName
+from torch_panda.rendering.frames import Frames
+from torch_panda.rendering.scene_renderer import SceneBuilder, SceneRenderer
 
 # Meshes finer than this are drawn as they are [m].
 _FINEST_CELL = 0.004
 
 
-class Renderer:
-    """Draws the environments of a simulation, each thread with a visual twin.
+class VectorRenderer:
+    """Draws the environments of a simulation, each thread with a `SceneRenderer`.
 
     Nothing is built before something is drawn. In small pictures the robot's meshes
     are merged to cells of half a pixel (see `mesh_cell`).
 
     Args:
         simulation: what is drawn, by its own threads.
-        make_twin: makes a twin of its scene, with a `mesh_cell`.
+        build_scene: builds the scene of the simulation.
         renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, in
             one thread of its own, because a context of OpenGL belongs to a thread.
     """
@@ -30,37 +32,38 @@ class Renderer:
     def __init__(
         self,
         simulation: VectorSimulation,
-        make_twin: Callable[[float], VisualTwin],
+        build_scene: SceneBuilder,
         *,
         renderer: RendererName = "tiny",
     ) -> None:
         self._simulation = simulation
-        self._make_twin = make_twin
-        # Idle twins by mesh cell; lists are popped and appended to under the GIL.
-        self._twins: dict[float, list[VisualTwin]] = {}
+        self._build_scene = build_scene
+        self._renderer: RendererName = renderer
+        # Idle ones by mesh cell; lists are popped and appended to under the GIL.
+        self._scenes: dict[float, list[SceneRenderer]] = {}
         self._gl_thread = WorkerPool(1) if renderer == "egl" else None
 
     def draw(
         self, envs: Sequence[int], camera: Camera, frames: Frames, rows: Sequence[int]
     ) -> None:
-        """Draw environments into rows of ``frames``; see `VisualTwin.draw`.
+        """Draw environments into rows of ``frames``; see `SceneRenderer.draw`.
 
         Raises:
-            WorkerError: Bullet failed in one twin.
+            WorkerError: Bullet failed in one picture.
         """
         jobs = list(zip(envs, rows, strict=True))
         run = self._simulation.run if self._gl_thread is None else self._gl_thread.run
         cell = mesh_cell(camera) if self._gl_thread is None else 0.0
         threads = self._simulation.num_threads if self._gl_thread is None else 1
-        twins = self._have_twins(cell, min(threads, len(jobs)))
+        scenes = self._provide(cell, min(threads, len(jobs)))
 
         def work(job: int) -> None:
             env, row = jobs[job]
-            twin = twins.pop()
+            scene = scenes.pop()
             try:
-                twin.draw(self._simulation, env, camera, frames, row)
+                scene.draw(env, camera, frames, row)
             finally:
-                twins.append(twin)
+                scenes.append(scene)
 
         run(work, range(len(jobs)))
 
@@ -71,25 +74,37 @@ class Renderer:
         return frames.pixels
 
     def close(self) -> None:
-        """Free all twins. Closing again does nothing."""
-        twins = [twin for idle in self._twins.values() for twin in idle]
-        self._twins = {}
+        """Free all that was built. Closing again does nothing."""
+        scenes = [scene for idle in self._scenes.values() for scene in idle]
+        self._scenes = {}
         if self._gl_thread is None:
-            for twin in twins:
-                twin.close()
+            for scene in scenes:
+                scene.close()
         elif not sys.is_finalizing():  # when Python ends, its threads already have
-            self._gl_thread.run(lambda k: twins[k].close(), range(len(twins)))
+            self._gl_thread.run(lambda k: scenes[k].close(), range(len(scenes)))
             self._gl_thread.close()
 
-    def _have_twins(self, cell: float, count: int) -> list[VisualTwin]:
+    def _provide(self, cell: float, count: int) -> list[SceneRenderer]:
         """At least so many, made one by one: Bullet's importer is not for threads."""
-        twins = self._twins.setdefault(cell, [])
-        missing = range(len(twins), count)
+        scenes = self._scenes.setdefault(cell, [])
+
+        def make(_: int) -> None:
+            scenes.append(
+                SceneRenderer(
+                    self._simulation,
+                    self._build_scene,
+                    renderer=self._renderer,
+                    mesh_cell=cell,
+                )
+            )
+
+        missing = range(len(scenes), count)
         if self._gl_thread is None:
-            twins.extend(self._make_twin(cell) for _ in missing)
+            for index in missing:
+                make(index)
         else:
-            self._gl_thread.run(lambda _: twins.append(self._make_twin(cell)), missing)
-        return twins
+            self._gl_thread.run(make, missing)
+        return scenes
 
 
 def mesh_cell(camera: Camera) -> float:

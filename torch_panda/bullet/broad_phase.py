@@ -1,4 +1,4 @@
-"""The way back to a world as it was built, as far as Bullet remembers it.
+"""The way back to the broad phase of a world as it was built.
 
 A step depends on more than poses and velocities: Bullet solves contacts in the order
 in which its broad phase found the pairs of bodies, and that order depends on what
@@ -17,8 +17,8 @@ No command resets them, so each is led back to where it was.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from torch_panda.bullet import _capi
-from torch_panda.bullet.client import PhysicsClient, read_doubles
+from torch_panda.bullet import capi
+from torch_panda.bullet.client import PhysicsClient
 
 # [m]; so much farther than the world is wide that a box put back lands beside those
 # that are back already, never among those that still wait.
@@ -39,8 +39,8 @@ class _Link(NamedTuple):
     snapshot: int  # in which the link is where it entered the broad phase
 
 
-class BuiltWorld:
-    """What a client has built so far, and the way back to it.
+class BroadPhase:
+    """A client's broad phase as its world was built, and the way back to it.
 
     Bodies go back by snapshots, which leave the links' boxes where they are: a link
     enters the broad phase anew when its collision filter is set, and no other one does.
@@ -83,7 +83,7 @@ class BuiltWorld:
         # A detection that finds a single pair puts the mark at the first one.
         pair = client.bodies[:2]
         for body in pair:
-            client.set_collision_filter(body, -1, *_capi.FILTER_DYNAMIC)
+            client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
         for body in pair:
             client.set_collision_filter(body, -1, *_NOTHING)
@@ -112,15 +112,14 @@ class BuiltWorld:
                 client.set_base(body, (x, y, z), base[3:])
                 snapshot = client.save()
             is_static = link == -1 and not client.mass(body)
-            group_mask = _capi.FILTER_STATIC if is_static else _capi.FILTER_DYNAMIC
+            group_mask = capi.FILTER_STATIC if is_static else capi.FILTER_DYNAMIC
             self._links.append(_Link(body, link, group_mask, snapshot))
 
 
 def _read_poses(client: PhysicsClient, body: int) -> list[tuple[float, ...]]:
     """Poses of the centres of mass of a body's base and links."""
-    state, joints = client.state(body), client.joints(body)
-    addresses = [state.q, *(state.link_pose(joint.index) for joint in joints)]
-    return [read_doubles(address, 7) for address in addresses]
+    state = client.state(body)
+    return [tuple(pose.tolist()) for pose in (state.base_pose, *state.link_poses)]
 
 
 def _rotate(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:

@@ -1,4 +1,4 @@
-"""Coarser meshes for small pictures.
+"""Decimated meshes for small pictures.
 
 The Panda's meshes have 100,000 triangles, and Bullet's software renderer spends 95 %
 of a picture of 64 x 64 pixels on triangles that are smaller than a pixel.
@@ -28,7 +28,7 @@ def _scratch() -> tempfile.TemporaryDirectory[str]:
 
 
 @functools.cache
-def coarse_urdf(urdf: str, cell: float) -> Path:
+def decimated_urdf(urdf: str, cell: float) -> Path:
     """A URDF that looks like another one from afar.
 
     Its visual meshes in Wavefront's format (.obj) have one vertex in a cube of edge

@@ -1,24 +1,19 @@
-"""A client that holds what bodies look like, and draws it."""
+"""A client that holds the visuals of bodies, and draws them."""
 
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from torch_panda.bullet import _capi
-from torch_panda.bullet.camera import Camera
-from torch_panda.bullet.client import (
-    BulletError,
-    PhysicsClient,
-    doubles,
-    find_urdf,
-)
-from torch_panda.bullet.coarse import coarse_urdf
-from torch_panda.bullet.renderers import RendererName
-from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Look, Shape, Sphere
+from torch_panda.bullet import PhysicsClient, capi
+from torch_panda.bullet.connection import BulletError, doubles
+from torch_panda.bullet.library import library_path
+from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Shape, Sphere, Visual
+from torch_panda.rendering.camera import Camera
+from torch_panda.rendering.egl import RendererName
+from torch_panda.rendering.mesh_decimation import decimated_urdf
 
 Layer = Literal["solids", "markers", "all"]
 
@@ -54,10 +49,10 @@ class VisualClient(PhysicsClient):
         renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, whose
             client must be made, used and closed by one thread.
         mesh_cell: merge the vertices of robots' meshes in cubes of this edge length
-            [m]; see `coarse_urdf`. 0 leaves them as they are.
+            [m]; see `decimated_urdf`. 0 leaves them as they are.
 
     Attributes:
-        looks: how bodies look, by body id.
+        visuals: how bodies are drawn, by body id.
     """
 
     def __init__(
@@ -76,22 +71,7 @@ class VisualClient(PhysicsClient):
         self._mesh_cell = mesh_cell
         if layer != "markers":
             self._urdf_flags = 0
-        self.looks: dict[int, Look] = {}
-
-    def load_urdf(
-        self,
-        path: str | Path,
-        *,
-        position: Sequence[float] = (0.0, 0.0, 0.0),
-        orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-        fixed_base: bool = False,
-    ) -> int:
-        """Load a URDF to be seen; see `PhysicsClient.load_urdf`."""
-        if self._mesh_cell > 0 and self._layer == "solids":
-            path = coarse_urdf(find_urdf(path), self._mesh_cell)
-        return super().load_urdf(
-            path, position=position, orientation=orientation, fixed_base=fixed_base
-        )
+        self.visuals: dict[int, Visual] = {}
 
     def draw(
         self, camera: Camera, *, segmentation: bool = False, shadow: bool = True
@@ -105,7 +85,7 @@ class VisualClient(PhysicsClient):
         """
         view, projection = (c_float * 16)(), (c_float * 16)()
         x, y, z = camera.target
-        _capi.view_matrix(
+        capi.view_matrix(
             (c_float * 3)(x, y, z),
             camera.distance,
             camera.yaw,
@@ -115,19 +95,19 @@ class VisualClient(PhysicsClient):
             view,
         )
         aspect = camera.width / camera.height
-        _capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
+        capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
         while self._warm_up:
             self._warm_up -= 1
             self.draw(camera, shadow=shadow)
-        command = _capi.camera_init(self._open())
-        _capi.camera_set_matrices(command, view, projection)
-        _capi.camera_set_size(command, camera.width, camera.height)
-        _capi.camera_set_shadow(command, int(shadow))
-        flags = 0 if segmentation else _capi.ER_NO_SEGMENTATION_MASK
-        _capi.camera_set_flags(command, flags)
-        self._submit(command, _capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
-        data = _capi.CameraImage()
-        _capi.camera_result(self._handle, byref(data))
+        command = capi.camera_init(self._open())
+        capi.camera_set_matrices(command, view, projection)
+        capi.camera_set_size(command, camera.width, camera.height)
+        capi.camera_set_shadow(command, int(shadow))
+        flags = 0 if segmentation else capi.ER_NO_SEGMENTATION_MASK
+        capi.camera_set_flags(command, flags)
+        self._submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
+        data = capi.CameraImage()
+        capi.camera_result(self._handle, byref(data))
         size = (camera.height, camera.width)
         return Image(
             np.ctypeslib.as_array(data.rgba, shape=(*size, 4))[..., :3],
@@ -138,39 +118,44 @@ class VisualClient(PhysicsClient):
         )
 
     def _load_egl(self) -> None:
-        command = _capi.plugin_init(self._open())
-        _capi.plugin_set_path(command, _capi.library_path("eglRenderer").encode())
-        _capi.plugin_set_suffix(command, b"_eglRendererPlugin")
+        command = capi.plugin_init(self._open())
+        capi.plugin_set_path(command, library_path("eglRenderer").encode())
+        capi.plugin_set_suffix(command, b"_eglRendererPlugin")
         status = self._submit(
-            command, _capi.CMD_CUSTOM_COMMAND_COMPLETED, "load its EGL renderer"
+            command, capi.CMD_CUSTOM_COMMAND_COMPLETED, "load its EGL renderer"
         )
-        if _capi.status_plugin(status) < 0:
+        if capi.status_plugin(status) < 0:
             raise BulletError("Bullet could not load its EGL renderer")
 
-    # ---- looks -------------------------------------------------------------------
+    # ---- visuals -----------------------------------------------------------------
+
+    def _drawn_urdf(self, file: str) -> str:
+        if self._mesh_cell > 0 and self._layer == "solids":
+            return str(decimated_urdf(file, self._mesh_cell))
+        return file
 
     def _create_body(
         self,
         shape: Shape | None,
         mass: float,
         position: Sequence[float],
-        look: Look,
+        visual: Visual,
         *,
         is_marker: bool = False,
     ) -> int:
-        body = super()._create_body(shape, mass, position, look, is_marker=is_marker)
-        self.looks[body] = look
-        if look.texture is not None and self._draws(is_marker):
-            path = str(look.texture).encode()
-            command = _capi.texture_init(self._open(), path)
+        body = super()._create_body(shape, mass, position, visual, is_marker=is_marker)
+        self.visuals[body] = visual
+        if visual.texture is not None and self._draws(is_marker):
+            path = str(visual.texture).encode()
+            command = capi.texture_init(self._open(), path)
             status = self._submit(
-                command, _capi.CMD_LOAD_TEXTURE_COMPLETED, f"load {look.texture}"
+                command, capi.CMD_LOAD_TEXTURE_COMPLETED, f"load {visual.texture}"
             )
-            texture = _capi.status_texture(status)
-            command = _capi.look_init(self._open(), body, -1, -1)
-            _capi.look_set_texture(command, texture)
+            texture = capi.status_texture(status)
+            command = capi.visual_update_init(self._open(), body, -1, -1)
+            capi.visual_update_texture(command, texture)
             self._submit(
-                command, _capi.CMD_VISUAL_SHAPE_UPDATE_COMPLETED, "set a texture"
+                command, capi.CMD_VISUAL_SHAPE_UPDATE_COMPLETED, "set a texture"
             )
         return body
 
@@ -178,28 +163,30 @@ class VisualClient(PhysicsClient):
         # Bullet draws the collision shape of a body that has no visual shape.
         return -1
 
-    def _create_visual_shape(self, shape: Shape, look: Look, *, is_marker: bool) -> int:
+    def _create_visual_shape(
+        self, shape: Shape, visual: Visual, *, is_marker: bool
+    ) -> int:
         if not self._draws(is_marker):
             return -1
         handle = self._open()
-        command = _capi.visual_init(handle)
+        command = capi.visual_init(handle)
         match shape:
-            case Box(half_extents) if look.texture is not None:
+            case Box(half_extents) if visual.texture is not None:
                 add_textured_box(handle, command, half_extents)
             case Box(half_extents):
-                _capi.visual_add_box(command, doubles(half_extents))
+                capi.visual_add_box(command, doubles(half_extents))
             case Cylinder(radius, height):
-                _capi.visual_add_cylinder(command, radius, height)
+                capi.visual_add_cylinder(command, radius, height)
             case Sphere(radius):
-                _capi.visual_add_sphere(command, radius)
-        color = look.color if look.texture is None else WHITE
-        opacity = look.opacity if is_marker and self._layer == "all" else 1.0
-        _capi.visual_set_color(command, 0, doubles((*color, opacity)))
-        _capi.visual_set_specular(command, 0, _NOT_SHINY)
+                capi.visual_add_sphere(command, radius)
+        color = visual.color if visual.texture is None else WHITE
+        opacity = visual.opacity if is_marker and self._layer == "all" else 1.0
+        capi.visual_set_color(command, 0, doubles((*color, opacity)))
+        capi.visual_set_specular(command, 0, _NOT_SHINY)
         status = self._submit(
-            command, _capi.CMD_CREATE_VISUAL_SHAPE_COMPLETED, "create a visual shape"
+            command, capi.CMD_CREATE_VISUAL_SHAPE_COMPLETED, "create a visual shape"
         )
-        return _capi.status_visual(status)
+        return capi.status_visual(status)
 
     def _draws(self, is_marker: bool) -> bool:
         return self._layer == "all" or is_marker == (self._layer == "markers")
@@ -208,7 +195,7 @@ class VisualClient(PhysicsClient):
 def add_textured_box(
     handle: int, command: int, half_extents: tuple[float, float, float]
 ) -> None:
-    """Add a box whose faces show the six squares of a texture; see `Look`.
+    """Add a box whose faces show the six squares of a texture; see `Visual`.
 
     Bullet's own boxes show the whole texture on each face.
     """
@@ -231,7 +218,7 @@ def add_textured_box(
                 normals += normal
                 coordinates += [(axis + u) / 3, 1 - (row + 1 - v) / 2]
             indices += [first + k for k in (0, 1, 2, 0, 2, 3)]
-    _capi.visual_add_mesh(
+    capi.visual_add_mesh(
         handle,
         command,
         doubles((1.0, 1.0, 1.0)),

@@ -17,11 +17,9 @@ ARM = 7  # joints
 
 def hand_to_world(env):
     """Rotation of the hand's frame, where the wrist's wrench is given: (3, 3)."""
-    from ctypes import c_double
-
-    simulation = env._simulation
+    simulation = env.episodes.simulation
     state = simulation.clients[0].state(simulation.scene.robot)
-    *_, x, y, z, w = (c_double * 7).from_address(state.link_pose(HAND))
+    *_, x, y, z, w = state.link_pose(HAND).tolist()
     return torch.tensor(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

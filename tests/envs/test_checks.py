@@ -1,0 +1,249 @@
+"""What an environment is made of: each mistake is one clear error."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv, Task
+from torch_panda.bullet import VectorSimulation
+from torch_panda.tasks import Bodies, create_table
+
+
+def make(task, robot=None, **options):
+    return RobotTaskEnv(robot=robot or Panda(block_gripper=True), task=task, **options)
+
+
+# ---- kinds -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("robot", "task", "message"),
+    [
+        (Panda(), Reach, "task must be an instance of Task, got the class Reach"),
+        (Panda, Reach(), "robot must be an instance of Robot, got the class Panda"),
+        (Reach(), Panda(), "robot must be an instance of Robot, got <.*Reach"),
+        (Panda(), None, "task must be an instance of Task, got None"),
+    ],
+)
+def test_robot_and_task(robot, task, message):
+    with pytest.raises(TypeError, match=message):
+        RobotTaskEnv(robot=robot, task=task)
+
+
+def test_sensors_are_sensors():
+    with pytest.raises(TypeError, match="must be a Sensor or a name, got 3"):
+        make(Reach(), sensors=(3,))
+    twice = (torch_panda.CameraSensor(), torch_panda.CameraSensor(depth=True))
+    with pytest.raises(ValueError, match=r"two sensors observe \['pixels'\]"):
+        make(Reach(), sensors=twice)
+
+
+# ---- scenes ------------------------------------------------------------------
+
+
+class Forgetful(Reach):
+    def build(self, client):
+        super().build(client)
+
+
+class ForgetfulRobot(Panda):
+    def build(self, client):
+        super().build(client)
+
+
+def test_builders_that_return_nothing():
+    with pytest.raises(TypeError, match=r"Forgetful.build must return Bodies, got Non"):
+        make(Forgetful())
+    with pytest.raises(TypeError, match=r"ForgetfulRobot.build must return the robot"):
+        make(Reach(), ForgetfulRobot())
+    with pytest.raises(TypeError, match="must return a Scene, got None"):
+        VectorSimulation(lambda client: None, 1)
+
+
+class Changing(Push):
+    """Builds another cube every time, under the same body ids."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+        self.count = 0
+
+    def build(self, client):
+        self.count += 1
+        create_table(client)
+        size = 0.02 + (0.001 * self.count if self.change == "size" else 0.0)
+        height = 0.02 + (0.001 * self.count if self.change == "place" else 0.0)
+        cube = client.create_box((size,) * 3, mass=1.0, position=(0, 0, height))
+        if self.change == "friction":
+            client.set_friction(cube, lateral=0.1 * self.count)
+        elif self.change == "number" and self.count > 1:
+            client.create_marker((0.0, 0.0, 0.0))
+        return Bodies(objects=(cube,))
+
+
+@pytest.mark.parametrize("change", ["size", "place", "friction", "number"])
+def test_scenes_that_differ_between_clients(change):
+    with pytest.raises(BulletError, match="the same in every client"):
+        make(Changing(change), num_envs=2)
+
+
+def test_scenes_that_differ_from_what_is_drawn():
+    with make(Changing("size")) as env:
+        env.reset()
+        with pytest.raises(BulletError, match="the same in every client"):
+            env.render(size=8)
+
+
+class ChangingMarker(Reach):
+    count = 0
+
+    def build(self, client):
+        self.count += 1
+        shape = torch_panda.bullet.Sphere(0.02 if self.count < 3 else 0.05)
+        return Bodies(markers=(client.create_marker((0.0, 0.0, 0.0), shape),))
+
+
+def test_markers_that_differ_from_what_is_drawn():
+    with make(ChangingMarker()) as env:
+        env.reset()
+        with pytest.raises(BulletError, match="the same in every client"):
+            env.render(size=8)
+
+
+# ---- functions ---------------------------------------------------------------
+
+
+def task_with(name, function):
+    return type("Own", (Reach,), {name: function})()
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "error", "message"),
+    [
+        ("compute_reward", lambda s, a, d: 0.0, TypeError, "compute_reward must retur"),
+        ("compute_reward", lambda s, a, d: a[:, 0], ValueError, r"\(2, 1\), got \(2,"),
+        ("is_success", lambda s, a, d: a[:, 0] > 0, ValueError, r"is_success .*\(2, 1"),
+        ("is_success", lambda s, a, d: a[:, :1], ValueError, "must return bool"),
+        ("is_success", lambda s, a, d: True, TypeError, "is_success must return a te"),
+        (
+            "achieved_goal",
+            lambda s, sim: (0, 0, 0),
+            TypeError,
+            "achieved_goal must re",
+        ),
+        (
+            "observation",
+            lambda s, sim: sim.ee_position,
+            ValueError,
+            r"shape \(2, 0\), got \(2, 3\)",
+        ),
+    ],
+)
+def test_functions_of_a_task(name, function, error, message):
+    with pytest.raises(error, match=message):
+        make(task_with(name, function), num_envs=2)
+
+
+# ---- rotations ---------------------------------------------------------------
+
+
+def test_quaternions_without_length():
+    kuka = {
+        "urdf": "kuka_iiwa/model.urdf",
+        "neutral_joint_position": (0.0,) * 7,
+        "joint_forces": (200.0,) * 7,
+        "ee_link": 6,
+    }
+    with pytest.raises(ValueError, match="ee_orientation must be a quaternion"):
+        torch_panda.Robot(**kuka, ee_orientation=(0, 0, 0, 0))
+    task = Push()
+    task.sample_objects = lambda rng: ((0, 0, 0.02, 0, 0, 0, 0),)
+    with (
+        make(task) as env,
+        pytest.raises(ValueError, match=r"sample_objects .*unit q"),
+    ):
+        env.reset()
+    task = torch_panda.Flip()
+    task.sample_goal = lambda rng: (0, 0, 0, 0)
+    with make(task) as env, pytest.raises(ValueError, match=r"desired_goal .*unit qua"):
+        env.reset()
+    with torch_panda.make("PandaFlip-v1", num_envs=2, seed=0) as env:
+        env.reset()
+        state = env.get_state()
+        bad = state.clone()
+        bad["desired_goal"][1] = 0.0
+        with pytest.raises(ValueError, match=r"desired_goal .*ment 1 .*unit"):
+            env.reset(bad, set_state=True)
+        assert (env.get_state() == state).all()
+
+
+# ---- states without set_state ------------------------------------------------
+
+
+@pytest.fixture
+def env():
+    with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
+        env.rollout(5)
+        yield env
+
+
+def test_a_state_is_started_from_without_being_told(env):
+    state = env.get_state()
+    expected = env.reset(state, set_state=True)
+    env.reset()
+    assert (env.reset(state) == expected).all()
+    env.reset()
+    goal = state.select("desired_goal")
+    assert torch.equal(env.reset(goal)["desired_goal"], goal["desired_goal"].float())
+
+
+def test_set_state_false_starts_an_episode(env):
+    state = env.get_state()
+    env.reset(state, set_state=False)
+    assert not torch.equal(env.get_state()["object_pose"], state["object_pose"])
+    assert not env.get_state()["step_count"].any()
+
+
+def test_what_was_observed_is_no_state(env):
+    td = env.rollout(3)[:, -1]["next"].exclude("reward")
+    td["step_count"] = torch.full((2, 1), 3)  # of torchrl's StepCounter
+    goal = td["desired_goal"].clone()
+    start = env.reset(td)
+    assert not torch.equal(start["desired_goal"], goal)
+    assert not env.get_state()["step_count"].any()
+
+
+def test_a_state_among_observations_needs_a_word(env):
+    td = env.reset(env.get_state(), set_state=True)
+    assert "object_pose" in td
+    with pytest.raises(ValueError, match="say set_state=True"):
+        env.reset(td)
+    env.reset(td, set_state=False)
+    # Within a rollout torchrl resets as ever.
+    last = env.get_state()
+    last["step_count"][:] = 49
+    td = env.reset(last, set_state=True)
+    rollout = env.rollout(3, tensordict=td, auto_reset=False, break_when_any_done=False)
+    assert rollout["next", "truncated"][:, 0].all()
+    goals = rollout["desired_goal"]
+    assert not torch.equal(goals[:, 0], goals[:, 1])
+
+
+def test_an_empty_task():
+    class Nothing(Task):
+        goal_dim, observation_dim = 3, 0
+
+        def build(self, client):
+            return Bodies()
+
+        def sample_goal(self, rng):
+            return (0.0, 0.0, 0.0)
+
+        def achieved_goal(self, simulation):
+            return simulation.ee_position
+
+    with make(Nothing(), num_envs=2) as env:
+        td = env.reset()
+        env.step(td.set("action", torch.zeros(2, 3)))
+        assert isinstance(env.get_state(), TensorDict)

@@ -1,0 +1,157 @@
+"""An exact state: episodes go on from it bit for bit."""
+
+import numpy as np
+import pytest
+import torch
+
+import torch_panda
+from tests.envs.test_parity import choose_action
+from torch_panda.envs import history
+from torch_panda.gymnasium_envs import GoalEnv
+
+NUM_ENVS = 4
+
+
+def actions_of(env_id, observation, rngs, size):
+    rows = zip(observation.numpy(), rngs, strict=True)
+    actions = [choose_action(env_id, row, rng, size) for row, rng in rows]
+    return torch.from_numpy(np.stack(actions))
+
+
+def play(env, td, env_id, rngs, steps):
+    size = env.action_spec.shape[-1]
+    for _ in range(steps):
+        action = actions_of(env_id, td["observation"], rngs, size)
+        td = env.step(td.set("action", action))["next"]
+    return td
+
+
+def follow(env, td, actions):
+    observations = []
+    for action in actions:
+        td = env.step(td.clone().set("action", action))["next"]
+        observations.append(td)
+    return torch.stack(observations, dim=1)
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    ["PandaPush-v1", "PandaSlideJoints-v3", "PandaPickAndPlace-v1", "PandaStack-v3"],
+)
+def test_goes_on_bit_for_bit(env_id):
+    """Through hard contacts, from different times in different environments."""
+    rngs = [np.random.default_rng(k) for k in range(NUM_ENVS)]
+    with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=2, seed=1) as env:
+        td = play(env, env.reset(), env_id, rngs, 12)
+        half = torch.tensor([[True], [False]] * (NUM_ENVS // 2))
+        td = play(env, env.reset(td.set("_reset", half)), env_id, rngs, 9)
+        state = env.get_state(exact=True)
+        assert state["num_actions"].flatten().tolist() == [9, 21] * (NUM_ENVS // 2)
+        generator = torch.Generator().manual_seed(0)
+        shape = (20, *env.action_spec.shape)
+        actions = torch.randn(shape, generator=generator).clamp(-1, 1)
+        expected = follow(env, td.clone(), actions)
+        play(env, env.reset(), env_id, rngs, 5)
+        again = env.reset(state, set_state=True)
+        for key in ("observation", "achieved_goal", "desired_goal", "success"):
+            assert torch.equal(again[key], td[key]), key
+        assert (env.get_state(exact=True) == state).all()
+        assert (follow(env, again, actions) == expected).all()
+    # And in another environment.
+    with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=1) as other:
+        again = other.reset(state.clone(), set_state=True)
+        assert (follow(other, again, actions) == expected).all()
+
+
+def test_without_actions_and_unbatched():
+    with torch_panda.make("PandaPush-v1", seed=0, sensors=("joint_torque",)) as env:
+        first = env.reset()
+        state = env.get_state(exact=True)
+        assert state["actions"].shape == (0, 3)
+        action = torch.tensor([1.0, 0.0, -1.0])
+        expected = env.step(first.clone().set("action", action))["next"]
+        later = env.get_state(exact=True)
+        again = env.reset(state, set_state=True)
+        found = env.step(again.set("action", action))["next"]
+        assert (found == expected).all()
+        # Sensors say what they said, not that no time has passed.
+        again = env.reset(later, set_state=True)
+        assert torch.equal(again["joint_torque"], expected["joint_torque"])
+
+
+def test_a_partial_reset_restores_only_its_own():
+    with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
+        torch.manual_seed(0)
+        td = env.rollout(5)[:, -1]["next"].exclude("reward")
+        state = env.get_state(exact=True)
+        action = torch.ones(2, 3)
+        expected = env.step(td.clone().set("action", action))["next"]
+        state["_reset"] = torch.tensor([[False], [True]])
+        env.reset(state, set_state=True)
+        assert env.get_state()["step_count"].flatten().tolist() == [6, 5]
+        env.step(td.clone().set("action", action).set("_step", state["_reset"][:, 0]))
+        pose = env.get_state()["object_pose"][1, 0, :3].float()
+        assert torch.equal(pose, expected["achieved_goal"][1])
+
+
+def test_gymnasium_passes_it_on():
+    env = GoalEnv("PandaPush-v1")
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step([0.3, 0.0, -1.0])
+    state = env.torch_env.get_state(exact=True)
+    expected = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
+    env.reset(options={"state": {key: x.numpy() for key, x in state.items()}})
+    found = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
+    env.close()
+    np.testing.assert_array_equal(expected, found)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.exclude("actions"), r"needs all its entries.*'actions'"),
+        (lambda s: s.exclude("joint_position"), r"needs all.*'joint_position'"),
+        (lambda s: s.set("actions", s["actions"] * 9), r"actions of environment 0"),
+        (lambda s: s.set("actions", s["actions"][..., :2]), "actions must have shape"),
+        (lambda s: s.set("num_actions", s["num_actions"] + 1), "at most 3"),
+        (
+            lambda s: s.set("object_pose", s["object_pose"] + 1e-9),
+            "environment 0 does not lead to its object_pose",
+        ),
+    ],
+)
+def test_what_is_no_exact_state(change, message):
+    with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
+        torch.manual_seed(0)
+        env.rollout(3)
+        state = env.get_state(exact=True)
+        with pytest.raises(ValueError, match=message):
+            env.reset(change(state.clone()), set_state=True)
+        env.rollout(3)
+
+
+def test_episodes_without_end_are_forgotten(monkeypatch):
+    monkeypatch.setattr(history, "_MOST", 10)
+    with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
+        td = env.reset().set("action", torch.zeros(2, 3))
+        for _ in range(10):
+            env.step(td.clone())
+        assert env.get_state(exact=True)["actions"].shape == (2, 10, 3)
+        env.step(td.clone())
+        with pytest.raises(torch_panda.BulletError, match=r"\[0, 1\] are too long"):
+            env.get_state(exact=True)
+        env.reset()
+        env.step(td.clone())
+        assert env.get_state(exact=True)["actions"].shape == (2, 1, 3)
+
+
+def test_long_histories_are_forgotten_with_their_episodes():
+    with torch_panda.make(
+        "PandaReach-v1", num_envs=2, num_threads=1, seed=0, physics="fast"
+    ) as env:
+        torch.manual_seed(0)
+        env.rollout(1101, break_when_any_done=False)
+        assert len(env.episodes._history._steps) < 1100
+        state = env.get_state(exact=True)
+        assert state["num_actions"].flatten().tolist() == [1, 1]

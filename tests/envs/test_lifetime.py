@@ -1,0 +1,169 @@
+"""Copies, resumed runs, and what is left of an environment that is forgotten."""
+
+import gc
+import pickle
+import weakref
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import SerialEnv
+
+import torch_panda
+from torch_panda import CameraSensor
+
+
+@pytest.fixture
+def no_collection():
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def test_a_rebound_environment_is_gone_at_once(no_collection):
+    """Without the garbage collector: there is no cycle of references."""
+    env = torch_panda.make(
+        "PandaPush-v1",
+        num_envs=2,
+        sensors=("wrist_force_torque",),
+        depth=True,
+        render_size=8,
+    )
+    env.rollout(3)
+    env.render(size=8)
+    env.get_state(exact=True)
+    clients = list(env.episodes.simulation.clients)
+    reference = weakref.ref(env)
+    env = None
+    assert reference() is None
+    assert all(client.is_closed for client in clients)
+
+
+class PushHarder(torch_panda.RobotTaskEnv):
+    """A subclass with arguments of its own."""
+
+    def __init__(self, friction, *, limit=7, **options):
+        super().__init__(
+            robot=torch_panda.Panda(block_gripper=True),
+            task=torch_panda.Push(object_friction=friction),
+            max_episode_steps=limit,
+            **options,
+        )
+        self.friction = friction
+
+
+def test_a_subclass_with_arguments_pickles():
+    with PushHarder(0.7, limit=9, num_envs=2) as env:
+        env.set_seed(4)
+        with pickle.loads(pickle.dumps(env)) as copy:
+            assert type(copy) is PushHarder
+            assert (copy.friction, copy.max_episode_steps) == (0.7, 9)
+            assert copy.task.object_friction == 0.7
+            assert (copy.reset() == env.reset()).all()
+            # And a copy's copy.
+            with pickle.loads(pickle.dumps(copy)) as second:
+                assert second.friction == 0.7
+
+
+def test_cameras_pickle():
+    sensor = CameraSensor(torch_panda.Camera(width=8, height=8), depth=True)
+    with torch_panda.make("PandaReach-v1", seed=0, sensors=(sensor,)) as env:
+        start = env.reset()
+        with pickle.loads(pickle.dumps(env)) as copy:
+            assert (copy.reset()["depth"] == start["depth"]).all()
+
+
+def test_made_under_inference_mode():
+    with torch.inference_mode():
+        env = torch_panda.make(
+            "PandaPickAndPlace-v1",
+            num_envs=2,
+            seed=0,
+            sensors=("joint_torque",),
+            depth=True,
+            render_size=8,
+        )
+        env.rollout(2)
+    with env, torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as other:
+        other.reset()
+        start = env.reset()
+        assert torch.equal(start["observation"], other.reset()["observation"])
+        env.rollout(3)
+        env.reset(env.get_state(exact=True), set_state=True)
+        # A policy that squashes into the spec's bounds can learn.
+        scale = torch.ones(4, requires_grad=True)
+        (env.action_spec.high * scale).sum().backward()
+
+
+def make(**options):
+    return torch_panda.make("PandaReach-v1", num_envs=2, num_threads=1, **options)
+
+
+def test_a_run_is_resumed():
+    with make(seed=3) as env, make() as resumed:
+        env.set_env_seed(1, 8)
+        for _ in range(3):
+            env.reset()
+        env.reset(env.reset().set("_reset", torch.tensor([[True], [False]])))
+        state = env.state_dict()
+        resumed.load_state_dict(state)
+        for _ in range(2):
+            assert (env.reset() == resumed.reset()).all()
+
+
+def test_a_state_dict_is_a_file_without_code(tmp_path):
+    with make(seed=10**30) as env:
+        env.reset()
+        torch.save(env.state_dict(), tmp_path / "env.pt")
+        state = torch.load(tmp_path / "env.pt", weights_only=True)
+        goal = env.reset()["desired_goal"]
+        env.load_state_dict(state)
+        assert torch.equal(env.reset()["desired_goal"], goal)
+
+
+def test_a_resumed_collector_goes_on():
+    def collect(env):
+        policy = TensorDictModule(
+            torch.nn.LazyLinear(3), in_keys=["observation"], out_keys=["action"]
+        )
+        policy(env.reset())
+        return Collector(env, policy, frames_per_batch=100, total_frames=200)
+
+    def goals(data):
+        return data["desired_goal"][:, 0]
+
+    first, second = collect(make(seed=1)), collect(make())
+    next(iter(first))
+    second.load_state_dict(first.state_dict())
+    second.env.load_state_dict(first.env.state_dict())
+    for collector in (first, second):
+        collector.reset()
+    expected, found = next(iter(first)), next(iter(second))
+    assert torch.equal(goals(expected), goals(found))
+    first.shutdown()
+    second.shutdown()
+
+
+def test_batched_environments_are_resumed():
+    def serial():
+        return SerialEnv(2, make)
+
+    first, second = serial(), serial()
+    first.set_seed(0)
+    first.reset()
+    state = first.state_dict()
+    second.load_state_dict(state)
+    expected, found = first.reset(), second.reset()
+    assert torch.equal(expected["desired_goal"], found["desired_goal"])
+    first.close()
+    second.close()
+
+
+def test_a_state_dict_of_other_environments():
+    with (
+        make() as env,
+        torch_panda.make("PandaReach-v1", num_envs=3) as other,
+        pytest.raises(ValueError, match="of 2 environments, there are 3"),
+    ):
+        other.load_state_dict(env.state_dict())

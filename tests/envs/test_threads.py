@@ -1,0 +1,142 @@
+"""One thread at a time: an error for the others, and never a crash.
+
+Two threads in one Bullet client crash the interpreter, so the tests run in processes.
+"""
+
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import torch
+
+import torch_panda
+
+THREE_THREADS = """
+import threading, torch, torch_panda
+
+env = torch_panda.make("PandaPush-v1", num_envs=4, num_threads=2, seed=0)
+start = env.reset()
+errors, others = [], []
+
+def step():
+    td = start.clone().set("action", torch.ones(4, 3))
+    for _ in range(60):
+        try:
+            env.step(td)
+        except torch_panda.BulletError as error:
+            errors.append(str(error))
+        except BaseException as error:
+            others.append(error)
+
+threads = [threading.Thread(target=step) for _ in range(3)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+assert not others, others
+assert errors and all("thread" in error for error in errors), errors
+assert env.rollout(5).shape == (4, 5)
+env.close()
+print("fine")
+"""
+
+COLLECTOR = """
+import os, sys, time, torch, torch_panda
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs.utils import RandomPolicy
+
+env = torch_panda.make("PandaPush-v1", num_envs=4, num_threads=2, seed=0)
+rb = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=4)
+policy = RandomPolicy(env.action_spec)
+collector = Collector(
+    env, policy, frames_per_batch=80, total_frames=10**9, replay_buffer=rb
+)
+collector.start()
+while len(rb) < 80:
+    time.sleep(0.01)
+for _ in range(50):
+    try:
+        env.rollout(20)
+    except torch_panda.BulletError as error:
+        print(error, file=sys.stderr)  # or the collector's thread says it
+        break
+sys.stderr.flush()
+print("fine", flush=True)
+os._exit(0)
+"""
+
+
+def run(code):
+    """Run code in a process; what it has said to stderr."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.endswith("fine\n"), done.stderr[-2000:]
+    return done.stderr
+
+
+def test_three_threads_that_step():
+    run(THREE_THREADS)
+
+
+def test_a_collectors_thread_and_a_rollout():
+    assert "it serves one thread at a time" in run(COLLECTOR)
+
+
+@pytest.mark.parametrize("call", ["step", "reset", "render", "get_state", "close"])
+def test_every_call_is_refused_while_another_thread_is_in_it(monkeypatch, call):
+    """The other thread waits inside of a step until it has been refused."""
+    is_in, may_leave = threading.Event(), threading.Event()
+    with torch_panda.make("PandaReach-v1", num_envs=2, num_threads=1, seed=0) as env:
+        td = env.reset().set("action", torch.zeros(2, 3))
+        calls = {
+            "step": lambda: env.step(td.clone()),
+            "reset": env.reset,
+            "render": lambda: env.render(size=8),
+            "get_state": env.get_state,
+            "close": env.close,
+        }
+        observation = env.robot.observation
+
+        def wait(simulation):
+            is_in.set()
+            assert may_leave.wait(60)
+            return observation(simulation)
+
+        monkeypatch.setattr(env.robot, "observation", wait)
+        thread = threading.Thread(target=env.step, args=(td.clone(),))
+        thread.start()
+        assert is_in.wait(60)
+        with pytest.raises(torch_panda.BulletError, match="thread"):
+            calls[call]()
+        may_leave.set()
+        thread.join()
+        calls[call]()
+
+
+def test_threads_one_after_the_other():
+    results = []
+    with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
+        for _ in range(3):
+            thread = threading.Thread(target=lambda: results.append(env.rollout(3)))
+            thread.start()
+            thread.join()
+        results.append(env.rollout(3))
+    assert len(results) == 4
+
+
+def test_the_guard_costs_less_than_a_microsecond():
+    with torch_panda.make("PandaReach-v1") as env:
+        guard = env.episodes._guard
+        fastest = float("inf")
+        for _ in range(20):
+            start = time.perf_counter()
+            for _ in range(1000):
+                with guard:
+                    pass
+            fastest = min(fastest, (time.perf_counter() - start) / 1000)
+    assert fastest < 1e-6

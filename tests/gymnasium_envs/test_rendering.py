@@ -1,0 +1,74 @@
+"""Render modes, and panda-gym's names for the camera."""
+
+import gymnasium
+import numpy as np
+import panda_gym  # noqa: F401 (registers its environments)
+import pytest
+
+import torch_panda
+from torch_panda import Camera
+from torch_panda.gymnasium_envs import GoalEnv, GoalVectorEnv
+
+VIEW = {
+    "render_width": 60,
+    "render_height": 40,
+    "render_target_position": [0.1, 0.0, 0.05],
+    "render_distance": 0.9,
+    "render_yaw": 20,
+    "render_pitch": -50,
+    "render_roll": 5,
+}
+
+
+@pytest.mark.parametrize("mode", ["human", "ansi", "depth"])
+def test_unknown_modes(mode):
+    for kind in (GoalEnv, GoalVectorEnv):
+        with pytest.raises(ValueError, match=r"render_mode must be None or one of"):
+            kind("PandaReach-v1", render_mode=mode)
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        gymnasium.make_vec("torch_panda/PandaReach-v1", num_envs=2, render_mode=mode)
+
+
+def test_the_view_of_panda_gym():
+    """Pixels outside of the translucent target are panda-gym's."""
+    ours = gymnasium.make("torch_panda/PandaReach-v3", render_mode="rgb_array", **VIEW)
+    theirs = gymnasium.make(
+        "PandaReach-v3", render_mode="rgb_array", renderer="Tiny", **VIEW
+    )
+    ours.reset(seed=0)
+    theirs.reset(seed=0)
+    a, b = ours.render(), theirs.render()
+    ours.close()
+    theirs.close()
+    assert a.shape == b.shape == (40, 60, 3)
+    # Goals differ: so do the pixels of both targets.
+    assert (a != b).any(axis=-1).mean() < 0.05
+
+
+def test_a_camera_and_what_changes_it():
+    camera = Camera(distance=0.6, width=30, height=20)
+    single = GoalEnv("PandaReach-v1", render_mode="rgb_array", render_camera=camera)
+    many = GoalVectorEnv(
+        "PandaReach-v1",
+        num_envs=2,
+        render_mode="rgb_array",
+        render_camera=camera,
+        render_width=40,
+    )
+    single.reset(seed=0)
+    many.reset(seed=0)
+    pixels = single.render()
+    assert np.array_equal(pixels, single.torch_env.render(camera=camera))
+    frames = many.render()
+    assert [frame.shape for frame in frames] == [(20, 40, 3)] * 2
+    single.close()
+    many.close()
+    with pytest.raises(ValueError, match="at least 1 pixel"):
+        GoalEnv("PandaReach-v1", render_width=0)
+
+
+def test_importing_registers_and_nothing_else():
+    gymnasium.register_envs(torch_panda)
+    spec = gymnasium.spec("torch_panda/PandaPush-v1")
+    assert spec.entry_point == "torch_panda.gymnasium_envs:GoalEnv"
+    assert spec.vector_entry_point == "torch_panda.gymnasium_envs:GoalVectorEnv"

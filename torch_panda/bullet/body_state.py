@@ -1,0 +1,126 @@
+"""What Bullet reports of a body, as views of its memory.
+
+They are valid until the client's next command; copy what is to be kept. All numbers are
+float64 and in the world frame.
+"""
+
+from ctypes import byref, c_double, c_int, c_void_p
+
+import numpy as np
+import numpy.typing as npt
+
+from torch_panda.bullet import capi
+
+Doubles = npt.NDArray[np.float64]
+
+# Joints follow the base in Bullet's coordinates: 7 of its pose, 6 of its velocity.
+Q_OFFSET = 7
+U_OFFSET = 6
+
+_DOUBLE = 8  # bytes
+
+
+def _view(address: int | None, first: int, *shape: int) -> Doubles:
+    """Doubles from the one with number ``first`` on."""
+    assert address is not None  # Bullet has answered
+    count = shape[0] if len(shape) == 1 else shape[0] * shape[1]
+    array = (c_double * count).from_address(address + _DOUBLE * first)
+    view: Doubles = np.ctypeslib.as_array(array)
+    return view if len(shape) == 1 else view.reshape(shape)
+
+
+class BodyState:
+    """The state of a body with n joints of one degree of freedom and m links.
+
+    Args:
+        status: Bullet's answer to a request for the state.
+    """
+
+    def __init__(self, status: int) -> None:
+        self._status = status
+        q_size = c_int()
+        q, u, poses, velocities = c_void_p(), c_void_p(), c_void_p(), c_void_p()
+        capi.state_result(
+            status,
+            None,
+            None,
+            byref(q_size),
+            None,
+            None,
+            byref(q),
+            byref(u),
+            None,
+            None,
+            None,
+            byref(poses),
+            byref(velocities),
+        )
+        self._num_joints = q_size.value - Q_OFFSET
+        self._q, self._u = q.value, u.value
+        self._poses, self._velocities = poses.value, velocities.value
+
+    @property
+    def base_pose(self) -> Doubles:
+        """(7,): position [m] and quaternion xyzw."""
+        return _view(self._q, 0, 7)
+
+    @property
+    def base_velocity(self) -> Doubles:
+        """(6,): linear [m/s] and angular [rad/s]."""
+        return _view(self._u, 0, 6)
+
+    @property
+    def joint_positions(self) -> Doubles:
+        """(n,) [rad] or [m]."""
+        return _view(self._q, Q_OFFSET, self._num_joints)
+
+    @property
+    def joint_velocities(self) -> Doubles:
+        """(n,) [rad/s] or [m/s]."""
+        return _view(self._u, U_OFFSET, self._num_joints)
+
+    def link_pose(self, link: int) -> Doubles:
+        """(7,): of a link's centre of mass."""
+        return _view(self._poses, 7 * link, 7)
+
+    def link_velocity(self, link: int) -> Doubles:
+        """(6,): of a link's centre of mass; filled only if it was asked for."""
+        return _view(self._velocities, 6 * link, 6)
+
+    @property
+    def link_poses(self) -> Doubles:
+        """(m, 7): of the centres of mass."""
+        return _view(self._poses, 0, self._read_forces()[0], 7)
+
+    @property
+    def wrenches(self) -> Doubles:
+        """(m, 6): what each link's parent exerts on it in the last step.
+
+        Force [N] and torque [N m], at the joint and in the link's frame; zero without a
+        sensor.
+        """
+        num_links, wrenches, _ = self._read_forces()
+        return _view(wrenches, 0, num_links, 6)
+
+    @property
+    def motor_forces(self) -> Doubles:
+        """(m,): what each joint's motor exerts in the last step [N m] or [N]."""
+        num_links, _, motors = self._read_forces()
+        return _view(motors, 0, num_links)
+
+    def _read_forces(self) -> tuple[int, int | None, int | None]:
+        """Number of links, and where wrenches and motor forces are."""
+        links, wrenches, motors = c_int(), c_void_p(), c_void_p()
+        nothing = (None,) * 5
+        capi.state_result(
+            self._status,
+            None,
+            byref(links),
+            *nothing,
+            byref(wrenches),
+            None,
+            byref(motors),
+            None,
+            None,
+        )
+        return links.value, wrenches.value, motors.value

@@ -1,0 +1,300 @@
+"""Building a world of bodies in a client, and asking what it is made of."""
+
+import math
+from collections.abc import Sequence
+from ctypes import byref
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch_panda.bullet import capi
+from torch_panda.bullet.connection import Connection, doubles
+from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
+from torch_panda.bullet.urdf import check_collision_filters, find_urdf
+
+ORIGIN = (0.0, 0.0, 0.0)
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+# What was built, one command after the other: its name and its arguments.
+Blueprint = tuple[tuple[object, ...], ...]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a body, as its URDF describes it."""
+
+    index: int
+    name: str
+    link_name: str
+    is_movable: bool
+
+
+class SceneClient(Connection):
+    """A client in which a scene is built.
+
+    Nothing is drawn here: visuals are for a `VisualClient`, in which the same calls
+    build the same bodies to be seen.
+    """
+
+    _urdf_flags = capi.URDF_IGNORE_VISUAL_SHAPES
+
+    def __init__(self) -> None:
+        self._bodies: list[int] = []
+        self._blueprint: list[tuple[object, ...]] = []
+        super().__init__()
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Ids of the bodies, in the order in which they were built."""
+        return tuple(self._bodies)
+
+    @property
+    def blueprint(self) -> Blueprint:
+        """What was built and how; equal in clients that hold the same scene."""
+        return tuple(self._blueprint)
+
+    def load_urdf(
+        self,
+        path: str | Path,
+        *,
+        position: Sequence[float] = ORIGIN,
+        orientation: Sequence[float] = NO_ROTATION,
+        fixed_base: bool = False,
+    ) -> int:
+        """Load a URDF, here without its visual shapes, and return its body id.
+
+        Args:
+            path: a file, or a name among those that pybullet ships.
+            position: of the base, world frame [m].
+            orientation: of the base, quaternion xyzw.
+            fixed_base: whether the base cannot move.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it chooses its own collision groups or masks, which Bullet does
+                not report and `set_collision_filter` could therefore not restore.
+            BulletError: Bullet cannot read it.
+        """
+        file = find_urdf(path)
+        check_collision_filters(file)
+        check_quaternion("orientation", orientation)
+        pose = tuple(map(float, (*position, *orientation)))
+        self._blueprint.append(("load_urdf", file, pose, fixed_base))
+        file = self._drawn_urdf(file)
+        command = capi.urdf_init(self._open(), file.encode())
+        capi.urdf_set_position(command, *position)
+        capi.urdf_set_orientation(command, *orientation)
+        capi.urdf_set_fixed_base(command, int(fixed_base))
+        capi.urdf_set_flags(command, self._urdf_flags)
+        status = self._submit(command, capi.CMD_URDF_LOADING_COMPLETED, f"load {path}")
+        return self._add_body(status)
+
+    def create_box(
+        self,
+        half_extents: Sequence[float],
+        *,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a box and return its body id.
+
+        Args:
+            half_extents: along x, y and z [m].
+            mass: [kg]; 0 makes a body that never moves.
+            position: of its centre, world frame [m].
+            visual: how a `VisualClient` draws it.
+        """
+        x, y, z = half_extents
+        return self._create_body(Box((x, y, z)), mass, position, visual)
+
+    def create_cylinder(
+        self,
+        radius: float,
+        height: float,
+        *,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create an upright cylinder and return its body id; see `create_box`."""
+        return self._create_body(Cylinder(radius, height), mass, position, visual)
+
+    def create_sphere(
+        self,
+        radius: float,
+        *,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a sphere and return its body id; see `create_box`."""
+        return self._create_body(Sphere(radius), mass, position, visual)
+
+    def create_marker(
+        self,
+        position: Sequence[float],
+        shape: Shape | None = None,
+        *,
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a body that nothing touches, and return its id.
+
+        Args:
+            position: world frame [m].
+            shape: what a `VisualClient` draws, translucent; None: nothing.
+            visual: how it draws it.
+        """
+        return self._create_body(shape, 0.0, position, visual, is_marker=True)
+
+    def set_friction(
+        self,
+        body: int,
+        link: int = -1,
+        *,
+        lateral: float | None = None,
+        spinning: float | None = None,
+    ) -> None:
+        """Set friction coefficients of a link (-1 is the base); None leaves one.
+
+        Raises:
+            ValueError: one is negative or not finite.
+        """
+        _check_not_negative(lateral_friction=lateral, spinning_friction=spinning)
+        self._blueprint.append(("set_friction", body, link, lateral, spinning))
+        command = capi.dynamics_init(self._open())
+        if lateral is not None:
+            capi.dynamics_set_lateral_friction(command, body, link, lateral)
+        if spinning is not None:
+            capi.dynamics_set_spinning_friction(command, body, link, spinning)
+        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set friction")
+
+    def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
+        """Choose what a link (-1 is the base) touches, and forget what it touched.
+
+        Two links touch if the group of either has a bit of the other's mask. The link
+        enters Bullet's broad phase anew: without its overlaps and contacts so far, and
+        as the last of all links.
+        """
+        command = capi.filter_init(self._open())
+        capi.filter_set_group_mask(command, body, link, group, mask)
+        self._submit(
+            command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set a collision filter"
+        )
+
+    def mass(self, body: int, link: int = -1) -> float:
+        """Mass of a link (-1 is the base) [kg]; 0 for a base that cannot move."""
+        return float(self._dynamics(body, link).mass)
+
+    def centre_of_mass(self, body: int, link: int = -1) -> tuple[float, ...]:
+        """Centre of mass of a link (-1 is the base) in the frame of its URDF [m]."""
+        return tuple(self._dynamics(body, link).local_inertial_frame[:3])
+
+    def _dynamics(self, body: int, link: int) -> capi.DynamicsInfo:
+        command = capi.dynamics_info_init(self._open(), body, link)
+        status = self._submit(
+            command, capi.CMD_GET_DYNAMICS_INFO_COMPLETED, "report dynamics"
+        )
+        info = capi.DynamicsInfo()
+        capi.dynamics_info(status, byref(info))
+        return info
+
+    def joints(self, body: int) -> list[Joint]:
+        """The joints of a body, in the order of its URDF."""
+        handle = self._open()
+        info = capi.JointInfo()
+        joints = []
+        for index in range(capi.joint_count(handle, body)):
+            capi.joint_info(handle, body, index, byref(info))
+            name, link = info.joint_name.decode(), info.link_name.decode()
+            joints.append(Joint(index, name, link, info.u_size == 1))
+        return joints
+
+    def enable_wrench_sensor(self, body: int, joint: int) -> None:
+        """Have the forces through a joint computed in every step."""
+        command = capi.physics_init(self._open())
+        capi.physics_set_joint_feedback(command, capi.JOINT_FEEDBACK_IN_JOINT_FRAME)
+        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+        command = capi.sensor_init(self._open(), body)
+        capi.sensor_enable_wrench(command, joint, 1)
+        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "add a sensor")
+
+    def _create_body(
+        self,
+        shape: Shape | None,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual,
+        *,
+        is_marker: bool = False,
+    ) -> int:
+        _check_not_negative(mass=mass)
+        kind = "create_marker" if is_marker else "create_body"
+        place = tuple(map(float, position))
+        self._blueprint.append((kind, shape, mass, place, visual))
+        collision = visual_shape = -1
+        if shape is not None:
+            visual_shape = self._create_visual_shape(shape, visual, is_marker=is_marker)
+            if not is_marker:
+                collision = self._create_collision_shape(shape)
+        rotation, origin = doubles(NO_ROTATION), doubles(ORIGIN)
+        command = capi.body_init(self._open())
+        capi.body_set_base(
+            command,
+            mass,
+            collision,
+            visual_shape,
+            doubles(position),
+            rotation,
+            origin,
+            rotation,
+        )
+        status = self._submit(
+            command, capi.CMD_CREATE_MULTI_BODY_COMPLETED, "create a body"
+        )
+        return self._add_body(status)
+
+    def _drawn_urdf(self, file: str) -> str:
+        """A URDF that stands for another one; here, where none is drawn, itself."""
+        return file
+
+    def _add_body(self, status: int) -> int:
+        body: int = capi.status_body(status)
+        self._bodies.append(body)
+        return body
+
+    def _create_collision_shape(self, shape: Shape) -> int:
+        command = capi.shape_init(self._open())
+        match shape:
+            case Box(half_extents):
+                capi.shape_add_box(command, doubles(half_extents))
+            case Cylinder(radius, height):
+                capi.shape_add_cylinder(command, radius, height)
+            case Sphere(radius):
+                capi.shape_add_sphere(command, radius)
+        status = self._submit(
+            command, capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
+        )
+        return capi.status_shape(status)
+
+    def _create_visual_shape(
+        self, shape: Shape, visual: Visual, *, is_marker: bool
+    ) -> int:
+        """A shape to be seen; -1, as here, is none."""
+        return -1
+
+
+def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
+    """Make sure that a quaternion xyzw stands for a rotation.
+
+    Raises:
+        ValueError: it has no length, or is not finite.
+    """
+    length = math.hypot(*quaternion)
+    if not (len(quaternion) == 4 and 0 < length < math.inf):
+        raise ValueError(f"{name} must be a quaternion xyzw, got {tuple(quaternion)}")
+
+
+def _check_not_negative(**values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None and not 0 <= value < math.inf:
+            raise ValueError(f"{name} must be finite and at least 0, got {value}")

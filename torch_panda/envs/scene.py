@@ -1,0 +1,62 @@
+"""A robot, a task and sensors, built in a client."""
+
+from collections.abc import Sequence
+
+from torch_panda.bullet import PhysicsClient, Scene
+from torch_panda.robots import Robot
+from torch_panda.sensors import Sensor
+from torch_panda.tasks import Bodies, Task
+
+
+class TaskScene:
+    """Builds the same scene in any client; see `rendering.SceneBuilder`.
+
+    It holds descriptions only: an environment that held its simulation, which held
+    the environment as what builds its scene, would outlive its last reference.
+
+    Args:
+        robot: the robot.
+        task: the task.
+        sensors: what the robot's clients are to sense.
+    """
+
+    def __init__(self, robot: Robot, task: Task, sensors: Sequence[Sensor]) -> None:
+        self._robot = robot
+        self._task = task
+        self._sensors = sensors
+
+    def __call__(self, client: PhysicsClient) -> Scene:
+        """Build all of it.
+
+        Raises:
+            TypeError: the robot or the task does not say what it has built.
+        """
+        robot = self._robot
+        body = robot.build(client)
+        if not isinstance(body, int):
+            raise TypeError(
+                f"{type(robot).__name__}.build must return the robot's body id, "
+                f"got {body!r}"
+            )
+        bodies = self._build_task(client)
+        for sensor in self._sensors:
+            sensor.build(client, body, robot)
+        return Scene(
+            robot=body,
+            joints=tuple(j.index for j in client.joints(body) if j.is_movable),
+            ee_link=robot.ee_link,
+            objects=tuple(bodies.objects),
+            markers=tuple(bodies.markers),
+        )
+
+    def build_markers(self, client: PhysicsClient) -> tuple[int, ...]:
+        """Build the task alone, and return the body ids of its markers."""
+        return tuple(self._build_task(client).markers)
+
+    def _build_task(self, client: PhysicsClient) -> Bodies:
+        bodies = self._task.build(client)
+        if not isinstance(bodies, Bodies):
+            raise TypeError(
+                f"{type(self._task).__name__}.build must return Bodies, got {bodies!r}"
+            )
+        return bodies

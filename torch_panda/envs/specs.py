@@ -1,0 +1,61 @@
+"""What torchrl is told of the tensors of an environment."""
+
+import torch
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+
+from torch_panda.envs.episodes import Episodes
+from torch_panda.sensors import Entry
+
+
+class Specs:
+    """Specs of a batch of environments, from the sizes of robot, task and sensors.
+
+    Args:
+        episodes: the environments.
+        device: where the tensors are placed.
+        observe_state: whether ``observation`` is observed.
+    """
+
+    def __init__(
+        self, episodes: Episodes, device: torch.device, *, observe_state: bool
+    ) -> None:
+        self._batch = torch.Size(episodes.batch_shape)
+        self._device = device
+        robot, task = episodes.robot, episodes.task
+        observed: dict[str, TensorSpec] = {
+            "achieved_goal": self._numbers(task.goal_dim),
+            "desired_goal": self._numbers(task.goal_dim),
+            "success": self._flag(),
+        }
+        if observe_state:
+            size = robot.observation_dim + task.observation_dim
+            observed["observation"] = self._numbers(size)
+        for key, entry in episodes.sensed.items():
+            observed[key] = self._sensed(entry)
+        self.observation = Composite(observed, shape=self._batch, device=device)
+        self.action = Bounded(
+            low=-1.0,
+            high=1.0,
+            shape=(*self._batch, robot.action_dim),
+            device=device,
+            dtype=torch.float32,
+        )
+        self.reward = self._numbers(1)
+        self.done = Composite(
+            {key: self._flag() for key in ("done", "terminated", "truncated")},
+            shape=self._batch,
+            device=device,
+        )
+
+    def _numbers(self, size: int) -> Unbounded:
+        shape = (*self._batch, size)
+        return Unbounded(shape, device=self._device, dtype=torch.float32)
+
+    def _flag(self) -> Binary:
+        return Binary(shape=(*self._batch, 1), device=self._device, dtype=torch.bool)
+
+    def _sensed(self, entry: Entry) -> TensorSpec:
+        shape, dtype = (*self._batch, *entry.shape), entry.dtype
+        if entry.high is None:
+            return Unbounded(shape, dtype=dtype, device=self._device)
+        return Bounded(0, entry.high, shape, dtype=dtype, device=self._device)

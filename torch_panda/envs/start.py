@@ -1,0 +1,62 @@
+"""Drawing the start of an episode."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import VectorSimulation
+from torch_panda.envs.state import QUATERNION_TOLERANCE
+from torch_panda.robots import Robot
+from torch_panda.tasks import Task
+
+
+def draw_start(
+    env: int,
+    rng: np.random.Generator,
+    robot: Robot,
+    task: Task,
+    simulation: VectorSimulation,
+    goal: Tensor,
+) -> None:
+    """Put the start of an environment's next episode into the state tensors.
+
+    Args:
+        env: which environment.
+        rng: of this episode.
+        robot: starts neutral.
+        task: draws the goal, then the objects.
+        simulation: receives the state.
+        goal: (n, goal_dim), receives the goal.
+
+    Raises:
+        ValueError: the task draws a wrong shape, or what is not finite or no rotation.
+    """
+    _fill(goal[env], task.sample_goal(rng), "sample_goal")
+    simulation.joint_position[env] = _double(robot.neutral_joint_position)
+    simulation.joint_velocity[env] = 0.0
+    if simulation.scene.objects:
+        pose = simulation.object_pose
+        _fill(pose[env], task.sample_objects(rng), "sample_objects")
+        for *_, x, y, z, w in pose[env].tolist():
+            if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
+                raise ValueError(
+                    f"sample_objects must return unit quaternions, got {[x, y, z, w]}"
+                )
+        simulation.object_velocity[env] = 0.0
+
+
+def _double(values: object) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float64, device="cpu")
+
+
+def _fill(row: Tensor, values: object, function: str) -> None:
+    """Take what a task has drawn for one environment, (...)."""
+    drawn = _double(values)
+    if drawn.shape != row.shape or not drawn.isfinite().all():
+        raise ValueError(
+            f"{function} must return finite numbers of shape {tuple(row.shape)}, "
+            f"got {values}"
+        )
+    row.copy_(drawn)

@@ -1,0 +1,60 @@
+"""Pictures, and what is laid over them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from torch_panda.rendering.camera import Camera
+
+
+@dataclass
+class Frames:
+    """Pictures of n environments.
+
+    Attributes:
+        pixels: (n, height, width, 3) uint8.
+        depth: (n, height, width, 1) float32 [m], or None.
+        segmentation: (n, height, width, 1) int32, or None.
+    """
+
+    pixels: Tensor
+    depth: Tensor | None = None
+    segmentation: Tensor | None = None
+
+    @classmethod
+    def allocate(
+        cls, n: int, camera: Camera, *, depth: bool = False, segmentation: bool = False
+    ) -> "Frames":
+        """Black pictures of a camera's size."""
+
+        def zeros(channels: int, dtype: torch.dtype) -> Tensor:
+            shape = (n, camera.height, camera.width, channels)
+            return torch.zeros(shape, dtype=dtype, device="cpu")
+
+        return cls(
+            zeros(3, torch.uint8),
+            zeros(1, torch.float32) if depth else None,
+            zeros(1, torch.int32) if segmentation else None,
+        )
+
+
+def blend(
+    pixels: npt.NDArray[np.uint8],
+    overlay: npt.NDArray[np.uint8],
+    where: npt.NDArray[np.bool_],
+    opacity: npt.NDArray[np.float32],
+) -> None:
+    """Lay something translucent over pixels, in place.
+
+    Args:
+        pixels: (height, width, 3), what lies behind.
+        overlay: (height, width, 3), what lies in front.
+        where: (height, width), where something does.
+        opacity: of what does, as many values as ``where`` is true.
+    """
+    opacity = opacity[:, None]
+    mixed = (1 - opacity) * pixels[where] + opacity * overlay[where]
+    pixels[where] = mixed.round().astype(np.uint8)
