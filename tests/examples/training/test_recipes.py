@@ -4,7 +4,7 @@ import pytest
 
 import torch_panda
 from limits import check_limits
-from train import Args, default_args
+from train import Args, Run, default_args
 from training.recipes import RECIPES, find_recipe
 
 
@@ -21,9 +21,17 @@ def test_every_task_has_a_recipe():
         assert find_recipe(env_id) is not None
         assert any(env_id.startswith(f"Panda{task}") for task in RECIPES)
     push = RECIPES["Push"]
-    for variant in ("", "Joints", "Dense", "JointsDense"):
-        assert find_recipe(f"PandaPush{variant}-v3") == push
+    assert find_recipe("PandaPush-v1") == find_recipe("PandaPushDense-v3") == push
     assert find_recipe("PandaPickAndPlace-v1") != push
+
+
+@pytest.mark.parametrize(
+    "env_id", ["PandaPickAndPlaceJoints-v1", "PandaFlipJointsDense-v3"]
+)
+def test_recipes_fit_joint_control(env_id, tmp_path):
+    args = default_args("tuned", env_id)
+    args.num_envs, args.total_steps = 2, 100
+    Run(args, tmp_path).close()
 
 
 def test_unknown_tasks_and_the_paper_have_none():

@@ -1,0 +1,36 @@
+"""The guides: their snippets run as they stand, and they can be read."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
+FOLDERS += ("examples/policies", "examples/results")
+GUIDES = [ROOT / folder / "README.md" for folder in FOLDERS]
+MAX_LINES, MAX_WIDTH = 150, 120
+
+
+@pytest.mark.parametrize("guide", ["README.md", "torch_panda/README.md"])
+def test_snippets(guide):
+    """One after the other, as a reader would type them."""
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / guide).read_text(), re.DOTALL)
+    assert snippets
+    names = {}
+    for snippet in snippets:
+        exec(compile(snippet, guide, "exec"), names)
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=FOLDERS)
+def test_a_guide_is_readable(guide):
+    lines = guide.read_text().splitlines()
+    assert len(lines) <= MAX_LINES
+    assert max(map(len, lines)) <= MAX_WIDTH
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=FOLDERS)
+def test_links_of_a_guide(guide):
+    links = re.findall(r"\]\(([^)#]+)\)", guide.read_text())
+    files = [link for link in links if not link.startswith("http")]
+    assert [link for link in files if not (guide.parent / link).exists()] == []
