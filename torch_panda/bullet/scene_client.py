@@ -1,6 +1,7 @@
 """Building a world of bodies in a client, and asking what it is made of."""
 
 import math
+import threading
 from collections.abc import Sequence
 from ctypes import byref
 from dataclasses import dataclass
@@ -13,6 +14,9 @@ from torch_panda.bullet.urdf import check_collision_filters, find_urdf
 
 ORIGIN = (0.0, 0.0, 0.0)
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+# Bullet's importer shares its caches between clients: two threads in it crash.
+_IMPORTER = threading.Lock()
 
 # What was built, one command after the other: its name and its arguments.
 Blueprint = tuple[tuple[object, ...], ...]
@@ -85,7 +89,10 @@ class SceneClient(Connection):
         capi.urdf_set_orientation(command, *orientation)
         capi.urdf_set_fixed_base(command, int(fixed_base))
         capi.urdf_set_flags(command, self._urdf_flags)
-        status = self._submit(command, capi.CMD_URDF_LOADING_COMPLETED, f"load {path}")
+        with _IMPORTER:
+            status = self._submit(
+                command, capi.CMD_URDF_LOADING_COMPLETED, f"load {path}"
+            )
         return self._add_body(status)
 
     def create_box(
