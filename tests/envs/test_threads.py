@@ -69,6 +69,27 @@ os._exit(0)
 """
 
 
+OWN_ENVIRONMENTS = """
+import threading, torch_panda
+
+def work(seed):
+    for _ in range(3):
+        with torch_panda.make("PandaPush-v1", num_threads=1, seed=seed) as env:
+            env.rollout(2)
+            env.render(size=8)
+        done.append(seed)
+
+done = []
+threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+assert len(done) == 18
+print("fine")
+"""
+
+
 def run(code):
     """Run code in a process; what it has said to stderr."""
     done = subprocess.run(
@@ -85,6 +106,10 @@ def test_three_threads_that_step():
 
 def test_a_collectors_thread_and_a_rollout():
     assert "it serves one thread at a time" in run(COLLECTOR)
+
+
+def test_threads_may_build_environments_of_their_own_at_the_same_time():
+    run(OWN_ENVIRONMENTS)
 
 
 @pytest.mark.parametrize("call", ["step", "reset", "render", "get_state", "close"])

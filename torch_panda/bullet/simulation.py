@@ -108,6 +108,7 @@ class VectorSimulation:
                 if self._blueprint is None:
                     self.scene, self._blueprint = scene, client.blueprint
                 self.check_same(client, scene)
+                client.finish_building()
                 self._broad_phases.append(BroadPhase(client))
             self._allocate()
         except BaseException:
@@ -210,6 +211,7 @@ class VectorSimulation:
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
         self.check_same(client, self._build(client))
+        client.finish_building()
         self._broad_phases[env] = BroadPhase(client)
 
     def close(self) -> None:

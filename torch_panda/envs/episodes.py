@@ -278,7 +278,7 @@ class Episodes(Closing):
     def _act(self, action: Tensor, envs: Sequence[int] | None) -> None:
         """Advance physics by a step."""
         robot, body = self.robot, self.simulation.scene.robot
-        setpoint = robot.setpoint(action, self.simulation).numpy()
+        setpoint = robot.setpoint(action, self.simulation).double().numpy()
 
         def control(client: PhysicsClient, env: int) -> None:
             robot.control(client, body, setpoint[env])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.bullet.scene_client import check_quaternion
+from torch_panda.bullet.checks import check_quaternion
 
 # What an action displaces: the end-effector along x, y, z, or the arm's joints.
 ControlType = Literal["ee", "joints"]
