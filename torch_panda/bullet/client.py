@@ -161,10 +161,14 @@ class PhysicsClient(SceneClient):
             return
         handle = self._open()
         command = capi.detect_init(handle)
-        expected = capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED
-        for _ in range(count):
-            self.native.num_detections += 1
-            self._check(capi.submit(handle, command), expected, "detect collisions")
+        self.native.num_detections += count
+        for _ in range(count):  # as in `step`; the last answer is checked
+            status = capi.submit(handle, command)
+        self._check(
+            status,
+            capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED,
+            "detect collisions",
+        )
 
     # ---- asking it ---------------------------------------------------------------
 

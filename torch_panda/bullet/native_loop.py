@@ -129,12 +129,6 @@ class NativeLoop:
             raise MemoryError
 
     def _describe(self, control: PositionControl) -> None:
-        n_joints = self._scene.num_joints
-        if len(control.forces) != n_joints:
-            raise ValueError(
-                f"a PositionControl needs a force for each of the {n_joints} joints, "
-                f"got {len(control.forces)}"
-            )
         self._control = native.Control(
             -1 if control.ik_link is None else control.ik_link,
             control.num_arm_joints,
@@ -142,7 +136,7 @@ class NativeLoop:
             control.ik_orientation,
             self._physics.position_gain,
             VELOCITY_GAIN,
-            (c_double * n_joints)(*control.forces),
+            (c_double * len(control.forces))(*control.forces),
         )
         self._described = control
 

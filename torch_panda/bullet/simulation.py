@@ -141,7 +141,7 @@ class VectorSimulation:
 
         Raises:
             WorkerError: Bullet failed in one client; it names the client.
-            ValueError: ``setpoint`` has another shape than ``control`` needs.
+            ValueError: ``control`` needs another ``setpoint``, or another robot.
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, PositionControl):
@@ -149,6 +149,12 @@ class VectorSimulation:
             if setpoint.shape != shape:
                 raise ValueError(
                     f"the setpoint must have shape {shape}, got {setpoint.shape}"
+                )
+            n_joints = len(self.scene.joints)
+            if len(control.forces) != n_joints:
+                raise ValueError(
+                    f"a PositionControl needs a force for each of {n_joints} joints, "
+                    f"got {len(control.forces)}"
                 )
             if self._native is not None:
                 self._native.step(control, setpoint, envs)
