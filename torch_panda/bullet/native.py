@@ -16,9 +16,9 @@ LoopName = Literal["native", "ctypes"]
 # Chooses the loop of what is created from now on: for tests and comparisons.
 LOOP_VARIABLE = "TORCH_PANDA_LOOP"
 
-# Answers that are no status codes.
-NO_ANSWER = -1
-CLIENT_CLOSED = -2
+# In a `Failure`, beside status codes.
+NO_ANSWER = -1  # as answer
+CLIENT_CLOSED = -2  # as expected
 
 # In the order of ``struct functions``.
 _BULLET = (

@@ -143,7 +143,7 @@ class NativeLoop:
     def _error(self, env: int) -> BulletError | None:
         """Why a client has failed in this step, if it has."""
         expected, answer = self._failures[env].expected, self._failures[env].answer
-        if answer == native.CLIENT_CLOSED:
+        if expected == native.CLIENT_CLOSED:
             return client_closed()
         if not expected:
             return None

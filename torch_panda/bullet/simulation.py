@@ -1,5 +1,6 @@
 """Many copies of one scene, stepped in parallel."""
 
+import math
 import os
 from collections.abc import Callable, Sequence
 
@@ -189,10 +190,10 @@ class VectorSimulation:
 
     def diverged(self) -> list[int]:
         """The clients whose state is not finite."""
-        finite = self._state.isfinite()
-        if finite.all():
+        # A single operation where all is well: a sum is finite only if each number is.
+        if math.isfinite(self._state.sum().item()):
             return []
-        return (~finite).any(dim=1).nonzero().flatten().tolist()
+        return (~self._state.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""
@@ -214,6 +215,12 @@ class VectorSimulation:
     def _allocate(self) -> None:
         n, scene = self.num_envs, self.scene
         n_joints, n_objects = len(scene.joints), len(scene.objects)
+        found = len(self._clients[0].state(scene.robot).joint_positions)
+        if found != n_joints:
+            raise BulletError(
+                f"a scene must name the robot's {found} joints of one degree of "
+                f"freedom, got {n_joints}"
+            )
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
