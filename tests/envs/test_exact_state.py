@@ -83,12 +83,16 @@ def test_a_partial_reset_restores_only_its_own():
     with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
         torch.manual_seed(0)
         td = env.rollout(5)[:, -1]["next"].exclude("reward")
+        mask = torch.tensor([True, False])
+        env.step(td.clone().set("action", torch.ones(2, 3)).set("_step", mask))
+        mask[:] = True  # which changes nothing of what has been
         state = env.get_state(exact=True)
+        assert state["num_actions"].flatten().tolist() == [6, 5]
         action = torch.ones(2, 3)
         expected = env.step(td.clone().set("action", action))["next"]
         state["_reset"] = torch.tensor([[False], [True]])
         env.reset(state, set_state=True)
-        assert env.get_state()["step_count"].flatten().tolist() == [6, 5]
+        assert env.get_state()["step_count"].flatten().tolist() == [7, 5]
         env.step(td.clone().set("action", action).set("_step", state["_reset"][:, 0]))
         pose = env.get_state()["object_pose"][1, 0, :3].float()
         assert torch.equal(pose, expected["achieved_goal"][1])

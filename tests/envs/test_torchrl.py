@@ -4,13 +4,12 @@ import functools
 
 import pytest
 import torch
-from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import Collector, MultiAsyncCollector
 from torchrl.envs import (
     CatTensors,
     Compose,
     InitTracker,
     ObservationNorm,
-    ParallelEnv,
     RewardSum,
     SerialEnv,
     StepCounter,
@@ -58,10 +57,9 @@ def test_transformed_environments_do_not_lose_a_state_silently():
         assert (start.select(*state.keys()) == state).exclude("desired_goal").all()
 
 
-@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
-def test_batched_environments(kind):
-    arguments = {"mp_start_method": "spawn"} if kind is ParallelEnv else {}
-    env = kind(2, make_env, **arguments)
+def test_batched_environments():
+    """In one process; `test_multi_process` compares it with a ParallelEnv."""
+    env = SerialEnv(2, make_env)
     env.set_seed(0)
     rollout = env.rollout(5)
     env.close()
@@ -82,9 +80,9 @@ def test_collector():
     assert (ids[:, 50] != ids[:, 49]).all()
 
 
-@pytest.mark.parametrize("kind", [MultiSyncCollector, MultiAsyncCollector])
-def test_multi_process_collectors(kind):
-    collector = kind(
+def test_multi_process_collector():
+    """The asynchronous one; `test_multi_process` has the other."""
+    collector = MultiAsyncCollector(
         [make_env, make_env],
         RandomPolicy(make_env().action_spec),
         frames_per_batch=80,

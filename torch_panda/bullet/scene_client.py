@@ -1,6 +1,5 @@
 """Building a world of bodies in a client, and asking what it is made of."""
 
-import math
 import threading
 from collections.abc import Sequence
 from ctypes import byref
@@ -8,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_panda.bullet import capi
+from torch_panda.bullet.checks import check_not_negative, check_quaternion
 from torch_panda.bullet.connection import Connection, doubles
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
 from torch_panda.bullet.urdf import check_collision_filters, find_urdf
@@ -44,6 +44,7 @@ class SceneClient(Connection):
     def __init__(self) -> None:
         self._bodies: list[int] = []
         self._blueprint: list[tuple[object, ...]] = []
+        self._is_built = False
         super().__init__()
 
     @property
@@ -55,6 +56,10 @@ class SceneClient(Connection):
     def blueprint(self) -> Blueprint:
         """What was built and how; equal in clients that hold the same scene."""
         return tuple(self._blueprint)
+
+    def finish_building(self) -> None:
+        """What is changed from now on is no part of the blueprint."""
+        self._is_built = True
 
     def load_urdf(
         self,
@@ -82,7 +87,7 @@ class SceneClient(Connection):
         check_collision_filters(file)
         check_quaternion("orientation", orientation)
         pose = tuple(map(float, (*position, *orientation)))
-        self._blueprint.append(("load_urdf", file, pose, fixed_base))
+        self._note("load_urdf", file, pose, fixed_base)
         file = self._drawn_urdf(file)
         command = capi.urdf_init(self._open(), file.encode())
         capi.urdf_set_position(command, *position)
@@ -166,8 +171,8 @@ class SceneClient(Connection):
         Raises:
             ValueError: one is negative or not finite.
         """
-        _check_not_negative(lateral_friction=lateral, spinning_friction=spinning)
-        self._blueprint.append(("set_friction", body, link, lateral, spinning))
+        check_not_negative(lateral_friction=lateral, spinning_friction=spinning)
+        self._note("set_friction", body, link, lateral, spinning)
         command = capi.dynamics_init(self._open())
         if lateral is not None:
             capi.dynamics_set_lateral_friction(command, body, link, lateral)
@@ -234,10 +239,10 @@ class SceneClient(Connection):
         *,
         is_marker: bool = False,
     ) -> int:
-        _check_not_negative(mass=mass)
+        check_not_negative(mass=mass)
         kind = "create_marker" if is_marker else "create_body"
         place = tuple(map(float, position))
-        self._blueprint.append((kind, shape, mass, place, visual))
+        self._note(kind, shape, mass, place, visual)
         collision = visual_shape = -1
         if shape is not None:
             visual_shape = self._create_visual_shape(shape, visual, is_marker=is_marker)
@@ -259,6 +264,10 @@ class SceneClient(Connection):
             command, capi.CMD_CREATE_MULTI_BODY_COMPLETED, "create a body"
         )
         return self._add_body(status)
+
+    def _note(self, *command: object) -> None:
+        if not self._is_built:
+            self._blueprint.append(command)
 
     def _drawn_urdf(self, file: str) -> str:
         """A URDF that stands for another one; here, where none is drawn, itself."""
@@ -288,20 +297,3 @@ class SceneClient(Connection):
     ) -> int:
         """A shape to be seen; -1, as here, is none."""
         return -1
-
-
-def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
-    """Make sure that a quaternion xyzw stands for a rotation.
-
-    Raises:
-        ValueError: it has no length, or is not finite.
-    """
-    length = math.hypot(*quaternion)
-    if not (len(quaternion) == 4 and 0 < length < math.inf):
-        raise ValueError(f"{name} must be a quaternion xyzw, got {tuple(quaternion)}")
-
-
-def _check_not_negative(**values: float | None) -> None:
-    for name, value in values.items():
-        if value is not None and not 0 <= value < math.inf:
-            raise ValueError(f"{name} must be finite and at least 0, got {value}")

@@ -74,6 +74,7 @@ class VectorSimulation:
                 if self._blueprint is None:
                     self.scene, self._blueprint = scene, client.blueprint
                 self.check_same(client, scene)
+                client.finish_building()
                 self._broad_phases.append(BroadPhase(client))
             self._allocate()
             if loop_name() == "native":
@@ -200,6 +201,7 @@ class VectorSimulation:
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
         self.check_same(client, self._build(client))
+        client.finish_building()
         self._broad_phases[env] = BroadPhase(client)
         if self._native is not None:
             self._native.replace(env, client)

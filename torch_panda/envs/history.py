@@ -58,7 +58,7 @@ class History:
         if len(self._steps) == _MOST:
             self._steps = []
             self._begun = [_LOST] * len(self._begun)
-        self._steps.append((action, stepped))
+        self._steps.append((action, None if stepped is None else stepped.clone()))
 
     def export(self) -> dict[str, Tensor]:
         """Starts, ``actions`` (n, most, action_dim) and ``num_actions`` (n, 1).

@@ -15,7 +15,7 @@ from torch_panda.bullet import (
     PositionControl,
     VectorSimulation,
 )
-from torch_panda.bullet.scene_client import check_quaternion
+from torch_panda.bullet.checks import check_quaternion
 
 # What an action displaces: the end-effector along x, y, z, or the arm's joints.
 ControlType = Literal["ee", "joints"]
