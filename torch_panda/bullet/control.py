@@ -42,6 +42,23 @@ class PositionControl:
             return len(self.forces)
         return 3 + len(self.forces) - self.num_arm_joints
 
+    def check(self, setpoint: Doubles, num_envs: int, num_joints: int) -> None:
+        """Make sure that this control drives these robots to these setpoints.
+
+        Raises:
+            ValueError: it has the forces of another robot, or other setpoints.
+        """
+        if len(self.forces) != num_joints:
+            raise ValueError(
+                f"a PositionControl needs a force for each of {num_joints} joints, "
+                f"got {len(self.forces)}"
+            )
+        if setpoint.shape != (num_envs, self.setpoint_dim):
+            raise ValueError(
+                f"the setpoint must have shape {(num_envs, self.setpoint_dim)}, "
+                f"got {setpoint.shape}"
+            )
+
     def __call__(self, client: PhysicsClient, body: int, setpoint: Doubles) -> None:
         """Set the motors of one client's robot."""
         if self.ik_link is None:

@@ -45,6 +45,7 @@ class VectorSimulation:
 
     Raises:
         BulletError: ``build`` does not build the same in every client.
+        ValueError: the environment variable asks for a loop that there is not.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class VectorSimulation:
     ) -> None:
         if num_threads is None:
             num_threads = os.cpu_count() or 1
+        is_native = loop_name() == "native"
         self.n_substeps = physics.n_substeps
         self.ctrl_dt = physics.ctrl_dt
         self._physics = physics
@@ -77,7 +79,7 @@ class VectorSimulation:
                 client.finish_building()
                 self._broad_phases.append(BroadPhase(client))
             self._allocate()
-            if loop_name() == "native":
+            if is_native:
                 self._native = NativeLoop(
                     self._clients,
                     self.scene,
@@ -147,18 +149,9 @@ class VectorSimulation:
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, PositionControl):
-            shape = (self.num_envs, control.setpoint_dim)
-            if setpoint.shape != shape:
-                raise ValueError(
-                    f"the setpoint must have shape {shape}, got {setpoint.shape}"
-                )
-            n_joints = len(self.scene.joints)
-            if len(control.forces) != n_joints:
-                raise ValueError(
-                    f"a PositionControl needs a force for each of {n_joints} joints, "
-                    f"got {len(control.forces)}"
-                )
+            control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
+                self._pool.wait()  # after a second Ctrl-C, its threads may be at work
                 self._native.step(control, setpoint, envs)
                 return
 

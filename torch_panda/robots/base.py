@@ -157,7 +157,7 @@ class Robot:
 
     @property
     def position_control(self) -> PositionControl:
-        """What `control` does, as data."""
+        """What `control` does, as data; read once, when an environment is made."""
         if self.control_type == "joints":
             return PositionControl(self.joint_forces)
         return PositionControl(
