@@ -1,6 +1,5 @@
 """Many copies of one scene, stepped in parallel."""
 
-import math
 import os
 from collections.abc import Callable, Sequence
 
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.broad_phase import BroadPhase
+from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, PositionControl
@@ -184,8 +184,7 @@ class VectorSimulation:
 
     def diverged(self) -> list[int]:
         """The clients whose state is not finite."""
-        # A single operation where all is well: a sum is finite only if each number is.
-        if math.isfinite(self._state.sum().item()):
+        if all_finite(self._state):
             return []
         return (~self._state.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
