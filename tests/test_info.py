@@ -4,6 +4,11 @@ import re
 
 import torch_panda
 from torch_panda.__main__ import main
+from torch_panda.info import stepping
+
+
+def test_names_the_loop(loop):
+    assert stepping().startswith(f"{loop}: ")
 
 
 def test_names_versions_ids_and_spaces(capsys):

@@ -7,6 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
 import torch_panda
+from torch_panda.bullet.native import loop_name
 
 _PACKAGES = (
     "torch_panda",
@@ -68,12 +69,20 @@ def renderers() -> list[str]:
     return ["TinyRenderer (CPU): in pybullet", f"OpenGL (EGL plugin): {egl}"]
 
 
+def stepping() -> str:
+    """Which loop steps the environments."""
+    if loop_name() == "native":
+        return "native: in threads of C"
+    return "ctypes: in threads of Python, slower; a C compiler at installation helps"
+
+
 def describe() -> str:
     """All of it, as text."""
     threads = f"{num_cores()} of {os.cpu_count()} cores usable; default: one a core"
     sections = {
         "versions": [f"{name} {number}" for name, number in versions().items()],
         "threads": [f"{threads}, at most one an environment"],
+        "stepping": [stepping()],
         "renderers": renderers(),
         "environments": environments(),
     }

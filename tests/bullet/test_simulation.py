@@ -8,6 +8,8 @@ import torch
 import torch_panda
 from torch_panda.bullet import PhysicsClient, Scene, VectorSimulation
 
+pytestmark = pytest.mark.usefixtures("loop")
+
 
 def trajectory(num_envs, num_threads, steps):
     generator = torch.Generator().manual_seed(0)

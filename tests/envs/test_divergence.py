@@ -6,6 +6,8 @@ from tensordict import TensorDict
 
 import torch_panda
 
+pytestmark = pytest.mark.usefixtures("loop")
+
 
 def make(on_divergence):
     return torch_panda.make(

@@ -12,6 +12,7 @@ import torch
 import torch_panda
 from tests.envs.test_parity import choose_action
 
+pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
 # Of other episodes. Times 20 substeps they differ modulo any power of two above 4.
 HISTORY = (41, 50, 57)

@@ -20,6 +20,7 @@ from tests.panda_gym_reference import make_reference, start
 
 # Those of ours that panda-gym, which the reference imports, has registered.
 V3_IDS = [env_id for env_id in PHYSICS_IDS if env_id in gymnasium.registry]
+pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
 KEYS = ("observation", "achieved_goal", "desired_goal")
 

@@ -2,7 +2,6 @@
 
 import gc
 import pickle
-import signal
 import subprocess
 import sys
 import threading
@@ -396,42 +395,6 @@ def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):
     for client in clients:
         with pytest.raises(torch_panda.BulletError, match="closed"):
             client.step(1)
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_error_in_a_worker_names_the_environment(env, monkeypatch, index):
-    td = env.reset()
-    broken = env.episodes.simulation.clients[index]
-    original = PhysicsClient.step
-
-    def step(self, count=1):
-        if self is broken:
-            raise torch_panda.BulletError("no answer")
-        original(self, count)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(PhysicsClient, "step", step)
-        with pytest.raises(RuntimeError, match=f"environment {index}: BulletError"):
-            env.step(td.set("action", torch.zeros(3, 3)))
-    assert env.rollout(5).shape == (3, 5)
-
-
-def test_interrupt_in_a_step(env, monkeypatch):
-    td = env.reset()
-    original = PhysicsClient.step
-    main = threading.main_thread().ident
-
-    def step(self, count=1):
-        if self is env.episodes.simulation.clients[0]:
-            signal.pthread_kill(main, signal.SIGINT)
-        original(self, count)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(PhysicsClient, "step", step)
-        with pytest.raises(KeyboardInterrupt):
-            env.step(td.set("action", torch.zeros(3, 3)))
-    assert env.get_state()["step_count"].flatten().tolist() == [1, 1, 1]
-    assert env.rollout(5).shape == (3, 5)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -2,6 +2,7 @@
 
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
+from torch_panda.bullet.control import Control, PositionControl
 from torch_panda.bullet.guard import ThreadGuard
 from torch_panda.bullet.physics import (
     EXACT,
@@ -11,18 +12,21 @@ from torch_panda.bullet.physics import (
     read_physics,
 )
 from torch_panda.bullet.pool import WorkerError, WorkerPool
+from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.shapes import Box, Cylinder, Sphere, Visual
-from torch_panda.bullet.simulation import Scene, VectorSimulation
+from torch_panda.bullet.simulation import VectorSimulation
 
 __all__ = [
     "EXACT",
     "FAST",
     "Box",
     "BulletError",
+    "Control",
     "Cylinder",
     "PhysicsClient",
     "PhysicsName",
     "PhysicsParams",
+    "PositionControl",
     "Scene",
     "Sphere",
     "ThreadGuard",

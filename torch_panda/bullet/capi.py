@@ -13,7 +13,6 @@ from ctypes import (
     c_double,
     c_float,
     c_int,
-    c_size_t,
     c_ubyte,
     c_void_p,
 )
@@ -57,9 +56,6 @@ JOINT_FEEDBACK_IN_JOINT_FRAME = 2
 
 # enum EnumRendererAuxFlags
 ER_NO_SEGMENTATION_MASK = 4
-
-# The ...MultiDof setters ignore a call for more degrees of freedom than this.
-MAX_MULTI_DOF = 4
 
 
 class JointInfo(ctypes.Structure):
@@ -165,21 +161,6 @@ submit_quick = bind(  # for what takes Bullet a microsecond
     _cheap, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command
 )
 status_type = bind(_cheap, "b3GetStatusType", c_int, _status)
-# lfind(key, base, &count, width, compare) of <search.h>, on POSIX systems, calls
-# compare(key, base + k * width) until it answers 0. With compare = submit, key =
-# client, base = command and width = 0 that submits a command ``count`` times in one
-# foreign call, so that the GIL is handed over once a step instead of once a substep:
-# 4 to 10 % more steps/s with two threads. It gives NULL if every one was answered.
-repeat = bind(
-    ctypes.CDLL(None),
-    "lfind",
-    c_void_p,
-    _client,
-    _command,
-    POINTER(c_size_t),
-    c_size_t,
-    c_void_p,
-)
 
 # World
 physics_init = bind(_cheap, "b3InitPhysicsParamCommand", _command, _client)
@@ -342,29 +323,13 @@ load_set_snapshot = bind(_cheap, "b3LoadStateSetStateId", c_int, _command, c_int
 
 # Motors
 motor_init = bind(_cheap, "b3JointControlCommandInit2", _command, _client, c_int, c_int)
-motor_set_positions = bind(
-    _cheap,
-    "b3JointControlSetDesiredPositionMultiDof",
-    c_int,
-    _command,
-    c_int,
-    _doubles,
-    c_int,
+motor_set_position = bind(
+    _cheap, "b3JointControlSetDesiredPosition", c_int, _command, c_int, c_double
 )
-motor_set_kp = bind(
-    _cheap, "b3JointControlSetKpMultiDof", c_int, _command, c_int, _doubles, c_int
-)
-motor_set_kd = bind(
-    _cheap, "b3JointControlSetKdMultiDof", c_int, _command, c_int, _doubles, c_int
-)
-motor_set_forces = bind(
-    _cheap,
-    "b3JointControlSetDesiredForceTorqueMultiDof",
-    c_int,
-    _command,
-    c_int,
-    _doubles,
-    c_int,
+motor_set_kp = bind(_cheap, "b3JointControlSetKp", c_int, _command, c_int, c_double)
+motor_set_kd = bind(_cheap, "b3JointControlSetKd", c_int, _command, c_int, c_double)
+motor_set_force = bind(
+    _cheap, "b3JointControlSetMaximumForce", c_int, _command, c_int, c_double
 )
 
 # Inverse kinematics

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Sequence
 
+from torch import Tensor
+
 
 def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
     """Make sure that a quaternion xyzw stands for a rotation.
@@ -24,3 +26,8 @@ def check_not_negative(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not 0 <= value < math.inf:
             raise ValueError(f"{name} must be finite and at least 0, got {value}")
+
+
+def all_finite(values: Tensor) -> bool:
+    """Whether all numbers are finite; one operation where their sum is, too."""
+    return math.isfinite(values.sum().item()) or bool(values.isfinite().all())

@@ -1,20 +1,17 @@
 """One DIRECT physics client of Bullet."""
 
 from collections.abc import Sequence
-from ctypes import byref, c_int, c_size_t
+from ctypes import byref, c_int
 
-from torch_panda.bullet import capi, library
+from torch_panda.bullet import capi, library, native
 from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState, Doubles
 from torch_panda.bullet.connection import BulletError, doubles, shared
 from torch_panda.bullet.contacts import ContactPoint, read_contact
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.scene_client import NO_ROTATION, ORIGIN, SceneClient
 
-_MAX_DOF = capi.MAX_MULTI_DOF
 # pybullet's default for setJointMotorControlArray(POSITION_CONTROL).
-_KD = doubles([1.0] * _MAX_DOF)
-
-_DOUBLE = 8  # bytes
+VELOCITY_GAIN = 1.0
 
 
 class PhysicsClient(SceneClient):
@@ -25,11 +22,14 @@ class PhysicsClient(SceneClient):
 
     Raises:
         ImportError: the installed pybullet has another C API.
+
+    Attributes:
+        native: what the native loop knows of it.
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
         super().__init__()
-        self._num_detections = 0
+        self.native = native.Client(self._handle, 0)
         # The last status code in use: it moves when another version adds one before.
         try:
             self.detect_collisions()
@@ -42,12 +42,17 @@ class PhysicsClient(SceneClient):
         capi.physics_set_solver_iterations(command, physics.solver_iterations)
         capi.physics_set_residual_threshold(command, physics.residual_threshold)
         self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
-        self._kp = doubles([physics.position_gain] * _MAX_DOF)
+        self._position_gain = physics.position_gain
 
     @property
     def num_detections(self) -> int:
         """How often collisions have been detected; every time step does."""
-        return self._num_detections
+        return self.native.num_detections
+
+    def close(self) -> None:
+        """Free the world. Closing again does nothing."""
+        self.native.handle = None
+        super().close()
 
     # ---- moving the world --------------------------------------------------------
 
@@ -127,18 +132,14 @@ class PhysicsClient(SceneClient):
             setpoint: as many positions as there are forces [rad] or [m].
             forces: the most each motor may exert [N m] or [N].
         """
-        size = len(forces)
-        positions, limits = shared(setpoint), doubles(forces)
         command = capi.motor_init(
             self._open(), body, capi.CONTROL_MODE_POSITION_VELOCITY_PD
         )
-        for first in range(0, size, _MAX_DOF):
-            count, offset = min(_MAX_DOF, size - first), _DOUBLE * first
-            q, u = first + Q_OFFSET, first + U_OFFSET
-            capi.motor_set_positions(command, q, byref(positions, offset), count)
-            capi.motor_set_kp(command, u, self._kp, count)
-            capi.motor_set_kd(command, u, _KD, count)
-            capi.motor_set_forces(command, u, byref(limits, offset), count)
+        for k, (position, force) in enumerate(zip(setpoint, forces, strict=True)):
+            capi.motor_set_position(command, Q_OFFSET + k, position)
+            capi.motor_set_kp(command, U_OFFSET + k, self._position_gain)
+            capi.motor_set_kd(command, U_OFFSET + k, VELOCITY_GAIN)
+            capi.motor_set_force(command, U_OFFSET + k, force)
         # Bullet only takes notes: done before another thread could use the GIL.
         status = capi.submit_quick(self._open(), command)
         self._check(status, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints")
@@ -146,13 +147,13 @@ class PhysicsClient(SceneClient):
     def step(self, count: int = 1) -> None:
         """Advance the world by ``count`` time steps."""
         handle = self._open()
-        command = capi.step_init(handle)
         # A client has one command buffer, and stepping leaves it as it was: submitting
         # it again steps again.
-        self._num_detections += count
-        failed = capi.repeat(handle, command, byref(c_size_t(count)), 0, capi.submit)
-        if failed:
-            raise BulletError("Bullet could not step: it gave no answer")
+        command = capi.step_init(handle)
+        expected = capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED
+        for _ in range(count):
+            self.native.num_detections += 1
+            self._check(capi.submit(handle, command), expected, "step")
 
     def detect_collisions(self, count: int = 1) -> None:
         """Run collision detection ``count`` times without advancing time."""
@@ -160,11 +161,11 @@ class PhysicsClient(SceneClient):
             return
         handle = self._open()
         command = capi.detect_init(handle)
-        self._num_detections += count
-        # As in `step`; the last one's answer is checked.
-        capi.repeat(handle, command, byref(c_size_t(count - 1)), 0, capi.submit)
-        self._submit(
-            command,
+        self.native.num_detections += count
+        for _ in range(count):  # as in `step`; the last answer is checked
+            status = capi.submit(handle, command)
+        self._check(
+            status,
             capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED,
             "detect collisions",
         )

@@ -50,7 +50,7 @@ class Connection(Closing):
 
     def _open(self) -> int:
         if self._handle is None:
-            raise BulletError("the physics client is closed")
+            raise client_closed()
         return self._handle
 
     def _submit(self, command: int, expected: int, action: str) -> int:
@@ -62,10 +62,18 @@ class Connection(Closing):
         """Raise unless Bullet answered with the expected status code."""
         code = capi.status_type(status) if status else None
         if code != expected:
-            raise BulletError(
-                f"Bullet could not {action}: it answered with status {code}, "
-                f"expected {expected}"
-            )
+            raise refusal(action, code, expected)
+
+
+def refusal(action: str, code: int | None, expected: int) -> BulletError:
+    """The error where Bullet did not answer with the expected status code."""
+    answer = "gave no answer" if code is None else f"answered with status {code}"
+    return BulletError(f"Bullet could not {action}: it {answer}, expected {expected}")
+
+
+def client_closed() -> BulletError:
+    """The error where a client is closed."""
+    return BulletError("the physics client is closed")
 
 
 def doubles(values: Sequence[float]) -> Array[c_double]:

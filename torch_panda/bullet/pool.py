@@ -96,7 +96,7 @@ class WorkerPool:
         Raises:
             WorkerError: ``work`` raised; all other indices are done nevertheless.
         """
-        self._wait()
+        self.wait()
         self._start()
         job = _Job(work, indices, self.num_threads)
         self._last_job = job
@@ -105,14 +105,14 @@ class WorkerPool:
         try:
             job.wait()
         finally:
-            self._wait()
+            self.wait()
         if job.errors:
             index, error = min(job.errors, key=lambda failed: failed[0])
             raise WorkerError(index, error) from error
 
     def close(self) -> None:
         """End the threads. Closing again does nothing."""
-        self._wait()
+        self.wait()
         workers, self._workers = self._workers, []
         if self._process != os.getpid():
             return  # a forked child: these threads live in its parent
@@ -121,7 +121,7 @@ class WorkerPool:
         for worker in workers:
             worker.join()
 
-    def _wait(self) -> None:
+    def wait(self) -> None:
         """Wait until no thread touches a client, also after a second Ctrl-C."""
         if self._last_job is not None and self._process == os.getpid():
             self._last_job.wait()

@@ -1,59 +1,24 @@
 """Many copies of one scene, stepped in parallel."""
 
 import os
-import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.broad_phase import BroadPhase
+from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
+from torch_panda.bullet.control import Control, PositionControl
+from torch_panda.bullet.native import loop_name
+from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool
+from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.scene_client import Blueprint, SceneClient
-
-# Sets the motors of an environment's robot, in the thread that steps its client.
-Control = Callable[[PhysicsClient, int], None]
-
-# Of a client's substeps. Of 0.3 and 0.5 the better, by the durations of Push.
-_LAST_PIECE = 0.3
-
-
-class _Pieces:
-    """Work on one index in several pieces, each done by whichever thread comes next."""
-
-    def __init__(self, *pieces: Work) -> None:
-        self._pieces = list(pieces)
-        self._lock = threading.Lock()
-
-    def __call__(self, index: int) -> None:
-        with self._lock:
-            self._pieces[0](index)
-            del self._pieces[0]  # only if it did not fail
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What a simulation moves and reads; the same ids in every client.
-
-    Attributes:
-        robot: body id of the robot.
-        joints: indices of its movable joints.
-        ee_link: its link whose centre of mass is the end-effector.
-        objects: body ids of the movable objects.
-        markers: body ids of the markers that show where the objects should go.
-    """
-
-    robot: int
-    joints: tuple[int, ...]
-    ee_link: int
-    objects: tuple[int, ...] = ()
-    markers: tuple[int, ...] = ()
 
 
 class VectorSimulation:
@@ -80,6 +45,7 @@ class VectorSimulation:
 
     Raises:
         BulletError: ``build`` does not build the same in every client.
+        ValueError: the environment variable asks for a loop that there is not.
     """
 
     def __init__(
@@ -92,6 +58,7 @@ class VectorSimulation:
     ) -> None:
         if num_threads is None:
             num_threads = os.cpu_count() or 1
+        is_native = loop_name() == "native"
         self.n_substeps = physics.n_substeps
         self.ctrl_dt = physics.ctrl_dt
         self._physics = physics
@@ -100,6 +67,7 @@ class VectorSimulation:
         self._clients: list[PhysicsClient] = []
         self._broad_phases: list[BroadPhase] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
+        self._native: NativeLoop | None = None
         try:
             for _ in range(num_envs):
                 client = PhysicsClient(physics=physics)
@@ -111,6 +79,14 @@ class VectorSimulation:
                 client.finish_building()
                 self._broad_phases.append(BroadPhase(client))
             self._allocate()
+            if is_native:
+                self._native = NativeLoop(
+                    self._clients,
+                    self.scene,
+                    self._state,
+                    physics=physics,
+                    num_threads=self.num_threads,
+                )
         except BaseException:
             self.close()
             raise
@@ -154,31 +130,38 @@ class VectorSimulation:
                 f"{len(self._blueprint)}"
             )
 
-    def step(self, control: Control, envs: Sequence[int] | None = None) -> None:
+    def step(
+        self, control: Control, setpoint: Doubles, envs: Sequence[int] | None = None
+    ) -> None:
         """Control the robots, advance time and read the state.
 
+        In C where that was compiled and ``control`` is data, else in Python threads:
+        the numbers are the same.
+
         Args:
-            control: sets the motors, given a client and its index.
+            control: sets the motors.
+            setpoint: (num_envs, k) float64, a row for each client's robot.
             envs: which clients; None means all.
 
         Raises:
             WorkerError: Bullet failed in one client; it names the client.
+            ValueError: ``control`` needs another ``setpoint``, or another robot.
         """
-        envs = range(self.num_envs) if envs is None else envs
-        step_one = partial(self._step_one, control)
-        if not 1 < self.num_threads < len(envs):
-            self._pool.run(step_one, envs)
-            return
-        # At the end of a step, threads that find no work left wait for the others: the
-        # last piece of work is but a part of a client's step, so that they wait less.
-        last = round(_LAST_PIECE * self.n_substeps)
-        pieces = _Pieces(
-            partial(self._begin_step, control, self.n_substeps - last),
-            partial(self._end_step, last),
-        )
-        self._pool.run(
-            lambda env: (pieces if env == envs[0] else step_one)(env), (*envs, envs[0])
-        )
+        setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
+        if isinstance(control, PositionControl):
+            control.check(setpoint, self.num_envs, len(self.scene.joints))
+            if self._native is not None:
+                self._pool.wait()  # after a second Ctrl-C, its threads may be at work
+                self._native.step(control, setpoint, envs)
+                return
+
+        def step_one(env: int) -> None:
+            client = self._clients[env]
+            control(client, self.scene.robot, setpoint[env])
+            client.step(self.n_substeps)
+            self._read(env)
+
+        self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
 
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for these environments, in the threads that step them.
@@ -201,10 +184,9 @@ class VectorSimulation:
 
     def diverged(self) -> list[int]:
         """The clients whose state is not finite."""
-        finite = self._state.isfinite()
-        if finite.all():
+        if all_finite(self._state):
             return []
-        return (~finite).any(dim=1).nonzero().flatten().tolist()
+        return (~self._state.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""
@@ -213,16 +195,26 @@ class VectorSimulation:
         self.check_same(client, self._build(client))
         client.finish_building()
         self._broad_phases[env] = BroadPhase(client)
+        if self._native is not None:
+            self._native.replace(env, client)
 
     def close(self) -> None:
         """Free all clients and end the threads. Closing again does nothing."""
         self._pool.close()
+        if self._native is not None:
+            self._native.close()
         for client in self._clients:
             client.close()
 
     def _allocate(self) -> None:
         n, scene = self.num_envs, self.scene
         n_joints, n_objects = len(scene.joints), len(scene.objects)
+        found = len(self._clients[0].state(scene.robot).joint_positions)
+        if found != n_joints:
+            raise BulletError(
+                f"a scene must name the robot's {found} joints of one degree of "
+                f"freedom, got {n_joints}"
+            )
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
@@ -244,18 +236,6 @@ class VectorSimulation:
         # The same memory, part by part, for `_read`: rows of tensors take longer.
         ends = np.cumsum(sizes)[:-1]
         self._rows = [np.split(row, ends) for row in self._state.numpy()]
-
-    def _step_one(self, control: Control, env: int) -> None:
-        self._begin_step(control, self.n_substeps, env)
-        self._read(env)
-
-    def _begin_step(self, control: Control, substeps: int, env: int) -> None:
-        control(self._clients[env], env)
-        self._clients[env].step(substeps)
-
-    def _end_step(self, substeps: int, env: int) -> None:
-        self._clients[env].step(substeps)
-        self._read(env)
 
     def _reset_one(self, env: int) -> None:
         client, scene = self._clients[env], self.scene

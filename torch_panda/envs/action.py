@@ -2,6 +2,8 @@
 
 from torch import Tensor
 
+from torch_panda.bullet.checks import all_finite
+
 
 def read_action(action: object, shape: tuple[int, ...]) -> Tensor:
     """The clipped action on the CPU: (n, action_dim) float32.
@@ -23,7 +25,7 @@ def read_action(action: object, shape: tuple[int, ...]) -> Tensor:
     if not action.dtype.is_floating_point:
         raise TypeError(f"the action must be float32, got {action.dtype}")
     action = action.detach().to("cpu").reshape(-1, shape[-1])
-    if not action.isfinite().all():
+    if not all_finite(action):
         env = int((~action.isfinite()).any(dim=1).nonzero()[0])
         raise ValueError(
             f"the action of environment {env} is not finite: {action[env].tolist()}"

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from torch_panda.bullet import (
     BulletError,
-    PhysicsClient,
     PhysicsName,
     PhysicsParams,
     ThreadGuard,
@@ -79,6 +78,7 @@ class Episodes(Closing):
             )
         n = num_envs or 1
         self.robot, self.task = robot, task
+        self._control = robot.controller
         self.batch_shape = () if num_envs is None else (n,)
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
@@ -277,13 +277,8 @@ class Episodes(Closing):
 
     def _act(self, action: Tensor, envs: Sequence[int] | None) -> None:
         """Advance physics by a step."""
-        robot, body = self.robot, self.simulation.scene.robot
-        setpoint = robot.setpoint(action, self.simulation).double().numpy()
-
-        def control(client: PhysicsClient, env: int) -> None:
-            robot.control(client, body, setpoint[env])
-
-        self.simulation.step(control, envs)
+        setpoint = self.robot.setpoint(action, self.simulation).numpy()
+        self.simulation.step(self._control, setpoint, envs)
 
     def _replay(self, envs: list[int], given: GivenState) -> None:
         """Take the actions of an exact state, and make sure that they lead there."""

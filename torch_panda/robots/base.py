@@ -9,7 +9,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import (
+    Control,
+    PhysicsClient,
+    PositionControl,
+    VectorSimulation,
+)
 from torch_panda.bullet.checks import check_quaternion
 
 # What an action displaces: the end-effector along x, y, z, or the arm's joints.
@@ -140,20 +145,30 @@ class Robot:
     ) -> None:
         """Set the motors of one client's robot, in the thread that steps the client.
 
+        A robot that is driven otherwise than by `position_control` overrides this; its
+        steps then go through Python.
+
         Args:
             client: where the robot is ``body``.
             body: its id.
             setpoint: (k,), a row of what `setpoint` gives.
         """
+        self.position_control(client, body, setpoint)
+
+    @property
+    def position_control(self) -> PositionControl:
+        """What `control` does, as data; read once, when an environment is made."""
         if self.control_type == "joints":
-            client.control_joints(body, setpoint, self.joint_forces)
-            return
-        joints = np.empty(len(self.joint_forces))
-        client.inverse_kinematics(
-            body, self.ee_link, setpoint[:3], self.ee_orientation, joints
+            return PositionControl(self.joint_forces)
+        return PositionControl(
+            self.joint_forces, self.ee_link, self.ee_orientation, self.num_arm_joints
         )
-        joints[self.num_arm_joints :] = setpoint[3:]
-        client.control_joints(body, joints, self.joint_forces)
+
+    @property
+    def controller(self) -> Control:
+        """`control`, as data unless a subclass has its own."""
+        has_own = type(self).control is not Robot.control
+        return self.control if has_own else self.position_control
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """End-effector position [m] and velocity [m/s]: (num_envs, 6), float64."""

@@ -1,0 +1,292 @@
+"""The native loop and the ctypes loop: the same numbers, errors and manners.
+
+The other half is in the tests that use the fixture ``loop``: parity with panda-gym,
+histories, divergence.
+"""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from ctypes import c_int, c_void_p
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from torch_panda import Panda, PhysicsParams, Push, RobotTaskEnv, WorkerError
+from torch_panda.bullet import BulletError, PositionControl, capi, library, native
+
+IDS = (
+    "PandaReachJoints-v3",
+    "PandaPush-v1",
+    "PandaPickAndPlace-v3",
+    "PandaStackJoints-v1",
+)
+N = 3
+SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
+
+remove_body = library.bind(
+    library.WORK, "b3InitRemoveBodyCommand", c_void_p, c_void_p, c_int
+)
+needs_native = pytest.mark.skipif(
+    native.LIBRARY is None, reason="installed where there was no C compiler"
+)
+
+
+def make(env_id="PandaPush-v1", **options):
+    options = {"num_envs": N, "num_threads": 2, "seed": 0, **options}
+    return torch_panda.make(env_id, **options)
+
+
+def own_threads():
+    """Threads of this process, Python's or not."""
+    return len(os.listdir("/proc/self/task"))
+
+
+@pytest.fixture
+def env(loop):
+    with make() as env:
+        assert (env.episodes.simulation._native is None) == (loop == "ctypes")
+        yield env
+
+
+def detections(env):
+    return [client.num_detections for client in env.episodes.simulation.clients]
+
+
+def play(env, steps=12, masks=False):
+    """All that is observed in two episodes, towards the first object or down."""
+    generator, seen = torch.Generator().manual_seed(0), []
+    for _episode in range(2):
+        td = env.reset()
+        for _ in range(steps):
+            action = torch.rand(env.action_spec.shape, generator=generator) * 3 - 1.5
+            td["action"] = action
+            if masks:
+                td["_step"] = torch.rand(N, 1, generator=generator) < 0.6
+            td = env.step(td)["next"].exclude("_step")
+            seen.append(td)
+        seen.append(env.get_state())
+    return seen, detections(env)
+
+
+@needs_native
+@pytest.mark.parametrize(
+    ("env_id", "options", "masks"),
+    [
+        *((env_id, {}, False) for env_id in IDS),
+        ("PandaPickAndPlace-v1", {"sensors": SENSORS}, False),
+        ("PandaPush-v1", {"physics": "fast", "num_threads": 1}, False),
+        ("PandaStack-v1", {}, True),
+    ],
+)
+def test_both_give_the_same(monkeypatch, env_id, options, masks):
+    found = {}
+    for name in ("native", "ctypes"):
+        monkeypatch.setenv(native.LOOP_VARIABLE, name)
+        with make(env_id, **options) as env:
+            found[name] = play(env, masks=masks)
+    (ours, ours_detected), (theirs, theirs_detected) = found.values()
+    assert ours_detected == theirs_detected
+    for one, other in zip(ours, theirs, strict=True):
+        assert (one == other).all()
+
+
+@needs_native
+def test_more_threads_than_work():
+    def rollout(num_threads):
+        with make(num_envs=5, num_threads=num_threads) as env:
+            return env.rollout(10, lambda td: td.set("action", torch.ones(5, 3)))
+
+    one, five = rollout(1), rollout(5)
+    assert torch.equal(one["next", "observation"], five["next", "observation"])
+
+
+# ---- errors --------------------------------------------------------------------------
+
+
+def break_client(env, index):
+    """Take the robot out of a client, so that Bullet refuses its commands."""
+    simulation = env.episodes.simulation
+    client = simulation.clients[index]
+    capi.submit(client._handle, remove_body(client._handle, simulation.scene.robot))
+
+
+def step(env):
+    return env.step(TensorDict({"action": torch.ones(N, 3)}, [N]))["next"]
+
+
+@pytest.mark.parametrize("broken", [(0,), (1,), (2, 1)])
+def test_an_error_names_the_environment_and_the_others_go_on(env, broken):
+    with make() as other:
+        env.reset()
+        other.reset()
+        for index in broken:
+            break_client(env, index)
+        first = min(broken)
+        message = (
+            f"environment {first}: BulletError: Bullet could not solve the inverse "
+            rf"kinematics: it answered with status \d+, expected 43"
+        )
+        with pytest.raises(WorkerError, match=message) as caught:
+            step(env)
+        assert caught.value.index == first
+        assert isinstance(caught.value.__cause__, BulletError)
+        step(other)
+        alive = [k for k in range(N) if k not in broken]
+        ours, theirs = env.get_state(), other.get_state()
+        assert (ours[alive] == theirs[alive]).all()
+    for index in broken:
+        env.episodes.simulation.rebuild(index)
+    assert env.rollout(5).shape == (N, 5)
+
+
+def test_a_closed_client(env):
+    env.reset()
+    env.episodes.simulation.clients[1].close()
+    with pytest.raises(WorkerError, match=r"environment 1: BulletError: .* is closed"):
+        step(env)
+
+
+def test_a_closed_simulation(env):
+    env.reset()
+    simulation = env.episodes.simulation
+    env.close()
+    control, setpoint = env.robot.position_control, np.zeros((N, 5))
+    with pytest.raises(WorkerError, match=r"environment 0: BulletError: .* is closed"):
+        simulation.step(control, setpoint)
+    simulation.close()
+
+
+def test_a_setpoint_of_another_shape(env):
+    control = env.robot.position_control
+    with pytest.raises(ValueError, match=r"must have shape \(3, 5\), got \(3, 4\)"):
+        env.episodes.simulation.step(control, np.zeros((N, 4)))
+
+
+def test_forces_of_another_robot(env):
+    with pytest.raises(ValueError, match="a force for each of 9 joints, got 4"):
+        env.episodes.simulation.step(PositionControl((1.0,) * 4), np.zeros((N, 4)))
+
+
+# ---- interrupts, processes, threads --------------------------------------------------
+
+
+def test_a_step_is_finished_before_an_interrupt_is_raised(loop):
+    physics = PhysicsParams(n_substeps=400)
+    with make(physics=physics) as env:
+        env.reset()
+        before = detections(env)
+        main = threading.main_thread().ident
+
+        def interrupt():
+            while detections(env) == before:  # the step has not begun
+                time.sleep(1e-4)
+            signal.pthread_kill(main, signal.SIGINT)
+
+        thread = threading.Thread(target=interrupt)
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            step(env)
+        thread.join()
+        assert detections(env) == [count + 400 for count in before]
+        assert env.get_state()["step_count"].flatten().tolist() == [1] * N
+        with make(physics=physics) as other:
+            other.reset()
+            step(other)
+            assert (env.get_state() == other.get_state()).all()
+
+
+def test_a_forked_child_has_threads_of_its_own(env):
+    env.reset()
+    step(env)
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+
+    def child():
+        sender.send([step(env)["observation"].tolist() for _ in range(3)])
+        env.close()
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    try:
+        assert receiver.poll(60)
+        theirs = receiver.recv()
+        process.join(60)
+        assert process.exitcode == 0
+    finally:
+        process.kill()
+    assert [step(env)["observation"].tolist() for _ in range(3)] == theirs
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
+def test_no_thread_is_left(loop):
+    before = own_threads()
+    with make() as env:
+        env.rollout(3)
+        assert own_threads() > before
+    deadline = time.monotonic() + 10
+    while own_threads() > before:  # one that has been joined may still be listed
+        assert time.monotonic() < deadline
+
+
+@needs_native
+def test_denormal_numbers_are_not_flushed_to_zero(monkeypatch):
+    """What torch does with them in the caller's thread says nothing of physics."""
+    monkeypatch.setenv(native.LOOP_VARIABLE, "native")
+    tiny = 1e-310  # [m/s]
+    torch.set_flush_denormal(True)
+    try:
+        with make() as env:
+            env.reset()
+            state = env.get_state()
+            state["object_pose"][:, 0, 2] = 0.5  # in free fall
+            state["object_velocity"][:, 0, 0] = tiny
+            env.reset(state, set_state=True)
+            step(env)
+            velocity = env.get_state()["object_velocity"][:, 0, 0]
+    finally:
+        torch.set_flush_denormal(False)
+    assert (velocity > 0).all()
+    assert (velocity < tiny).all()  # Bullet damps it
+
+
+# ---- which loop ----------------------------------------------------------------------
+
+
+class OwnControl(Panda):
+    """A robot whose control is written in Python."""
+
+    num_controlled = 0
+
+    def control(self, client, body, setpoint):
+        self.num_controlled += 1
+        super().control(client, body, setpoint)
+
+
+def test_own_control_is_called(loop):
+    robots = OwnControl(block_gripper=True), Panda(block_gripper=True)
+    states = []
+    for robot in robots:
+        with RobotTaskEnv(robot=robot, task=Push(), num_envs=N, seed=0) as env:
+            env.rollout(4, lambda td: td.set("action", torch.ones(N, 3)))
+            states.append(env.get_state())
+    assert (states[0] == states[1]).all()
+    assert robots[0].num_controlled == 4 * N
+
+
+def test_loops_that_there_are_not(monkeypatch):
+    monkeypatch.setenv(native.LOOP_VARIABLE, "fortran")
+    with pytest.raises(ValueError, match=r"one of \('native', 'ctypes'\), got 'fort"):
+        make()
+    monkeypatch.setattr(native, "LIBRARY", None)
+    monkeypatch.setenv(native.LOOP_VARIABLE, "native")
+    with pytest.raises(ValueError, match="without its native loop"):
+        make()
+    monkeypatch.delenv(native.LOOP_VARIABLE)
+    with make() as env:
+        assert env.episodes.simulation._native is None

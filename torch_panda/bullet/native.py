@@ -1,0 +1,148 @@
+"""``loop.c`` as the package's installation compiled it: found, loaded and declared.
+
+It is an optional part: without it, `VectorSimulation` steps its clients in Python.
+"""
+
+import ctypes
+import importlib.util
+import os
+from ctypes import POINTER, Structure, c_double, c_int, c_int64, c_void_p
+from typing import Any, Literal, get_args
+
+from torch_panda.bullet import capi
+
+LoopName = Literal["native", "ctypes"]
+
+# Chooses the loop of what is created from now on: for tests and comparisons.
+LOOP_VARIABLE = "TORCH_PANDA_LOOP"
+
+# In a `Failure`, beside status codes.
+NO_ANSWER = -1  # as answer
+CLIENT_CLOSED = -2  # as expected
+
+# In the order of ``struct functions``.
+_BULLET = (
+    capi.submit,
+    capi.status_type,
+    capi.ik_init,
+    capi.ik_set_target,
+    capi.ik_result,
+    capi.motor_init,
+    capi.motor_set_position,
+    capi.motor_set_kp,
+    capi.motor_set_kd,
+    capi.motor_set_force,
+    capi.step_init,
+    capi.state_init,
+    capi.state_want_link_velocity,
+    capi.state_result,
+)
+Functions = c_void_p * len(_BULLET)
+
+
+class Client(Structure):
+    """``struct client``."""
+
+    _fields_ = (("handle", c_void_p), ("num_detections", c_int64))
+
+
+class Scene(Structure):
+    """``struct scene``."""
+
+    _fields_ = (
+        ("robot", c_int),
+        ("ee_link", c_int),
+        ("num_joints", c_int),
+        ("num_objects", c_int),
+        ("num_substeps", c_int),
+        ("objects", POINTER(c_int)),
+    )
+
+
+class Control(Structure):
+    """``struct control``."""
+
+    _fields_ = (
+        ("ik_link", c_int),
+        ("num_arm_joints", c_int),
+        ("setpoint_size", c_int),
+        ("orientation", c_double * 4),
+        ("position_gain", c_double),
+        ("velocity_gain", c_double),
+        ("forces", POINTER(c_double)),
+    )
+
+
+class Failure(Structure):
+    """``struct failure``."""
+
+    _fields_ = (("expected", c_int), ("answer", c_int))
+
+
+class Library:
+    """The functions of ``loop.c``. Calls release the GIL.
+
+    Args:
+        path: of the compiled file.
+    """
+
+    def __init__(self, path: str) -> None:
+        library = ctypes.CDLL(path)
+        self.create = library.loop_create
+        self.create.restype = c_void_p
+        self.create.argtypes = (
+            Functions,
+            POINTER(Scene),
+            POINTER(POINTER(Client)),
+            c_void_p,
+            POINTER(Failure),
+            c_int,
+        )
+        self.step = library.loop_step
+        self.step.argtypes = (
+            c_void_p,
+            POINTER(Control),
+            c_void_p,
+            POINTER(c_int),
+            c_int,
+        )
+        self.destroy = library.loop_destroy
+        self.destroy.restype = None
+        self.destroy.argtypes = (c_void_p,)
+
+
+def _find() -> Library | None:
+    # It has the name of an extension module, but knows nothing of Python.
+    spec = importlib.util.find_spec("torch_panda.bullet._loop")
+    return None if spec is None or spec.origin is None else Library(spec.origin)
+
+
+LIBRARY = _find()
+
+
+def loop_name() -> LoopName:
+    """The loop that steps what is created now.
+
+    Raises:
+        ValueError: the environment variable asks for a loop that there is not.
+    """
+    name = os.environ.get(LOOP_VARIABLE)
+    if name is None:
+        return "ctypes" if LIBRARY is None else "native"
+    if name == "native" and LIBRARY is None:
+        raise ValueError(
+            f"{LOOP_VARIABLE}=native, but torch_panda was installed without its native "
+            f"loop: install it again where there is a C compiler"
+        )
+    if name == "ctypes":
+        return "ctypes"
+    if name == "native":
+        return "native"
+    raise ValueError(
+        f"{LOOP_VARIABLE} must be one of {get_args(LoopName)}, got {name!r}"
+    )
+
+
+def bullet_functions() -> Any:  # noqa: ANN401 (a ctypes array)
+    """``struct functions``: where Bullet's functions are."""
+    return Functions(*(ctypes.cast(f, c_void_p).value for f in _BULLET))
