@@ -70,14 +70,8 @@ class VectorSimulation:
         self._native: NativeLoop | None = None
         try:
             for _ in range(num_envs):
-                client = PhysicsClient(physics=physics)
-                self._clients.append(client)
-                scene = build(client)
-                if self._blueprint is None:
-                    self.scene, self._blueprint = scene, client.blueprint
-                self.check_same(client, scene)
-                client.finish_building()
-                self._broad_phases.append(BroadPhase(client))
+                self._clients.append(PhysicsClient(physics=physics))
+                self._broad_phases.append(self._build_in(self._clients[-1]))
             self._allocate()
             if is_native:
                 self._native = NativeLoop(
@@ -192,9 +186,7 @@ class VectorSimulation:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
-        self.check_same(client, self._build(client))
-        client.finish_building()
-        self._broad_phases[env] = BroadPhase(client)
+        self._broad_phases[env] = self._build_in(client)
         if self._native is not None:
             self._native.replace(env, client)
 
@@ -205,6 +197,15 @@ class VectorSimulation:
             self._native.close()
         for client in self._clients:
             client.close()
+
+    def _build_in(self, client: PhysicsClient) -> BroadPhase:
+        """Build the scene in a client; return the way back to it."""
+        scene = self._build(client)
+        if self._blueprint is None:
+            self.scene, self._blueprint = scene, client.blueprint
+        self.check_same(client, scene)
+        client.finish_building()
+        return BroadPhase(client)
 
     def _allocate(self) -> None:
         n, scene = self.num_envs, self.scene
