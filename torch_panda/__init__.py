@@ -6,6 +6,7 @@ from torch_panda.registry import (
     ENV_IDS,
     make,
     max_episode_steps,
+    register,
     register_with_gymnasium,
 )
 from torch_panda.rendering import Camera
@@ -43,6 +44,7 @@ __all__ = [
     "WorkerError",
     "make",
     "max_episode_steps",
+    "register",
 ]
 
 # So that `gymnasium.register_envs(torch_panda)` reads as for any other package.

@@ -63,8 +63,9 @@ struct client {
 };
 
 struct scene { /* the same in every client */
-    int robot, ee_link, num_joints, num_objects, num_substeps;
-    const int *objects; /* body ids */
+    int robot, ee_link, num_joints, num_objects, num_object_joints, num_substeps;
+    const int *objects;       /* body ids */
+    const int *object_joints; /* how many each object has */
 };
 
 struct control { /* PositionControl of control.py */
@@ -174,22 +175,29 @@ static double *copy(double *to, doubles from, int count) {
     return to + count;
 }
 
-/* Fill a client's row: joint positions and velocities, position and velocity of the
-   end-effector, poses (7 each) and then velocities (6 each) of the objects. */
+/* Fill a client's row: joint positions and velocities, position, velocity and
+   orientation of the end-effector; poses (7 each), then velocities (6 each) of the
+   objects, then positions and velocities of their joints. */
 static int read_state(struct loop *loop, int env) {
     const struct scene *scene = loop->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
-    double *row = loop->state + (size_t)env * (2 * n + 6 + 13 * num_objects);
+    int num_object_joints = scene->num_object_joints;
+    int size = 2 * n + 10 + 13 * num_objects + 2 * num_object_joints;
+    double *row = loop->state + (size_t)env * size;
     struct body_state body;
     if (!ask_state(loop, env, scene->robot, &body)) return 0;
     row = copy(row, body.q + Q_OFFSET, n);
     row = copy(row, body.u + U_OFFSET, n);
     row = copy(row, body.link_poses + 7 * scene->ee_link, 3);
     row = copy(row, body.link_velocities + 6 * scene->ee_link, 3);
+    row = copy(row, body.link_poses + 7 * scene->ee_link + 3, 4);
+    double *joints = row + 13 * num_objects;
     for (int k = 0; k < num_objects; k++) {
         if (!ask_state(loop, env, scene->objects[k], &body)) return 0;
         copy(row + 7 * k, body.q, 7);
         copy(row + 7 * num_objects + 6 * k, body.u, 6);
+        copy(joints + num_object_joints, body.u + U_OFFSET, scene->object_joints[k]);
+        joints = copy(joints, body.q + Q_OFFSET, scene->object_joints[k]);
     }
     return 1;
 }

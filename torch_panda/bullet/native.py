@@ -54,8 +54,10 @@ class Scene(Structure):
         ("ee_link", c_int),
         ("num_joints", c_int),
         ("num_objects", c_int),
+        ("num_object_joints", c_int),
         ("num_substeps", c_int),
         ("objects", POINTER(c_int)),
+        ("object_joints", POINTER(c_int)),
     )
 
 

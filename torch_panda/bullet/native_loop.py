@@ -31,8 +31,7 @@ class NativeLoop:
         clients: the clients, which `replace` may replace.
         scene: what they hold.
         state: (num_envs, k) float64 and contiguous, which every step overwrites: of
-            each client the robot's joint positions, joint velocities, the position
-            and the velocity of its end-effector, and the objects' poses and velocities.
+            each client what `VectorSimulation` names, in that order.
         physics: how they integrate.
         num_threads: threads that step them, the caller's among them.
     """
@@ -53,13 +52,17 @@ class NativeLoop:
         self._num_threads = num_threads
         self._bullet = native.bullet_functions()
         self._objects = (c_int * len(scene.objects))(*scene.objects)
+        counts = [len(joints) for joints in scene.object_joints]
+        self._object_joints = (c_int * len(counts))(*counts)
         self._scene = native.Scene(
             scene.robot,
             scene.ee_link,
             len(scene.joints),
             len(scene.objects),
+            sum(counts),
             physics.n_substeps,
             self._objects,
+            self._object_joints,
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
