@@ -2,6 +2,7 @@
 
 from torch_panda.bullet import BulletError, PhysicsName, PhysicsParams, WorkerError
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.randomization import Randomization
 from torch_panda.registry import (
     ENV_IDS,
     make,
@@ -34,6 +35,7 @@ __all__ = [
     "PhysicsParams",
     "PickAndPlace",
     "Push",
+    "Randomization",
     "Reach",
     "Robot",
     "RobotTaskEnv",

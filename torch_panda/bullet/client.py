@@ -102,6 +102,12 @@ class PhysicsClient(SceneClient):
         capi.pose_set_orientation(command, *orientation)
         self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set a base pose")
 
+    def set_gravity(self, gravity: float) -> None:
+        """Set gravity along the world's z axis [m/s^2]."""
+        command = capi.physics_init(self._open())
+        capi.physics_set_gravity(command, 0.0, 0.0, gravity)
+        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set gravity")
+
     def save(self) -> int:
         """Take a snapshot of all poses, velocities and contacts; return its id."""
         command = capi.save_init(self._open())

@@ -24,6 +24,7 @@ from torch_panda.envs.seeds import EpisodeSeeds, integer
 from torch_panda.envs.start import draw_start
 from torch_panda.envs.state import GivenState, check_rotations, read_state
 from torch_panda.envs.variation import Variation
+from torch_panda.randomization import Randomization
 from torch_panda.rendering import (
     Camera,
     RendererName,
@@ -65,8 +66,11 @@ class Episodes(Closing):
         sensors: Sequence[Sensor | str] = (),
         renderer: RendererName = "tiny",
         on_divergence: OnDivergence = "raise",
+        randomize: Randomization | None = None,
     ) -> None:
         check_kinds(robot, task)
+        if not isinstance(randomize, Randomization | None):
+            raise TypeError(f"randomize must be a Randomization, got {randomize!r}")
         check_positive(
             num_envs=num_envs,
             num_threads=num_threads,
@@ -108,7 +112,12 @@ class Episodes(Closing):
             ]
             self._hooks = TaskHooks(task, self.simulation, robot.action_dim)
             self._variation = Variation(
-                task, self.simulation, randomizes=self._hooks.randomizes
+                randomize,
+                robot,
+                task,
+                self.simulation,
+                self.physics,
+                has_hook=self._hooks.randomizes,
             )
             observers: list[Observer] = [*self._readings, self._hooks, self._variation]
             self.entries = join_entries(observers)
@@ -277,7 +286,7 @@ class Episodes(Closing):
         self._step_count[env] = 0
         rng = self.seeds.next_generator(env)
         draw_start(env, rng, self.robot, self.task, self.simulation, self._goal)
-        if self._variation.state:
+        if self._variation.is_on:
             self._variation.draw(env, self.seeds.physics_seed(env))
 
     def _place(self, envs: list[int]) -> None:
@@ -288,7 +297,8 @@ class Episodes(Closing):
             check_rotations("desired_goal", pose, envs)
             simulation.marker_pose[envs] = pose
         self._history.begin(envs, self._state())
-        simulation.reset(envs, self._variation.apply if self._variation.state else None)
+        varies = self._variation.changes_physics
+        simulation.reset(envs, self._variation.apply if varies else None)
         for reading in self._readings:
             reading.after_reset(envs)
 
