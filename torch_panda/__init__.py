@@ -11,7 +11,7 @@ from torch_panda.registry import (
     register_with_gymnasium,
 )
 from torch_panda.rendering import Camera
-from torch_panda.robots import Panda, Robot
+from torch_panda.robots import Gripper, Kuka, Panda, Robot, XArm6, XArm6Gripper
 from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
     Flip,
@@ -30,6 +30,8 @@ __all__ = [
     "CameraSensor",
     "Flip",
     "ForceSensor",
+    "Gripper",
+    "Kuka",
     "Panda",
     "PhysicsName",
     "PhysicsParams",
@@ -44,6 +46,8 @@ __all__ = [
     "Stack",
     "Task",
     "WorkerError",
+    "XArm6",
+    "XArm6Gripper",
     "make",
     "max_episode_steps",
     "register",

@@ -10,7 +10,12 @@ from torch_panda.bullet import capi
 from torch_panda.bullet.checks import check_not_negative, check_quaternion
 from torch_panda.bullet.connection import Connection, doubles
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
-from torch_panda.bullet.urdf import check_collision_filters, find_urdf
+from torch_panda.bullet.urdf import (
+    Tool,
+    check_collision_filters,
+    find_urdf,
+    urdf_with_tool,
+)
 
 ORIGIN = (0.0, 0.0, 0.0)
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -79,6 +84,7 @@ class SceneClient(Connection):
         position: Sequence[float] = ORIGIN,
         orientation: Sequence[float] = NO_ROTATION,
         fixed_base: bool = False,
+        tool: Tool | None = None,
     ) -> int:
         """Load a URDF, here without its visual shapes, and return its body id.
 
@@ -87,6 +93,7 @@ class SceneClient(Connection):
             position: of the base, world frame [m].
             orientation: of the base, quaternion xyzw.
             fixed_base: whether the base cannot move.
+            tool: a link to be added.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -95,6 +102,8 @@ class SceneClient(Connection):
             BulletError: Bullet cannot read it.
         """
         file = find_urdf(path)
+        if tool is not None:
+            file = urdf_with_tool(file, tool)
         check_collision_filters(file)
         check_quaternion("orientation", orientation)
         pose = tuple(map(float, (*position, *orientation)))
