@@ -10,7 +10,7 @@ from torch_panda.registry import (
     register,
     register_with_gymnasium,
 )
-from torch_panda.rendering import Camera
+from torch_panda.rendering import Camera, HandCamera
 from torch_panda.robots import Gripper, Kuka, Panda, Robot, XArm6, XArm6Gripper
 from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
@@ -31,6 +31,7 @@ __all__ = [
     "Flip",
     "ForceSensor",
     "Gripper",
+    "HandCamera",
     "Kuka",
     "Panda",
     "PhysicsName",
