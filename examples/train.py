@@ -31,7 +31,17 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import Hyperparameters, make_agent
-from limits import Count, Positive, Ratio, Seed, Weight, check_device, check_limits
+from limits import (
+    Count,
+    Factor,
+    Positive,
+    Ratio,
+    Seed,
+    Weight,
+    check_device,
+    check_limits,
+)
+from torch_panda import Randomization
 from training.buffers import Hindsight, make_buffer, select_episodes
 from training.checkpoint import (
     SAVE_INTERVAL,
@@ -83,6 +93,9 @@ class Args(Hyperparameters):
     """the ratio of training episodes that begin in the course of the task: with the
     hand at an object, or holding it, or, of Stack, holding the second when the first
     is placed (see examples/training/starts.py)"""
+    randomize: Factor = 1.0
+    """masses and frictions of objects and table, drawn for every training episode, lie
+    between the task's, divided and multiplied by this; 1: they are the task's"""
     demos: Path | None = None
     """a file of demonstrations to learn from beside one's own transitions"""
     demo_ratio: Ratio = 0.25
@@ -119,8 +132,17 @@ class Run:
         # Permits bfloat16; on CPUs with AVX-512 it selects oneDNN, up to twice as fast.
         torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
+        randomize = None
+        if args.randomize > 1:
+            factors = (1 / args.randomize, args.randomize)
+            randomize = Randomization(
+                object_mass=factors, object_friction=factors, table_friction=factors
+            )
         self.env = torch_panda.make(
-            args.env_id, num_envs=args.num_envs, device=args.device
+            args.env_id,
+            num_envs=args.num_envs,
+            device=args.device,
+            randomize=randomize,
         )
         self.agent = make_agent(self.env, args)
         iteration = args.num_envs * self.env.max_episode_steps
