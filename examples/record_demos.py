@@ -39,8 +39,6 @@ class Args:
     """the standard deviation of Gaussian noise on the actions that are executed; saved
     are the actions without it, so that who imitates them learns to correct himself
     (DART, arXiv 1703.09327)"""
-    successful: bool = False
-    """save only the episodes that succeed at the end"""
     out: Path | None = None
     """where to save the transitions, a nested dict of tensors of shape (steps, ...)"""
 
@@ -121,10 +119,6 @@ def main(args: Args) -> None:
                 bar.update(len(new))
         print_success(args.env_id, episodes)
         if args.out is not None:
-            if args.successful:
-                episodes = [x for x in episodes if x["next", "success"][-1]]
-                if not episodes:
-                    raise SystemExit("no episode succeeded: nothing was saved")
             demos = join(episodes)
             demos["action"] = demos.pop("intended")
             # Ctrl-C leaves the file as it was, or makes the whole of it.

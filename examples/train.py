@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import make_agent
+from torch_panda import Randomization
 from training.buffers import make_buffer, select_episodes
 from training.checkpoint import (
     SAVE_INTERVAL,
@@ -45,6 +46,7 @@ from training.recipes import find_changes
 from training.starts import StartFrom, states_at_objects
 from video import record
 
+DEMO_RATIO = 0.25  # of each batch: what is drawn from the demonstrations, if any
 KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
 
 
@@ -65,8 +67,17 @@ class Run:
         # Permits bfloat16; on CPUs with AVX-512 it selects oneDNN, up to twice as fast.
         torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
+        randomize = None
+        if args.randomize > 1:
+            factors = (1 / args.randomize, args.randomize)
+            randomize = Randomization(
+                object_mass=factors, object_friction=factors, table_friction=factors
+            )
         self.env = torch_panda.make(
-            args.env_id, num_envs=args.num_envs, device=args.device
+            args.env_id,
+            num_envs=args.num_envs,
+            device=args.device,
+            randomize=randomize,
         )
         self.agent = make_agent(self.env, args)
         iteration = args.num_envs * self.env.max_episode_steps
@@ -83,7 +94,7 @@ class Run:
             demos = read_demos(args.demos, self.env)
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
             self.demos = make_demo_buffer(demos)
-            self.num_demos = round(args.demo_ratio * args.batch_size)
+            self.num_demos = int(DEMO_RATIO * args.batch_size)
         env: EnvBase = self.env
         if args.start_at_object:
             states = states_at_objects(args.env_id, seed=args.seed)

@@ -7,7 +7,16 @@ from typing import Literal
 import tyro
 
 from agents import Hyperparameters
-from limits import Count, Positive, Ratio, Seed, Weight, check_device, check_limits
+from limits import (
+    Count,
+    Factor,
+    Positive,
+    Ratio,
+    Seed,
+    Weight,
+    check_device,
+    check_limits,
+)
 from training.buffers import Hindsight
 from training.recipes import find_recipe
 
@@ -45,10 +54,11 @@ class Args(Hyperparameters):
     """the ratio of training episodes that begin in the course of the task: with the
     hand at an object, or holding it, or, of Stack, holding the second when the first
     is placed (see examples/training/starts.py)"""
+    randomize: Factor = 1.0
+    """masses and frictions of objects and table, drawn for every training episode, lie
+    between the task's, divided and multiplied by this; 1: they are the task's"""
     demos: Path | None = None
     """a file of demonstrations to learn from beside one's own transitions"""
-    demo_ratio: Ratio = 0.25
-    """the ratio of each batch that is drawn from the demonstrations"""
     pretrain_updates: Count = 0
     """gradient steps that only imitate the demonstrations, before the first step of the
     environments; the learning rate falls to 0 in them"""
@@ -75,11 +85,6 @@ def check(args: Args) -> None:
         raise ValueError("pretrain_updates needs demos to imitate")
     if not args.total_steps and not args.pretrain_updates:
         raise ValueError("total_steps must be positive without pretrain_updates, got 0")
-    if args.demos and round(args.demo_ratio * args.batch_size) >= args.batch_size:
-        raise ValueError(
-            f"a demo_ratio of {args.demo_ratio} leaves no room for transitions of "
-            f"one's own in a batch of {args.batch_size}"
-        )
     check_device(args.device)
 
 

@@ -45,19 +45,6 @@ def test_what_is_saved_is_the_action_without_noise(tmp_path):
     assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
 
 
-def test_only_successful_episodes_are_saved_if_wanted(tmp_path):
-    out = tmp_path / "demos.pt"
-    args = record_demos.Args("PandaFlip-v1", 12, num_envs=12, seed=1, out=out)
-    for successful in (False, True):
-        args.successful = successful
-        record_demos.main(args)
-        demos = TensorDict(torch.load(out)).auto_batch_size_(1)
-        ended = demos["next", "success"][demos["next", "done"]]
-        assert ended.all() == successful
-    assert 0 < len(ended) < 12
-    assert demos["collector", "traj_ids"].unique().tolist() == list(range(len(ended)))
-
-
 def stop(*arguments):
     raise KeyboardInterrupt
 

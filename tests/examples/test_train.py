@@ -253,7 +253,6 @@ def test_at_most_30_options_in_whole_phrases(capsys):
         ({"pretrain_updates": 9}, "pretrain_updates needs demos to imitate"),
         ({"her": "parts"}, "--her parts is for goals of several objects"),
         ({"start_at_object": 0.5}, "starts at objects need"),
-        ({"demos": Path("x"), "demo_ratio": 1.0}, "leaves no room"),
         ({"out": Path("/dev/null")}, "out must be a folder, got the file /dev/null"),
     ],
 )

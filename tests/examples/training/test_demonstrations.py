@@ -57,14 +57,14 @@ def small(path, **options):
 
 def test_a_ratio_of_each_batch_is_demonstrations(make_demos, tmp_path):
     options = {"total_steps": 100, "updates_per_step": 0.05, "batch_size": 32}
-    run = Run(small(make_demos(), demo_ratio=0.4, **options), tmp_path)
+    run = Run(small(make_demos(), **options), tmp_path)
     sizes, update = [], run.agent.update
     run.agent.update = lambda batch, demos: (
         sizes.append((len(batch), len(demos))) or update(batch, demos)
     )
     assert run.train()
     run.close()
-    assert sizes == [(19, 13)] * 5
+    assert sizes == [(24, 8)] * 5
     assert run.agent.normalizer.count == 200 + 100
     assert len(run.buffer) == 100
 
