@@ -43,7 +43,11 @@ Functions = c_void_p * len(_BULLET)
 class Client(Structure):
     """``struct client``."""
 
-    _fields_ = (("handle", c_void_p), ("num_detections", c_int64))
+    _fields_ = (
+        ("handle", c_void_p),
+        ("num_detections", c_int64),
+        ("num_substeps", c_int),
+    )
 
 
 class Scene(Structure):
