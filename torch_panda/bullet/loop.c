@@ -15,6 +15,7 @@
 #define _POSIX_C_SOURCE 200809L
 
 #include <fenv.h>
+#include <math.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdint.h>
@@ -180,12 +181,30 @@ static double *copy(double *to, doubles from, int count) {
     return to + count;
 }
 
+/* Roll, pitch and yaw of a quaternion xyzw; euler.py says more. */
+void euler_angles(doubles quaternion, double *angles) {
+    double x = quaternion[0], y = quaternion[1], z = quaternion[2], w = quaternion[3];
+    double sine = -2 * (x * z - w * y);
+    if (fabs(sine) >= 0.99999) {
+        double side = copysign(1, sine);
+        angles[0] = 0;
+        angles[1] = side * (3.14159265358979323846 / 2);
+        angles[2] = 2 * atan2(-side * x, side * y);
+        return;
+    }
+    double xx = x * x, yy = y * y, zz = z * z, ww = w * w;
+    angles[0] = atan2(2 * (y * z + w * x), ww - xx - yy + zz);
+    angles[1] = asin(sine);
+    angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
+}
+
 /* Fill a client's row: joint positions and velocities, position and velocity of the
-   end-effector, poses (7 each) and then velocities (6 each) of the objects. */
+   end-effector; then of all objects the poses (7 each), the velocities (6 each) and the
+   Euler angles (3 each). */
 static int read_state(struct loop *loop, int env) {
     const struct scene *scene = loop->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
-    double *row = loop->state + (size_t)env * (2 * n + 6 + 13 * num_objects);
+    double *row = loop->state + (size_t)env * (2 * n + 6 + 16 * num_objects);
     struct body_state body;
     if (!ask_state(loop, env, scene->robot, &body)) return 0;
     row = copy(row, body.q + Q_OFFSET, n);
@@ -196,6 +215,7 @@ static int read_state(struct loop *loop, int env) {
         if (!ask_state(loop, env, scene->objects[k], &body)) return 0;
         copy(row + 7 * k, body.q, 7);
         copy(row + 7 * num_objects + 6 * k, body.u, 6);
+        euler_angles(body.q + 3, row + 13 * num_objects + 3 * k);
     }
     return 1;
 }

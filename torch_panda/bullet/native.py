@@ -110,6 +110,9 @@ class Library:
             POINTER(c_int),
             c_int,
         )
+        self.euler_angles = library.euler_angles
+        self.euler_angles.restype = None
+        self.euler_angles.argtypes = (POINTER(c_double), POINTER(c_double))
         self.destroy = library.loop_destroy
         self.destroy.restype = None
         self.destroy.argtypes = (c_void_p,)

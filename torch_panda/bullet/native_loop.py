@@ -32,7 +32,8 @@ class NativeLoop:
         scene: what they hold.
         state: (num_envs, k) float64 and contiguous, which every step overwrites: of
             each client the robot's joint positions, joint velocities, the position
-            and the velocity of its end-effector, and the objects' poses and velocities.
+            and the velocity of its end-effector, and the objects' poses, velocities and
+            Euler angles.
         physics: how they integrate.
         num_threads: threads that step them, the caller's among them.
     """

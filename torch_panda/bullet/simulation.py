@@ -13,6 +13,7 @@ from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, PositionControl
+from torch_panda.bullet.euler import euler_angles
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
@@ -41,6 +42,8 @@ class VectorSimulation:
         ee_velocity: (num_envs, 3) [m/s].
         object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
+        object_euler: (num_envs, n_objects, 3), the pose's roll, pitch and yaw [rad] as
+            `step` and `reset` leave it; `reset` does not start from it.
         marker_pose: (num_envs, n_markers, 7), where `reset` puts the markers.
 
     Raises:
@@ -220,7 +223,8 @@ class VectorSimulation:
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
 
-        sizes = (n_joints, n_joints, 3, 3, 7 * n_objects, 6 * n_objects)
+        widths = (7, 6, 3)  # of an object
+        sizes = (n_joints, n_joints, 3, 3, *(width * n_objects for width in widths))
         # In one tensor, which one check finds finite or not.
         self._state = zeros(sum(sizes))
         (
@@ -228,11 +232,12 @@ class VectorSimulation:
             self.joint_velocity,
             self.ee_position,
             self.ee_velocity,
-            object_pose,
-            object_velocity,
+            *objects,
         ) = self._state.split(sizes, dim=1)
-        self.object_pose = object_pose.unflatten(1, (n_objects, 7))
-        self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
+        self.object_pose, self.object_velocity, self.object_euler = (
+            part.unflatten(1, (n_objects, width))
+            for part, width in zip(objects, widths, strict=True)
+        )
         self.marker_pose = zeros(len(scene.markers), 7)
         # The same memory, part by part, for `_read`: rows of tensors take longer.
         ends = np.cumsum(sizes)[:-1]
@@ -260,7 +265,8 @@ class VectorSimulation:
     def _read(self, env: int) -> None:
         """Copy the state of one client into the tensors."""
         client, scene = self._clients[env], self.scene
-        joints, speeds, ee_position, ee_velocity, poses, velocities = self._rows[env]
+        joints, speeds, ee_position, ee_velocity, *objects = self._rows[env]
+        poses, velocities, angles = objects
         state = client.state(scene.robot, link_velocities=True)
         joints[:] = state.joint_positions
         speeds[:] = state.joint_velocities
@@ -270,3 +276,4 @@ class VectorSimulation:
             state = client.state(body)
             poses[7 * k : 7 * k + 7] = state.base_pose
             velocities[6 * k : 6 * k + 6] = state.base_velocity
+            angles[3 * k : 3 * k + 3] = euler_angles(*state.base_pose[3:].tolist())
