@@ -82,7 +82,11 @@ class SceneRenderer:
         simulation, solids = self._simulation, self._solids
         scene = simulation.scene
         pose_solids(solids, scene, simulation, env)
-        image = solids.draw(camera, segmentation=frames.segmentation is not None)
+        image = solids.draw(
+            camera,
+            segmentation=frames.segmentation is not None,
+            shadow=camera.shadows,
+        )
         pixels = frames.pixels[row].numpy()
         pixels[:] = image.rgb
         if frames.depth is not None:
