@@ -16,11 +16,23 @@ def rows_of(output):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_table_and_json(tmp_path, capsys):
-    path = tmp_path / "bench.json"
+def test_table_json_and_plot(tmp_path, capsys):
+    path, picture = tmp_path / "bench.json", tmp_path / "bench.png"
     options = ["--ids", "PandaPush-v3", "PandaFlip-v1", "--num-envs", "1", "2"]
     options += ["--others", "fetch", "bare-bullet", "--rounds", "3", "--steps", "2"]
-    main(["bench", *options, "--num-threads", "2", "--json", str(path)])
+    main(
+        [
+            "bench",
+            *options,
+            "--num-threads",
+            "2",
+            "--json",
+            str(path),
+            "--plot",
+            str(picture),
+        ]
+    )
+    assert picture.read_bytes().startswith(b"\x89PNG")
     output = capsys.readouterr()
     rows = rows_of(output.out)
     settings = [tuple(row[:3]) for row in rows if row[3] == OURS]
@@ -75,8 +87,9 @@ def test_every_contender_that_is_installed(name, capsys):
         (["--num-envs", "4", "many"], "must be an integer from 1 on, got many"),
         (["--num-threads", "-1"], "must be an integer from 1 on, got -1"),
         (["--rounds", "0"], "must be an integer from 1 on, got 0"),
-        (["--others", "envpool"], "invalid choice: 'envpool'"),
+        (["--others", "mujoco"], "invalid choice: 'mujoco'"),
         (["--json", "no/such/folder.json"], "must be a file in a folder"),
+        (["--plot", "no/such/folder.png"], "must be a file in a folder"),
     ],
 )
 def test_bad_options(options, message, capsys):

@@ -107,6 +107,20 @@ def test_more_threads_than_work():
     assert torch.equal(one["next", "observation"], five["next", "observation"])
 
 
+@needs_native
+@pytest.mark.parametrize("n_substeps", [1, 7])  # less than a piece; no multiple of it
+def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
+    def rollout(num_threads):
+        physics = PhysicsParams(n_substeps=n_substeps)
+        with make(num_envs=6, num_threads=num_threads, physics=physics) as env:
+            found = env.rollout(10, lambda td: td.set("action", torch.ones(6, 3)))
+            return found, detections(env)
+
+    (one, one_detected), (two, two_detected) = rollout(1), rollout(2)
+    assert torch.equal(one["next", "observation"], two["next", "observation"])
+    assert one_detected == two_detected
+
+
 # ---- errors --------------------------------------------------------------------------
 
 

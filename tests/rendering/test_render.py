@@ -81,6 +81,17 @@ def test_targets_are_seen_through():
     assert seen[0] > 0.7 * behind[0]
 
 
+def test_shadows_only_darken():
+    bright = Camera(width=180, height=120, shadows=False)
+    with torch_panda.make("PandaPush-v1", seed=0) as env:
+        env.reset()
+        without = env.render(camera=bright).int()
+        shaded = env.render(size=(120, 180)).int()
+    assert (shaded <= without).all()
+    darker = without - shaded  # everywhere by up to 2; here and there by 17
+    assert 0.001 < (darker > 5).float().mean() < 0.1
+
+
 @pytest.mark.parametrize(("version", "lower"), [("v1", 0), ("v3", 2)])
 def test_colors_of_the_stack(version, lower):
     with torch_panda.make(f"PandaStack-{version}", seed=0) as env:

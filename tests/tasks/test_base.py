@@ -1,46 +1,10 @@
-"""Rotations against pybullet, rewards by hand."""
+"""Rewards by hand."""
 
 import math
 
-import numpy as np
-import pybullet
-import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from torch_panda import Flip, Push, Stack
-from torch_panda.tasks.rotations import quaternion_to_euler
-
-angle = st.floats(-math.pi, math.pi)
-
-
-def assert_same_euler(quaternion):
-    ours = quaternion_to_euler(torch.tensor(quaternion, dtype=torch.float64))
-    theirs = pybullet.getEulerFromQuaternion(quaternion)
-    np.testing.assert_array_equal(ours.numpy(), theirs)
-
-
-@given(angle, angle, angle)
-def test_euler_equals_pybullet(roll, pitch, yaw):
-    assert_same_euler(pybullet.getQuaternionFromEuler((roll, pitch, yaw)))
-
-
-@pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
-@given(roll=angle, yaw=angle)
-def test_euler_equals_pybullet_when_vertical(pitch, roll, yaw):
-    assert_same_euler(pybullet.getQuaternionFromEuler((roll, pitch, yaw)))
-
-
-@pytest.mark.parametrize("shape", [(), (0,), (2,), (2, 3)])
-def test_euler_takes_any_leading_shape(shape):
-    quaternion = torch.rand(*shape, 4, dtype=torch.float64)
-    angles = quaternion_to_euler(quaternion)
-    assert angles.shape == (*shape, 3)
-    for single, found in zip(
-        quaternion.reshape(-1, 4), angles.reshape(-1, 3), strict=True
-    ):
-        assert torch.equal(quaternion_to_euler(single), found)
 
 
 def test_rewards_by_hand():

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch_panda
 from torch_panda.bench.comparison import Absence, Result, compare, work_of
 from torch_panda.bench.contenders import CONTENDERS, OURS, Setting
+from torch_panda.bench.plot import plot
 from torch_panda.bench.report import notes, table, write_json
 from torch_panda.bench.runner import ContenderError
 from torch_panda.info import num_cores
@@ -31,7 +32,7 @@ def _env_id(text: str) -> str:
     return text
 
 
-def _json_path(text: str) -> Path:
+def _new_file(text: str) -> Path:
     path = Path(text)
     if path.is_dir() or not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"must be a file in a folder, got {text}")
@@ -66,17 +67,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=50,
         help="steps of each environment in a round",
     )
-    parser.add_argument("--json", type=_json_path, help="where to write all figures")
+    parser.add_argument("--json", type=_new_file, help="where to write all figures")
+    parser.add_argument("--plot", type=_new_file, help="where to draw steps per second")
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure, and print the table.
 
     Raises:
-        SystemExit: the progress bar's library is missing, or a contender failed.
+        SystemExit: a library of the extra ``bench`` is missing, or a contender failed.
     """
-    if find_spec("tqdm") is None:
-        sys.exit("bench needs tqdm: pip install 'torch_panda[bench]'")
+    for library in ("tqdm", *(["matplotlib"] if args.plot else [])):
+        if find_spec(library) is None:
+            sys.exit(f"bench needs {library}: pip install 'torch_panda[bench]'")
     from tqdm import tqdm
 
     settings = [
@@ -112,3 +115,5 @@ def run(args: argparse.Namespace) -> None:
         print(notes(absences))
     if args.json is not None:
         write_json(args.json, results, absences)
+    if args.plot is not None:
+        plot(args.plot, results)

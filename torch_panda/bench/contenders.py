@@ -179,6 +179,25 @@ def _fetch_id(setting: Setting) -> str:
     return f"gymnasium_robotics:{prefix}-v{max(versions)}"
 
 
+def _make_envpool(setting: Setting) -> Contender:
+    import envpool
+
+    prefix = f"Fetch{setting.task}-v"
+    versions = [
+        int(name.removeprefix(prefix))
+        for name in envpool.list_all_envs()
+        if name.startswith(prefix)
+    ]
+    env = envpool.make(
+        f"{prefix}{max(versions)}",
+        env_type="gymnasium",
+        num_envs=setting.num_envs,
+        num_threads=setting.num_threads,
+    )
+    action_dim = gymnasium.spaces.flatdim(env.action_space)
+    return VectorEnvContender(env, setting.num_envs, action_dim)
+
+
 def _make_async_vector(get_id: Callable[[Setting], str], setting: Setting) -> Contender:
     make_env = partial(gymnasium.make, get_id(setting))
     env = gymnasium.vector.AsyncVectorEnv(
@@ -276,6 +295,13 @@ CONTENDERS: dict[str, Entry] = {
         partial(_make_async_vector, _fetch_id),
         memory=50,
         needs=("gymnasium_robotics",),
+        is_fetch=True,
+    ),
+    "envpool": Entry(
+        "Fetch (MuJoCo), EnvPool",
+        _make_envpool,
+        memory=10,
+        needs=("envpool",),
         is_fetch=True,
     ),
 }

@@ -3,6 +3,9 @@
    A step of one client sets the motors of its robot, advances time by some substeps,
    and copies the state of its world into the caller's memory. Clients are drawn by
    whichever thread is free; the caller's takes part, and returns when all are done.
+   The last clients are drawn in pieces of a few substeps each, in turns, so that all
+   threads end at about the same time: steps last 0.8 ms give or take 0.2, and so four
+   clients drawn whole take two threads 8 % longer than half their work, in pieces 4 %.
 
    Nothing is linked: Bullet's functions are given by address. native.py declares these
    structs once more, in the same order, and capi.py the functions by their full names.
@@ -12,6 +15,7 @@
 #define _POSIX_C_SOURCE 200809L
 
 #include <fenv.h>
+#include <math.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdint.h>
@@ -30,7 +34,8 @@ enum {
     MAX_DEGREES_OF_FREEDOM = 128, /* of a body */
     Q_OFFSET = 7,                 /* joints follow the base: 7 of its pose, */
     U_OFFSET = 6,                 /* 6 of its velocity */
-    STACK_SIZE = 8 << 20          /* of a thread: as on Linux; macOS gives less */
+    STACK_SIZE = 8 << 20,         /* of a thread: as on Linux; macOS gives less */
+    PIECE = 5                     /* substeps; other threads begin with a cold cache */
 };
 
 typedef void *handle;          /* of a client, a command or a status */
@@ -63,6 +68,7 @@ struct functions {
 struct client {
     handle handle;          /* NULL when it is closed */
     int64_t num_detections; /* how often collisions have been detected */
+    int num_substeps;       /* in the present step, so far */
 };
 
 struct scene { /* the same in every client */
@@ -96,8 +102,9 @@ struct loop {
 
     const struct control *control; /* of the present step, as what follows */
     doubles setpoint;              /* a row a client */
-    const int *envs;               /* which clients */
-    int num_envs, num_drawn, num_done, num_failed;
+    int num_envs, num_done, num_failed;
+    int *queue; /* a ring of num_envs clients that wait to be drawn */
+    int first, num_waiting, num_whole; /* of them the first ones are not cut up */
 
     pthread_mutex_t mutex; /* of all that changes */
     pthread_cond_t begun, done;
@@ -162,8 +169,9 @@ static int set_motors(struct loop *loop, int env, doubles joints) {
     return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
 }
 
-static int apply_torques(struct loop *loop, int env, doubles torques) {
+static int apply_torques(struct loop *loop, int env) {
     const struct functions *bullet = loop->bullet;
+    doubles torques = loop->setpoint + (size_t)env * loop->control->setpoint_size;
     handle client = loop->clients[env]->handle;
     handle command = bullet->motor_init(client, loop->scene->robot, TORQUE);
     for (int k = 0; k < loop->control->num_arm_joints; k++)
@@ -171,15 +179,15 @@ static int apply_torques(struct loop *loop, int env, doubles torques) {
     return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
 }
 
-static int advance(struct loop *loop, int env, doubles joints) {
+static int advance(struct loop *loop, int env, int num_substeps) {
     struct client *client = loop->clients[env];
     int has_torques = loop->control->arm_mode == TORQUES;
     /* A client has one command buffer, and stepping leaves it as it was. */
     handle command = loop->bullet->step_init(client->handle);
-    for (int k = 0; k < loop->scene->num_substeps; k++) {
+    for (; client->num_substeps < num_substeps; client->num_substeps++) {
         client->num_detections++;
         if (has_torques) { /* which Bullet forgets when it has stepped */
-            if (!apply_torques(loop, env, joints)) return 0;
+            if (!apply_torques(loop, env)) return 0;
             command = loop->bullet->step_init(client->handle);
         }
         if (!submit(loop, env, command, STEP_FORWARD_SIMULATION_COMPLETED)) return 0;
@@ -207,14 +215,32 @@ static double *copy(double *to, doubles from, int count) {
     return to + count;
 }
 
+/* Roll, pitch and yaw of a quaternion xyzw; euler.py says more. */
+void euler_angles(doubles quaternion, double *angles) {
+    double x = quaternion[0], y = quaternion[1], z = quaternion[2], w = quaternion[3];
+    double sine = -2 * (x * z - w * y);
+    if (fabs(sine) >= 0.99999) {
+        double side = copysign(1, sine);
+        angles[0] = 0;
+        angles[1] = side * (3.14159265358979323846 / 2);
+        angles[2] = 2 * atan2(-side * x, side * y);
+        return;
+    }
+    double xx = x * x, yy = y * y, zz = z * z, ww = w * w;
+    angles[0] = atan2(2 * (y * z + w * x), ww - xx - yy + zz);
+    angles[1] = asin(sine);
+    angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
+}
+
 /* Fill a client's row: joint positions and velocities, position, velocity and
    orientation of the end-effector; poses (7 each), then velocities (6 each) of the
-   objects, then positions and velocities of their joints. */
+   objects, then positions and velocities of their joints, and the objects' Euler
+   angles (3 each). */
 static int read_state(struct loop *loop, int env) {
     const struct scene *scene = loop->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
     int num_object_joints = scene->num_object_joints;
-    int size = 2 * n + 10 + 13 * num_objects + 2 * num_object_joints;
+    int size = 2 * n + 10 + 16 * num_objects + 2 * num_object_joints;
     double *row = loop->state + (size_t)env * size;
     struct body_state body;
     if (!ask_state(loop, env, scene->robot, &body)) return 0;
@@ -224,34 +250,54 @@ static int read_state(struct loop *loop, int env) {
     row = copy(row, body.link_velocities + 6 * scene->ee_link, 3);
     row = copy(row, body.link_poses + 7 * scene->ee_link + 3, 4);
     double *joints = row + 13 * num_objects;
+    double *angles = joints + 2 * num_object_joints;
     for (int k = 0; k < num_objects; k++) {
         if (!ask_state(loop, env, scene->objects[k], &body)) return 0;
         copy(row + 7 * k, body.q, 7);
         copy(row + 7 * num_objects + 6 * k, body.u, 6);
         copy(joints + num_object_joints, body.u + U_OFFSET, scene->object_joints[k]);
         joints = copy(joints, body.q + Q_OFFSET, scene->object_joints[k]);
+        euler_angles(body.q + 3, angles + 3 * k);
     }
     return 1;
 }
 
-static int step_client(struct loop *loop, int env) {
+static int begin_step(struct loop *loop, int env) {
     double joints[MAX_DEGREES_OF_FREEDOM];
     int is_closed = loop->clients[env]->handle == NULL;
     loop->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0};
-    return !is_closed && find_joints(loop, env, joints) &&
-           set_motors(loop, env, joints) && advance(loop, env, joints) && read_state(loop, env);
+    return !is_closed && find_joints(loop, env, joints) && set_motors(loop, env, joints);
+}
+
+/* Take so many substeps of a step; answer whether more of them are to be taken. */
+static int take_piece(struct loop *loop, int env, int piece) {
+    int begin = loop->clients[env]->num_substeps, all = loop->scene->num_substeps;
+    int end = piece < all - begin ? begin + piece : all;
+    if (begin == 0 && !begin_step(loop, env)) return 0;
+    if (!advance(loop, env, end)) return 0;
+    if (end < all) return 1;
+    read_state(loop, env);
+    return 0;
 }
 
 /* ---- threads --------------------------------------------------------------------- */
 
 /* Step clients until none is left to be drawn; the mutex is held before and after. */
 static void take_part(struct loop *loop) {
-    while (loop->num_drawn < loop->num_envs) {
-        int env = loop->envs[loop->num_drawn++];
+    while (loop->num_waiting) {
+        int env = loop->queue[loop->first];
+        int piece = loop->num_whole-- > 0 ? loop->scene->num_substeps : PIECE;
+        loop->first = (loop->first + 1) % loop->num_envs;
+        loop->num_waiting--;
         pthread_mutex_unlock(&loop->mutex);
-        int has_failed = !step_client(loop, env);
+        int goes_on = take_piece(loop, env, piece);
         pthread_mutex_lock(&loop->mutex);
-        loop->num_failed += has_failed;
+        if (goes_on) {
+            int last = (loop->first + loop->num_waiting++) % loop->num_envs;
+            loop->queue[last] = env;
+            continue;
+        }
+        loop->num_failed += loop->failures[env].expected != 0;
         if (++loop->num_done == loop->num_envs) pthread_cond_signal(&loop->done);
     }
 }
@@ -295,16 +341,20 @@ struct loop *loop_create(const struct functions *bullet, const struct scene *sce
     return loop;
 }
 
-/* Step some clients, of which none may be named twice; return how many have failed. */
+/* Step some clients, of which none may be named twice; return how many have failed.
+   The array that names them is shuffled. */
 int loop_step(struct loop *loop, const struct control *control, doubles setpoint,
-              const int *envs, int num_envs) {
+              int *envs, int num_envs) {
     fenv_t before; /* of the caller, who may flush denormal numbers to zero */
     fegetenv(&before);
     fesetenv(FE_DFL_ENV);
     pthread_mutex_lock(&loop->mutex);
     loop->control = control, loop->setpoint = setpoint;
-    loop->envs = envs, loop->num_envs = num_envs;
-    loop->num_drawn = loop->num_done = loop->num_failed = 0;
+    loop->queue = envs, loop->num_envs = loop->num_waiting = num_envs;
+    /* More than the last two of each thread would gain less than it costs. */
+    loop->num_whole = num_envs - (loop->num_threads ? 2 * (loop->num_threads + 1) : 0);
+    loop->first = loop->num_done = loop->num_failed = 0;
+    for (int k = 0; k < num_envs; k++) loop->clients[envs[k]]->num_substeps = 0;
     pthread_cond_broadcast(&loop->begun);
     take_part(loop);
     while (loop->num_done < num_envs) pthread_cond_wait(&loop->done, &loop->mutex);

@@ -48,7 +48,11 @@ Functions = c_void_p * len(_BULLET)
 class Client(Structure):
     """``struct client``."""
 
-    _fields_ = (("handle", c_void_p), ("num_detections", c_int64))
+    _fields_ = (
+        ("handle", c_void_p),
+        ("num_detections", c_int64),
+        ("num_substeps", c_int),
+    )
 
 
 class Scene(Structure):
@@ -115,6 +119,9 @@ class Library:
             POINTER(c_int),
             c_int,
         )
+        self.euler_angles = library.euler_angles
+        self.euler_angles.restype = None
+        self.euler_angles.argtypes = (POINTER(c_double), POINTER(c_double))
         self.destroy = library.loop_destroy
         self.destroy.restype = None
         self.destroy.argtypes = (c_void_p,)

@@ -67,7 +67,6 @@ class NativeLoop:
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
         self._failures = (native.Failure * n)()
-        self._all = (c_int * n)(*range(n))
         self._described: MotorControl | None = None  # by _control
         self._control = native.Control()
         self._loop: int | None = None
@@ -100,9 +99,10 @@ class NativeLoop:
         self._start()
         if control is not self._described:
             self._describe(control)
-        chosen = self._all if envs is None else (c_int * len(envs))(*envs)
+        chosen = range(len(self._clients)) if envs is None else envs
+        queue = (c_int * len(chosen))(*chosen)
         failed = self._library.step(
-            self._loop, self._control, setpoint.ctypes.data, chosen, len(chosen)
+            self._loop, self._control, setpoint.ctypes.data, queue, len(queue)
         )
         if failed:
             errors = {env: self._error(env) for env in sorted(chosen)}

@@ -13,6 +13,7 @@ from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
+from torch_panda.bullet.euler import euler_angles
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
@@ -45,6 +46,8 @@ class VectorSimulation:
         object_joint_position: (num_envs, n_object_joints) [rad] or [m], of all joints
             of the first object, then of the next.
         object_joint_velocity: (num_envs, n_object_joints) [rad/s] or [m/s].
+        object_euler: (num_envs, n_objects, 3), the pose's roll, pitch and yaw [rad] as
+            `step` and `reset` leave it; `reset` does not start from it.
         marker_pose: (num_envs, n_markers, 7), where `reset` puts the markers.
 
     Raises:
@@ -249,7 +252,7 @@ class VectorSimulation:
                 self._jointed_objects.append((body, joints, own))
                 n_more += len(joints)
         arm = (n_joints, n_joints, 3, 3, 4)
-        sizes = (*arm, 7 * n_objects, 6 * n_objects, n_more, n_more)
+        sizes = (*arm, 7 * n_objects, 6 * n_objects, n_more, n_more, 3 * n_objects)
         # In one tensor, which one check finds finite or not.
         self._state = zeros(sum(sizes))
         (
@@ -262,9 +265,11 @@ class VectorSimulation:
             object_velocity,
             self.object_joint_position,
             self.object_joint_velocity,
+            object_euler,
         ) = self._state.split(sizes, dim=1)
         self.object_pose = object_pose.unflatten(1, (n_objects, 7))
         self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
+        self.object_euler = object_euler.unflatten(1, (n_objects, 3))
         self.marker_pose = zeros(len(scene.markers), 7)
         # The same memory, part by part, for `_read`: rows of tensors take longer.
         ends = np.cumsum(sizes)[:-1]
@@ -299,7 +304,7 @@ class VectorSimulation:
         joints, speeds, ee_position, ee_velocity, ee_orientation, *objects = self._rows[
             env
         ]
-        poses, velocities, object_joints, object_speeds = objects
+        poses, velocities, object_joints, object_speeds, angles = objects
         state = client.state(scene.robot, link_velocities=True)
         joints[:] = state.joint_positions
         speeds[:] = state.joint_velocities
@@ -310,6 +315,7 @@ class VectorSimulation:
             state = client.state(body)
             poses[7 * k : 7 * k + 7] = state.base_pose
             velocities[6 * k : 6 * k + 6] = state.base_velocity
+            angles[3 * k : 3 * k + 3] = euler_angles(*state.base_pose[3:].tolist())
         for body, _, own in self._jointed_objects:
             state = client.state(body)
             object_joints[own] = state.joint_positions

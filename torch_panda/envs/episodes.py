@@ -341,11 +341,12 @@ class Episodes(Closing):
         achieved_goal = task.achieved_goal(simulation).float()
         desired_goal = self._goal.float()
         success = task.is_success(achieved_goal, desired_goal)
-        started = self._step_count > 0
         truncated = self._step_count >= self.max_episode_steps
-        terminated = success & started & self.terminate_on_success
+        terminated = torch.zeros_like(success)
+        if self.terminate_on_success:
+            terminated = success & (self._step_count > 0)
         if self._hooks.failure is not None:
-            terminated = terminated | self._hooks.failure() & started
+            terminated = terminated | self._hooks.failure() & (self._step_count > 0)
         observed: Observed = {}
         for observer in self._observers:
             observed |= observer.observe()

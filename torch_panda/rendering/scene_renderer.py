@@ -88,7 +88,12 @@ class SceneRenderer:
             *simulation.ee_position[env].tolist(),
             *simulation.ee_orientation[env].tolist(),
         ]
-        image = solids.draw(camera, hand, segmentation=frames.segmentation is not None)
+        image = solids.draw(
+            camera,
+            hand,
+            segmentation=frames.segmentation is not None,
+            shadow=camera.shadows,
+        )
         pixels = frames.pixels[row].numpy()
         pixels[:] = image.rgb
         if frames.depth is not None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.tasks.rotations import NO_ROTATION, quaternion_to_euler
+from torch_panda.tasks.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
 
 # What tasks of users are made of is found here.
@@ -217,6 +217,6 @@ class Task(ABC):
 
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
     """Position, Euler angles [rad] and velocity of an object: (num_envs, 12)."""
-    pose = simulation.object_pose[:, index]  # (num_envs, 7)
-    velocity = simulation.object_velocity[:, index]  # (num_envs, 6)
-    return torch.cat((pose[:, :3], quaternion_to_euler(pose[:, 3:]), velocity), dim=1)
+    position = simulation.object_pose[:, index, :3]
+    euler, velocity = simulation.object_euler, simulation.object_velocity
+    return torch.cat((position, euler[:, index], velocity[:, index]), dim=1)
