@@ -38,14 +38,14 @@ class Joint:
     damping: float
 
 
-# What sets the arguments of `SceneClient.set_dynamics`.
-_DYNAMICS = {
-    "mass": capi.dynamics_set_mass,
-    "lateral_friction": capi.dynamics_set_lateral_friction,
-    "spinning_friction": capi.dynamics_set_spinning_friction,
-    "restitution": capi.dynamics_set_restitution,
-    "joint_damping": capi.dynamics_set_joint_damping,
-}
+# The arguments of `SceneClient.set_dynamics`, and what sets them.
+_DYNAMICS = (
+    ("mass", capi.dynamics_set_mass),
+    ("lateral_friction", capi.dynamics_set_lateral_friction),
+    ("spinning_friction", capi.dynamics_set_spinning_friction),
+    ("restitution", capi.dynamics_set_restitution),
+    ("joint_damping", capi.dynamics_set_joint_damping),
+)
 
 
 class SceneClient(Connection):
@@ -220,19 +220,19 @@ class SceneClient(Connection):
         Raises:
             ValueError: a number is negative or not finite.
         """
-        changes = {
-            "mass": mass,
-            "lateral_friction": lateral_friction,
-            "spinning_friction": spinning_friction,
-            "restitution": restitution,
-            "joint_damping": joint_damping,
-        }
-        check_not_negative(**changes)
-        self._note("set_dynamics", body, link, *changes.values())
+        numbers = (
+            mass,
+            lateral_friction,
+            spinning_friction,
+            restitution,
+            joint_damping,
+        )
+        self._note("set_dynamics", body, link, *numbers)
         command = capi.dynamics_init(self._open())
-        for name, value in changes.items():
+        for (name, change), value in zip(_DYNAMICS, numbers, strict=True):
             if value is not None:
-                _DYNAMICS[name](command, body, link, value)
+                check_not_negative(**{name: value})
+                change(command, body, link, value)
         # Bullet only takes notes: done before another thread could use the GIL.
         status = capi.submit_quick(self._open(), command)
         self._check(status, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics")
