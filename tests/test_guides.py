@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+import torch_panda
+
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
 FOLDERS += ("examples/policies", "examples/results")
@@ -36,3 +38,9 @@ def test_links_of_a_guide(guide):
     links = re.findall(r"\]\(([^)#]+)\)", guide.read_text())
     files = [link for link in links if not link.startswith("http")]
     assert [link for link in files if not (guide.parent / link).exists()] == []
+
+
+def test_the_api_reference_names_what_is_exported():
+    pages = "".join(x.read_text() for x in (ROOT / ".ci/docs/pages").glob("*.md"))
+    missing = [name for name in torch_panda.__all__ if name not in pages]
+    assert missing == ["PhysicsName"]  # a type, which `make` explains

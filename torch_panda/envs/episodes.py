@@ -241,7 +241,7 @@ class Episodes(Closing):
     def open_viewer(self, camera: Camera, host: str, port: int) -> "WebViewer":
         """Serve the scene to browsers; see `RobotTaskEnv.open_viewer`."""
         if find_spec("viser") is None:
-            raise ImportError("viewers need viser: pip install 'torch_panda[viewer]'")
+            raise ImportError("viewers need viser: pip install -e '.[viewer]'")
         from torch_panda.rendering.web_viewer import WebViewer
 
         with self._guard:
