@@ -9,12 +9,15 @@ import torch_panda
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
-FOLDERS += ("examples/policies", "examples/results")
+FOLDERS += ("examples/policies", "examples/results", "torch_panda/gymnasium_envs")
 GUIDES = [ROOT / folder / "README.md" for folder in FOLDERS]
 MAX_LINES, MAX_WIDTH = 150, 120
 
 
-@pytest.mark.parametrize("guide", ["README.md", "torch_panda/README.md"])
+@pytest.mark.parametrize(
+    "guide",
+    ["README.md", "torch_panda/README.md", "torch_panda/gymnasium_envs/README.md"],
+)
 def test_snippets(guide):
     """One after the other, as a reader would type them."""
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / guide).read_text(), re.DOTALL)

@@ -110,7 +110,7 @@ def test_contacts_carry_the_cube():
         forces = web_viewer.read_forces(simulation.clients[0], simulation)
         near = abs(forces[:, 0, 2]) < 0.01  # not the hand's
         assert forces[near, 1].sum(0) == pytest.approx((0, 0, 9.81), abs=0.2)
-    long = web_scene.arrows(
+    long = web_viewer.arrows(
         np.array([[[0, 0, 0], [0, 0, 10]], [[0, 0, 0], [99, 0, 0]]])
     )
     np.testing.assert_allclose(long[:, 1], [[0, 0, 0.05], [0.12, 0, 0]])

@@ -1,7 +1,4 @@
-"""A scene in a browser: bodies and the robot's links as nodes of viser's scene tree.
-
-This module needs the extra ``viewer``.
-"""
+"""A scene in viser's scene tree, for browsers; needs the extra ``viewer``."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -18,13 +15,12 @@ from torch_panda.bullet import Box, Cylinder, PhysicsClient, Scene, Sphere, Visu
 from torch_panda.bullet.shapes import LIGHT_GREY, Shape
 from torch_panda.rendering.mesh_decimation import decimated_urdf
 
-MESH_CELL = 0.003  # [m]; meshes as coarse as this take a browser half a second
+MESH_CELL = 0.003  # how coarse meshes are [m]
 MAKES_A_BODY = ("load_urdf", "create_body", "create_marker")  # in the order of ids
 YELLOW = (255, 190, 0)
-ARROW_LENGTH = 0.005  # of a contact's force [m/N]
-LONGEST_ARROW = 0.12  # [m]
 
 Floats = npt.NDArray[np.float64]
+Joint = tuple[Any, Floats, SO3, Floats, bool]  # see WebScene._add_urdf
 
 
 class WebScene:
@@ -41,7 +37,7 @@ class WebScene:
     ) -> None:
         self._tree = server.scene
         self._tree.set_up_direction("+z")
-        self._joints: list[tuple[Any, Floats, SO3, Floats, bool]] = []
+        self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
         build = [x for x in client.blueprint if x[0] in MAKES_A_BODY]
         for body, (kind, *arguments) in enumerate(build):
@@ -72,7 +68,7 @@ class WebScene:
         joint_position: Floats,
         object_pose: Floats,
         marker_pose: Floats,
-        forces: Floats,
+        arrows: Floats,
     ) -> None:
         """Show one environment.
 
@@ -80,7 +76,7 @@ class WebScene:
             joint_position: (n_joints,) [rad] or [m].
             object_pose: (n_objects, 7), position [m] and quaternion xyzw.
             marker_pose: (n_markers, 7).
-            forces: (n, 2, 3), where they act [m], world frame, and forces [N].
+            arrows: (n, 2, 3), their starts and ends, world frame [m].
         """
         for (node, origin, rotation, axis, slides), q in zip(
             self._joints, joint_position, strict=True
@@ -98,24 +94,22 @@ class WebScene:
                     _place(node, pose)
         self._tree.add_arrows(
             "/contacts",
-            arrows(forces),
+            arrows,
             YELLOW,
             shaft_radius=0.003,
             head_radius=0.007,
             head_length=0.015,
-            visible=len(forces) > 0,
+            visible=len(arrows) > 0,
         )
 
     # ---- what is drawn -----------------------------------------------------------
 
-    def _add_urdf(
-        self, root: str, file: str, movable: list[str]
-    ) -> dict[str, tuple[Any, Floats, SO3, Floats, bool]]:
+    def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
         """Add a body's links, each below its parent: the tree does the kinematics.
 
         Returns:
-            By name of a movable joint: the link's node, the joint's origin and
-            rotation in the parent's frame, its axis, and whether it slides.
+            By joint: the link's node, the joint's origin and rotation in the parent's
+            frame, its axis, and whether it slides.
         """
         source = decimated_urdf(file, MESH_CELL)
         tree = ElementTree.parse(source)
@@ -126,7 +120,7 @@ class WebScene:
         }
         joints = {x.find("child").get("link"): x for x in tree.findall("joint")}  # type: ignore[union-attr]
         names: dict[str, str] = {}
-        handles: dict[str, tuple[Any, Floats, SO3, Floats, bool]] = {}
+        handles: dict[str, Joint] = {}
 
         def path(link: str) -> str:
             """The link's node, which is added when first asked for."""
@@ -156,15 +150,21 @@ class WebScene:
             for k, visual in enumerate(link.findall("visual")):
                 material = visual.find("material")
                 name = None if material is None else material.get("name")
-                mesh = _read_visual(visual, colors.get(name, np.ones(4)), source)
+                mesh = _read_mesh(visual, source)
                 if mesh is not None:
+                    node_name = f"{parent}/visual{k}"
                     origin, rotation = _origin(visual)
-                    self._tree.add_mesh_trimesh(
-                        f"{parent}/visual{k}",
-                        mesh,
-                        position=origin,
-                        wxyz=rotation.wxyz,
-                    )
+                    pose = {"position": origin, "wxyz": rotation.wxyz}
+                    if _has_texture(mesh):
+                        self._tree.add_mesh_trimesh(node_name, mesh, **pose)
+                    else:
+                        self._tree.add_mesh_simple(
+                            node_name,
+                            mesh.vertices,
+                            mesh.faces,
+                            color=colors.get(name, np.ones(4))[:3],
+                            **pose,
+                        )
         return handles
 
     def _add_shape(
@@ -172,7 +172,9 @@ class WebScene:
     ) -> Any:  # noqa: ANN401 (viser's handles)
         """Add a body of one shape; None: it has none."""
         if isinstance(shape, Box) and visual.texture is not None and not is_marker:
-            return self._tree.add_mesh_trimesh(name, colored_box(shape, visual.texture))
+            return self._tree.add_mesh_trimesh(
+                name, textured_box(shape, visual.texture)
+            )
         look: dict[str, Any] = {
             "color": visual.color if visual.texture is None else LIGHT_GREY,
             "opacity": visual.opacity if is_marker else None,
@@ -188,54 +190,46 @@ class WebScene:
         return None
 
 
-def arrows(forces: Floats) -> Floats:
-    """From where forces (n, 2, 3) act, along them: (n, 2, 3), start and end [m]."""
-    point, force = forces[:, 0], forces[:, 1]
-    size = np.linalg.norm(force, axis=1, keepdims=True)
-    length = np.minimum(ARROW_LENGTH * size, LONGEST_ARROW)
-    return np.stack((point, point + length * force / np.maximum(size, 1e-9)), axis=1)
-
-
-def colored_box(box: Box, texture: Path) -> trimesh.Trimesh:
-    """A box with the mean colours of a texture's six squares; see `Visual`."""
-    image = np.asarray(Image.open(texture).convert("RGB"), dtype=float)
-    rows, columns = image.shape[0] // 2, image.shape[1] // 3
-    squares = image.reshape(2, rows, 3, columns, 3).mean(axis=(1, 3))
+def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
+    """A box in the colours in the middle of a texture's six squares; see `Visual`."""
     mesh = trimesh.creation.box(extents=[2 * x for x in box.half_extents])
-    axis = np.abs(mesh.face_normals).argmax(axis=1)
-    below = (mesh.face_normals.sum(axis=1) < 0).astype(int)
     mesh.unmerge_vertices()
-    mesh.visual.face_colors = squares[below, axis].astype(np.uint8)
+    axis = np.abs(mesh.face_normals).argmax(axis=1)
+    below = mesh.face_normals.sum(axis=1) < 0
+    middle = np.stack(((axis + 0.5) / 3, np.where(below, 0.25, 0.75)), axis=1)
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=np.repeat(middle, 3, axis=0),
+        # Without reflections, metal is black.
+        material=trimesh.visual.material.PBRMaterial(
+            baseColorTexture=Image.open(texture).convert("RGB"),
+            metallicFactor=0.0,
+            roughnessFactor=0.8,
+        ),
+    )
     return mesh
 
 
-def _read_visual(
-    visual: ElementTree.Element, color: Floats, urdf: Path
-) -> trimesh.Trimesh | None:
+def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | None:
     """The shape of a visual of a URDF; None: its geometry is not one we know."""
-    geometry = visual.find("geometry/*")
-    if geometry is None:
+    if (kind := visual.find("geometry/*")) is None:
         return None
-    if geometry.tag == "mesh":
-        file = urdf.parent / str(geometry.get("filename"))
-        mesh = trimesh.load(file, force="mesh")
-        mesh.apply_scale(_numbers(geometry.get("scale"), (1, 1, 1)))
-        look = mesh.visual
-        textured = isinstance(look, trimesh.visual.TextureVisuals)
-        if textured and look.material.image is not None:
-            return mesh
-        mesh.visual = trimesh.visual.ColorVisuals(mesh)
-    elif geometry.tag == "box":
-        mesh = trimesh.creation.box(_numbers(geometry.get("size"), (1, 1, 1)))
-    elif geometry.tag == "sphere":
-        mesh = trimesh.creation.icosphere(radius=float(geometry.get("radius", 1)))
-    elif geometry.tag == "cylinder":
-        radius, length = (float(geometry.get(x, 1)) for x in ("radius", "length"))
-        mesh = trimesh.creation.cylinder(radius, length)
-    else:
-        return None
-    mesh.visual.face_colors = (255 * color).astype(np.uint8)
-    return mesh
+    match kind.tag:
+        case "mesh":
+            mesh = trimesh.load(urdf.parent / str(kind.get("filename")), force="mesh")
+            return mesh.apply_scale(_numbers(kind.get("scale"), (1, 1, 1)))
+        case "box":
+            return trimesh.creation.box(_numbers(kind.get("size"), (1, 1, 1)))
+        case "sphere":
+            return trimesh.creation.icosphere(radius=float(kind.get("radius", 1)))
+        case "cylinder":
+            radius, length = (float(kind.get(x, 1)) for x in ("radius", "length"))
+            return trimesh.creation.cylinder(radius, length)
+    return None
+
+
+def _has_texture(mesh: trimesh.Trimesh) -> bool:
+    look = mesh.visual
+    return look.kind == "texture" and look.material.image is not None
 
 
 def _origin(element: ElementTree.Element) -> tuple[Floats, SO3]:

@@ -18,6 +18,8 @@ from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.web_scene import WebScene
 
 POSITION = 3  # numbers of an object's part of a goal
+ARROW_LENGTH = 0.005  # of a contact's force [m/N]
+LONGEST_ARROW = 0.12  # [m]
 
 
 class Frame(NamedTuple):
@@ -171,7 +173,7 @@ class WebViewer(Closing):
             self._status.content = f"**{self._title}**{number}\n\n{frame.status}"
             forces = frame.forces if self._contacts.value else frame.forces[:0]
             with self._server.atomic():
-                self._scene.show(*frame[:3], forces)
+                self._scene.show(*frame[:3], arrows(forces))
 
 
 def read_forces(
@@ -187,6 +189,14 @@ def read_forces(
         if contact.body_a in rank and contact.normal_force > 0:
             found.append((contact.position_on_a, contact.force_on_a))
     return np.array(found, dtype=float).reshape(-1, 2, POSITION)
+
+
+def arrows(forces: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """From where forces (n, 2, 3) act, along them: (n, 2, 3), start and end [m]."""
+    point, force = forces[:, 0], forces[:, 1]
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    length = np.minimum(ARROW_LENGTH * size, LONGEST_ARROW)
+    return np.stack((point, point + length * force / np.maximum(size, 1e-9)), axis=1)
 
 
 def describe(step: int, state: dict[str, Tensor]) -> str:
