@@ -12,15 +12,17 @@ from typing import Any, Literal
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule
 from tqdm import tqdm
 
 import torch_panda
 from evaluate import wilson_interval
 from experts import make_expert
 from formats import Writer, load_format
-from limits import Positive, Seed, check_limits
+from limits import Positive, Seed, Weight, check_limits
 from training.files import prepare, save
 
 
@@ -38,6 +40,12 @@ class Args:
     """environments that are stepped in parallel"""
     num_threads: Positive | None = None
     """threads that step them; None means one per core"""
+    noise_eps: Weight = 0.0
+    """the standard deviation of Gaussian noise on the actions that are executed; saved
+    are the actions without it, so that who imitates them learns to correct himself
+    (DART, arXiv 1703.09327)"""
+    successful: bool = False
+    """save only the episodes that succeed at the end"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
     """a file of a nested dict of tensors of shape (steps, ...), or a data set"""
     out: Path | None = None
@@ -72,11 +80,22 @@ class TensorWriter:
         return str(self.path)
 
 
+def disturb(
+    expert: TensorDictModule, env: torch_panda.RobotTaskEnv, noise_eps: float
+) -> TensorDictModuleBase:
+    """The expert with noise on its ``action``, which is kept as ``intended``."""
+    keep = TensorDictModule(torch.clone, ["action"], ["intended"])
+    noise = AdditiveGaussianModule(
+        env.action_spec, sigma_init=noise_eps, sigma_end=noise_eps
+    )
+    return TensorDictSequential(expert, keep, noise)
+
+
 def play(
-    env: torch_panda.RobotTaskEnv, expert: TensorDictModule
+    env: torch_panda.RobotTaskEnv, expert: TensorDictModuleBase
 ) -> list[TensorDictBase]:
     """One fresh episode of every environment, each with its transitions (steps,)."""
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         rollout = env.rollout(
             env.max_episode_steps,
             expert,
@@ -134,7 +153,9 @@ def main(args: Args) -> None:
     """Run the episodes, print the success rates, save the transitions."""
     try:
         check_limits(args)
-        expert = make_expert(args.env_id)
+        expert: TensorDictModuleBase = make_expert(args.env_id)
+        if args.noise_eps and args.format == "minari":
+            raise ValueError("minari's episodes hold what was executed: no noise_eps")
         pictures: dict[str, Any] = {}
         if args.format == "lerobot":
             pictures = {"from_pixels": True, "render_size": args.image_size}
@@ -148,6 +169,7 @@ def main(args: Args) -> None:
         writer = open_writer(args, env)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
+    expert = disturb(expert, env, args.noise_eps)
     success: list[Tensor] = []
     steps = 0
     try:
@@ -159,13 +181,17 @@ def main(args: Args) -> None:
                         env.set_env_seed(index, args.seed + first + index)
                 new = play(env, expert)[: args.episodes - first]
                 for index, episode in enumerate(new, first):
-                    if writer is not None:
-                        writer.add(episode, args.seed + index)
                     success.append(episode["next", "success"])
-                    steps += len(episode)
+                    is_wanted = bool(success[-1][-1]) or not args.successful
+                    if writer is not None and is_wanted:
+                        episode["action"] = episode.pop("intended")
+                        writer.add(episode, args.seed + index)
+                        steps += len(episode)
                 bar.update(len(new))
         print_success(args.env_id, success)
         if writer is not None:
+            if not steps:
+                raise SystemExit("no episode succeeded: nothing was saved")
             print(f"{steps} transitions in {writer.close()}")
     except KeyboardInterrupt:
         raise SystemExit("stopped") from None

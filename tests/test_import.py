@@ -14,7 +14,7 @@ PACKAGE = Path(torch_panda.__file__).parent
 ROOMS = (
     ("closing",),
     ("bullet",),
-    ("rendering", "robots", "tasks"),
+    ("rendering", "robots", "tasks", "randomization"),
     ("sensors",),
     ("envs",),
     ("versions",),

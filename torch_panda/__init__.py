@@ -2,14 +2,16 @@
 
 from torch_panda.bullet import BulletError, PhysicsName, PhysicsParams, WorkerError
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.randomization import Randomization
 from torch_panda.registry import (
     ENV_IDS,
     make,
     max_episode_steps,
+    register,
     register_with_gymnasium,
 )
-from torch_panda.rendering import Camera
-from torch_panda.robots import Panda, Robot
+from torch_panda.rendering import Camera, HandCamera
+from torch_panda.robots import Gripper, Kuka, Panda, Robot, XArm6, XArm6Gripper
 from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
     Flip,
@@ -28,11 +30,15 @@ __all__ = [
     "CameraSensor",
     "Flip",
     "ForceSensor",
+    "Gripper",
+    "HandCamera",
+    "Kuka",
     "Panda",
     "PhysicsName",
     "PhysicsParams",
     "PickAndPlace",
     "Push",
+    "Randomization",
     "Reach",
     "Robot",
     "RobotTaskEnv",
@@ -41,8 +47,11 @@ __all__ = [
     "Stack",
     "Task",
     "WorkerError",
+    "XArm6",
+    "XArm6Gripper",
     "make",
     "max_episode_steps",
+    "register",
 ]
 
 # So that `gymnasium.register_envs(torch_panda)` reads as for any other package.

@@ -1,7 +1,7 @@
 """Demonstrations as data sets that other tools read, and back as our transitions.
 
-In these formats episode k is the one that ``reset(seed=seed + k)`` starts, of
-`torch_panda.gymnasium_envs.GoalEnv`.
+In these formats each episode has its seed: ``reset(seed=...)`` of
+`torch_panda.gymnasium_envs.GoalEnv` starts it again.
 """
 
 from importlib import import_module

@@ -49,6 +49,7 @@ FILTER_DYNAMIC = (1, -1)
 FILTER_STATIC = (2, -1 ^ 2)
 
 # enum for b3JointControlCommandInit2
+CONTROL_MODE_TORQUE = 1
 CONTROL_MODE_POSITION_VELOCITY_PD = 2
 
 # enum JointFeedbackMode
@@ -229,6 +230,27 @@ body_set_base = bind(
     _doubles,  # inertial frame orientation
 )
 dynamics_init = bind(_cheap, "b3InitChangeDynamicsInfo", _command, _client)
+dynamics_set_mass = bind(
+    _cheap, "b3ChangeDynamicsInfoSetMass", c_int, _command, c_int, c_int, c_double
+)
+dynamics_set_restitution = bind(
+    _cheap,
+    "b3ChangeDynamicsInfoSetRestitution",
+    c_int,
+    _command,
+    c_int,
+    c_int,
+    c_double,
+)
+dynamics_set_joint_damping = bind(
+    _cheap,
+    "b3ChangeDynamicsInfoSetJointDamping",
+    c_int,
+    _command,
+    c_int,
+    c_int,
+    c_double,
+)
 dynamics_set_lateral_friction = bind(
     _cheap,
     "b3ChangeDynamicsInfoSetLateralFriction",
@@ -325,6 +347,12 @@ load_set_snapshot = bind(_cheap, "b3LoadStateSetStateId", c_int, _command, c_int
 motor_init = bind(_cheap, "b3JointControlCommandInit2", _command, _client, c_int, c_int)
 motor_set_position = bind(
     _cheap, "b3JointControlSetDesiredPosition", c_int, _command, c_int, c_double
+)
+motor_set_velocity = bind(
+    _cheap, "b3JointControlSetDesiredVelocity", c_int, _command, c_int, c_double
+)
+motor_set_torque = bind(
+    _cheap, "b3JointControlSetDesiredForceTorque", c_int, _command, c_int, c_double
 )
 motor_set_kp = bind(_cheap, "b3JointControlSetKp", c_int, _command, c_int, c_double)
 motor_set_kd = bind(_cheap, "b3JointControlSetKd", c_int, _command, c_int, c_double)
@@ -451,6 +479,15 @@ view_matrix = bind(
     c_float,  # pitch
     c_float,  # roll
     c_int,  # up axis
+    _floats,
+)
+view_matrix_from_positions = bind(
+    _cheap,
+    "b3ComputeViewMatrixFromPositions",
+    None,
+    _floats,  # eye
+    _floats,  # target
+    _floats,  # up
     _floats,
 )
 projection_matrix = bind(

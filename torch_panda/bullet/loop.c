@@ -25,7 +25,8 @@ enum {
     STEP_FORWARD_SIMULATION_COMPLETED = 26,
     CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43,
 
-    POSITION_VELOCITY_PD = 2,     /* enum for b3JointControlCommandInit2 */
+    TORQUE = 1,                   /* enum for b3JointControlCommandInit2 */
+    POSITION_VELOCITY_PD = 2,
     MAX_DEGREES_OF_FREEDOM = 128, /* of a body */
     Q_OFFSET = 7,                 /* joints follow the base: 7 of its pose, */
     U_OFFSET = 6,                 /* 6 of its velocity */
@@ -44,6 +45,8 @@ struct functions {
     int (*ik_result)(handle status, int *body, int *count, double *positions);
     handle (*motor_init)(handle client, int body, int mode);
     int (*motor_set_position)(handle command, int q_index, double position);
+    int (*motor_set_velocity)(handle command, int u_index, double velocity);
+    int (*motor_set_torque)(handle command, int u_index, double torque);
     int (*motor_set_kp)(handle command, int u_index, double gain);
     int (*motor_set_kd)(handle command, int u_index, double gain);
     int (*motor_set_force)(handle command, int u_index, double force);
@@ -63,13 +66,17 @@ struct client {
 };
 
 struct scene { /* the same in every client */
-    int robot, ee_link, num_joints, num_objects, num_substeps;
-    const int *objects; /* body ids */
+    int robot, ee_link, num_joints, num_objects, num_object_joints, num_substeps;
+    const int *objects;       /* body ids */
+    const int *object_joints; /* how many each object has */
 };
 
-struct control { /* PositionControl of control.py */
+enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
+struct control { /* MotorControl of control.py */
     int ik_link; /* whose position setpoints give; -1: they are of all joints */
     int num_arm_joints, setpoint_size;
+    int turns;    /* whether they give its orientation, too */
+    int arm_mode; /* of the arm's joints */
     double orientation[4], position_gain, velocity_gain;
     doubles forces; /* one a joint */
 };
@@ -119,12 +126,14 @@ static int find_joints(struct loop *loop, int env, double *joints) {
         return 1;
     }
     handle command = bullet->ik_init(loop->clients[env]->handle, loop->scene->robot);
-    bullet->ik_set_target(command, control->ik_link, setpoint, control->orientation);
+    bullet->ik_set_target(command, control->ik_link, setpoint,
+                          control->turns ? setpoint + 3 : control->orientation);
     handle status = submit(loop, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED);
     if (!status) return 0;
     int body, count;
     bullet->ik_result(status, &body, &count, joints);
-    memcpy(joints + arm, setpoint + 3, (num_joints - arm) * sizeof *joints);
+    setpoint += control->turns ? 7 : 3;
+    memcpy(joints + arm, setpoint, (num_joints - arm) * sizeof *joints);
     return 1;
 }
 
@@ -134,21 +143,45 @@ static int set_motors(struct loop *loop, int env, doubles joints) {
     handle client = loop->clients[env]->handle;
     int robot = loop->scene->robot, num_joints = loop->scene->num_joints;
     handle command = bullet->motor_init(client, robot, POSITION_VELOCITY_PD);
+    int arm = control->num_arm_joints, mode = control->arm_mode;
     for (int k = 0; k < num_joints; k++) {
-        bullet->motor_set_position(command, Q_OFFSET + k, joints[k]);
-        bullet->motor_set_kp(command, U_OFFSET + k, control->position_gain);
+        int joint_mode = k < arm ? mode : POSITIONS, has_torque = joint_mode == TORQUES;
+        if (joint_mode == POSITIONS) {
+            bullet->motor_set_position(command, Q_OFFSET + k, joints[k]);
+            bullet->motor_set_kp(command, U_OFFSET + k, control->position_gain);
+        } else {
+            double velocity = has_torque ? 0 : joints[k];
+            bullet->motor_set_velocity(command, U_OFFSET + k, velocity);
+            bullet->motor_set_kp(command, U_OFFSET + k, 0);
+        }
         bullet->motor_set_kd(command, U_OFFSET + k, control->velocity_gain);
-        bullet->motor_set_force(command, U_OFFSET + k, control->forces[k]);
+        /* Where torques are applied, motors must not brake. */
+        bullet->motor_set_force(command, U_OFFSET + k,
+                                has_torque ? 0 : control->forces[k]);
     }
     return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
 }
 
-static int advance(struct loop *loop, int env) {
+static int apply_torques(struct loop *loop, int env, doubles torques) {
+    const struct functions *bullet = loop->bullet;
+    handle client = loop->clients[env]->handle;
+    handle command = bullet->motor_init(client, loop->scene->robot, TORQUE);
+    for (int k = 0; k < loop->control->num_arm_joints; k++)
+        bullet->motor_set_torque(command, U_OFFSET + k, torques[k]);
+    return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
+}
+
+static int advance(struct loop *loop, int env, doubles joints) {
     struct client *client = loop->clients[env];
+    int has_torques = loop->control->arm_mode == TORQUES;
     /* A client has one command buffer, and stepping leaves it as it was. */
     handle command = loop->bullet->step_init(client->handle);
     for (int k = 0; k < loop->scene->num_substeps; k++) {
         client->num_detections++;
+        if (has_torques) { /* which Bullet forgets when it has stepped */
+            if (!apply_torques(loop, env, joints)) return 0;
+            command = loop->bullet->step_init(client->handle);
+        }
         if (!submit(loop, env, command, STEP_FORWARD_SIMULATION_COMPLETED)) return 0;
     }
     return 1;
@@ -174,22 +207,29 @@ static double *copy(double *to, doubles from, int count) {
     return to + count;
 }
 
-/* Fill a client's row: joint positions and velocities, position and velocity of the
-   end-effector, poses (7 each) and then velocities (6 each) of the objects. */
+/* Fill a client's row: joint positions and velocities, position, velocity and
+   orientation of the end-effector; poses (7 each), then velocities (6 each) of the
+   objects, then positions and velocities of their joints. */
 static int read_state(struct loop *loop, int env) {
     const struct scene *scene = loop->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
-    double *row = loop->state + (size_t)env * (2 * n + 6 + 13 * num_objects);
+    int num_object_joints = scene->num_object_joints;
+    int size = 2 * n + 10 + 13 * num_objects + 2 * num_object_joints;
+    double *row = loop->state + (size_t)env * size;
     struct body_state body;
     if (!ask_state(loop, env, scene->robot, &body)) return 0;
     row = copy(row, body.q + Q_OFFSET, n);
     row = copy(row, body.u + U_OFFSET, n);
     row = copy(row, body.link_poses + 7 * scene->ee_link, 3);
     row = copy(row, body.link_velocities + 6 * scene->ee_link, 3);
+    row = copy(row, body.link_poses + 7 * scene->ee_link + 3, 4);
+    double *joints = row + 13 * num_objects;
     for (int k = 0; k < num_objects; k++) {
         if (!ask_state(loop, env, scene->objects[k], &body)) return 0;
         copy(row + 7 * k, body.q, 7);
         copy(row + 7 * num_objects + 6 * k, body.u, 6);
+        copy(joints + num_object_joints, body.u + U_OFFSET, scene->object_joints[k]);
+        joints = copy(joints, body.q + Q_OFFSET, scene->object_joints[k]);
     }
     return 1;
 }
@@ -199,7 +239,7 @@ static int step_client(struct loop *loop, int env) {
     int is_closed = loop->clients[env]->handle == NULL;
     loop->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0};
     return !is_closed && find_joints(loop, env, joints) &&
-           set_motors(loop, env, joints) && advance(loop, env) && read_state(loop, env);
+           set_motors(loop, env, joints) && advance(loop, env, joints) && read_state(loop, env);
 }
 
 /* ---- threads --------------------------------------------------------------------- */

@@ -10,7 +10,7 @@ from torch_panda.bullet import capi, native
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
 from torch_panda.bullet.connection import BulletError, client_closed, refusal
-from torch_panda.bullet.control import PositionControl
+from torch_panda.bullet.control import MotorControl
 from torch_panda.bullet.physics import PhysicsParams
 from torch_panda.bullet.pool import WorkerError
 from torch_panda.bullet.scene import Scene
@@ -31,8 +31,7 @@ class NativeLoop:
         clients: the clients, which `replace` may replace.
         scene: what they hold.
         state: (num_envs, k) float64 and contiguous, which every step overwrites: of
-            each client the robot's joint positions, joint velocities, the position
-            and the velocity of its end-effector, and the objects' poses and velocities.
+            each client what `VectorSimulation` names, in that order.
         physics: how they integrate.
         num_threads: threads that step them, the caller's among them.
     """
@@ -53,19 +52,23 @@ class NativeLoop:
         self._num_threads = num_threads
         self._bullet = native.bullet_functions()
         self._objects = (c_int * len(scene.objects))(*scene.objects)
+        counts = [len(joints) for joints in scene.object_joints]
+        self._object_joints = (c_int * len(counts))(*counts)
         self._scene = native.Scene(
             scene.robot,
             scene.ee_link,
             len(scene.joints),
             len(scene.objects),
+            sum(counts),
             physics.n_substeps,
             self._objects,
+            self._object_joints,
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
         self._failures = (native.Failure * n)()
         self._all = (c_int * n)(*range(n))
-        self._described: PositionControl | None = None  # by _control
+        self._described: MotorControl | None = None  # by _control
         self._control = native.Control()
         self._loop: int | None = None
         self._process = os.getpid()
@@ -78,7 +81,7 @@ class NativeLoop:
 
     def step(
         self,
-        control: PositionControl,
+        control: MotorControl,
         setpoint: Doubles,
         envs: Sequence[int] | None = None,
     ) -> None:
@@ -128,12 +131,14 @@ class NativeLoop:
         if self._loop is None:
             raise MemoryError
 
-    def _describe(self, control: PositionControl) -> None:
+    def _describe(self, control: MotorControl) -> None:
         self._control = native.Control(
             -1 if control.ik_link is None else control.ik_link,
             control.num_arm_joints,
             control.setpoint_dim,
-            control.ik_orientation,
+            control.ik_orientation is None,
+            native.ARM_MODES[control.arm_mode],
+            control.ik_orientation or (),
             self._physics.position_gain,
             VELOCITY_GAIN,
             (c_double * len(control.forces))(*control.forces),

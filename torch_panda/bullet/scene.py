@@ -12,6 +12,7 @@ class Scene:
         joints: indices of its movable joints.
         ee_link: its link whose centre of mass is the end-effector.
         objects: body ids of the movable objects.
+        object_joints: of each object the indices of its movable joints.
         markers: body ids of the markers that show where the objects should go.
     """
 
@@ -19,4 +20,5 @@ class Scene:
     joints: tuple[int, ...]
     ee_link: int
     objects: tuple[int, ...] = ()
+    object_joints: tuple[tuple[int, ...], ...] = ()
     markers: tuple[int, ...] = ()

@@ -10,7 +10,12 @@ from torch_panda.bullet import capi
 from torch_panda.bullet.checks import check_not_negative, check_quaternion
 from torch_panda.bullet.connection import Connection, doubles
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
-from torch_panda.bullet.urdf import check_collision_filters, find_urdf
+from torch_panda.bullet.urdf import (
+    Tool,
+    check_collision_filters,
+    find_urdf,
+    urdf_with_tool,
+)
 
 ORIGIN = (0.0, 0.0, 0.0)
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -30,6 +35,17 @@ class Joint:
     name: str
     link_name: str
     is_movable: bool
+    damping: float
+
+
+# What sets the arguments of `SceneClient.set_dynamics`.
+_DYNAMICS = {
+    "mass": capi.dynamics_set_mass,
+    "lateral_friction": capi.dynamics_set_lateral_friction,
+    "spinning_friction": capi.dynamics_set_spinning_friction,
+    "restitution": capi.dynamics_set_restitution,
+    "joint_damping": capi.dynamics_set_joint_damping,
+}
 
 
 class SceneClient(Connection):
@@ -68,6 +84,7 @@ class SceneClient(Connection):
         position: Sequence[float] = ORIGIN,
         orientation: Sequence[float] = NO_ROTATION,
         fixed_base: bool = False,
+        tool: Tool | None = None,
     ) -> int:
         """Load a URDF, here without its visual shapes, and return its body id.
 
@@ -76,6 +93,7 @@ class SceneClient(Connection):
             position: of the base, world frame [m].
             orientation: of the base, quaternion xyzw.
             fixed_base: whether the base cannot move.
+            tool: a link to be added.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -84,6 +102,8 @@ class SceneClient(Connection):
             BulletError: Bullet cannot read it.
         """
         file = find_urdf(path)
+        if tool is not None:
+            file = urdf_with_tool(file, tool)
         check_collision_filters(file)
         check_quaternion("orientation", orientation)
         pose = tuple(map(float, (*position, *orientation)))
@@ -171,14 +191,72 @@ class SceneClient(Connection):
         Raises:
             ValueError: one is negative or not finite.
         """
-        check_not_negative(lateral_friction=lateral, spinning_friction=spinning)
-        self._note("set_friction", body, link, lateral, spinning)
+        self.set_dynamics(
+            body, link, lateral_friction=lateral, spinning_friction=spinning
+        )
+
+    def set_dynamics(
+        self,
+        body: int,
+        link: int = -1,
+        *,
+        mass: float | None = None,
+        lateral_friction: float | None = None,
+        spinning_friction: float | None = None,
+        restitution: float | None = None,
+        joint_damping: float | None = None,
+    ) -> None:
+        """Change how a link (-1 is the base) moves; None leaves a number as it is.
+
+        Args:
+            body: the body.
+            link: the link.
+            mass: [kg]; the inertia of a body's base follows it.
+            lateral_friction: Bullet multiplies those of two bodies that touch.
+            spinning_friction: about the normal of a contact.
+            restitution: 1 bounces back as fast; multiplied, too.
+            joint_damping: of the link's joint [N m s/rad] or [N s/m].
+
+        Raises:
+            ValueError: a number is negative or not finite.
+        """
+        changes = {
+            "mass": mass,
+            "lateral_friction": lateral_friction,
+            "spinning_friction": spinning_friction,
+            "restitution": restitution,
+            "joint_damping": joint_damping,
+        }
+        check_not_negative(**changes)
+        self._note("set_dynamics", body, link, *changes.values())
         command = capi.dynamics_init(self._open())
-        if lateral is not None:
-            capi.dynamics_set_lateral_friction(command, body, link, lateral)
-        if spinning is not None:
-            capi.dynamics_set_spinning_friction(command, body, link, spinning)
-        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set friction")
+        for name, value in changes.items():
+            if value is not None:
+                _DYNAMICS[name](command, body, link, value)
+        # Bullet only takes notes: done before another thread could use the GIL.
+        status = capi.submit_quick(self._open(), command)
+        self._check(status, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics")
+
+    def set_joint_friction(self, body: int, joint: int, force: float) -> None:
+        """Let a joint that nothing drives resist motion, by up to a force [N or N m].
+
+        Bullet gives a joint about 1 N of it unless told otherwise.
+
+        Raises:
+            ValueError: the force is negative or not finite.
+        """
+        check_not_negative(force=force)
+        self._note("set_joint_friction", body, joint, force)
+        info = capi.JointInfo()
+        capi.joint_info(self._open(), body, joint, byref(info))
+        command = capi.motor_init(
+            self._open(), body, capi.CONTROL_MODE_POSITION_VELOCITY_PD
+        )
+        capi.motor_set_velocity(command, info.u_index, 0.0)
+        capi.motor_set_kp(command, info.u_index, 0.0)
+        capi.motor_set_kd(command, info.u_index, 1.0)
+        capi.motor_set_force(command, info.u_index, force)
+        self._submit(command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "set a motor")
 
     def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
         """Choose what a link (-1 is the base) touches, and forget what it touched.
@@ -196,6 +274,14 @@ class SceneClient(Connection):
     def mass(self, body: int, link: int = -1) -> float:
         """Mass of a link (-1 is the base) [kg]; 0 for a base that cannot move."""
         return float(self._dynamics(body, link).mass)
+
+    def friction(self, body: int, link: int = -1) -> float:
+        """Lateral friction of a link (-1 is the base)."""
+        return float(self._dynamics(body, link).lateral_friction)
+
+    def restitution(self, body: int, link: int = -1) -> float:
+        """Restitution of a link (-1 is the base)."""
+        return float(self._dynamics(body, link).restitution)
 
     def centre_of_mass(self, body: int, link: int = -1) -> tuple[float, ...]:
         """Centre of mass of a link (-1 is the base) in the frame of its URDF [m]."""
@@ -218,7 +304,8 @@ class SceneClient(Connection):
         for index in range(capi.joint_count(handle, body)):
             capi.joint_info(handle, body, index, byref(info))
             name, link = info.joint_name.decode(), info.link_name.decode()
-            joints.append(Joint(index, name, link, info.u_size == 1))
+            is_movable = info.u_size == 1
+            joints.append(Joint(index, name, link, is_movable, info.damping))
         return joints
 
     def enable_wrench_sensor(self, body: int, joint: int) -> None:

@@ -12,7 +12,7 @@ from torch_panda.bullet.broad_phase import BroadPhase
 from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
-from torch_panda.bullet.control import Control, PositionControl
+from torch_panda.bullet.control import Control, MotorControl
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
@@ -39,8 +39,12 @@ class VectorSimulation:
         joint_velocity: (num_envs, n_joints) [rad/s] or [m/s].
         ee_position: (num_envs, 3) [m].
         ee_velocity: (num_envs, 3) [m/s].
+        ee_orientation: (num_envs, 4), quaternion xyzw.
         object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
+        object_joint_position: (num_envs, n_object_joints) [rad] or [m], of all joints
+            of the first object, then of the next.
+        object_joint_velocity: (num_envs, n_object_joints) [rad/s] or [m/s].
         marker_pose: (num_envs, n_markers, 7), where `reset` puts the markers.
 
     Raises:
@@ -142,7 +146,7 @@ class VectorSimulation:
             ValueError: ``control`` needs another ``setpoint``, or another robot.
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
-        if isinstance(control, PositionControl):
+        if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
                 self._pool.wait()  # after a second Ctrl-C, its threads may be at work
@@ -152,7 +156,12 @@ class VectorSimulation:
         def step_one(env: int) -> None:
             client = self._clients[env]
             control(client, self.scene.robot, setpoint[env])
-            client.step(self.n_substeps)
+            if isinstance(control, MotorControl):
+                control.advance(
+                    client, self.scene.robot, setpoint[env], self.n_substeps
+                )
+            else:
+                client.step(self.n_substeps)
             self._read(env)
 
         self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
@@ -165,16 +174,27 @@ class VectorSimulation:
         """
         self._pool.run(work, envs)
 
-    def reset(self, envs: Sequence[int]) -> None:
+    def reset(self, envs: Sequence[int], vary: Work | None = None) -> None:
         """Start an episode from what the state tensors hold for these clients.
 
         Bullet remembers more than the state. `BroadPhase` makes it forget, so that what
         follows depends on the start state and the actions alone.
 
+        Args:
+            envs: which clients.
+            vary: is called with each of them first, in the thread that resets it, to
+                change its physics.
+
         Raises:
-            WorkerError: Bullet failed in one client; it names the client.
+            WorkerError: Bullet or ``vary`` failed in one client; it names the client.
         """
-        self._pool.run(self._reset_one, envs)
+
+        def reset_one(env: int) -> None:
+            if vary is not None:
+                vary(env)
+            self._reset_one(env)
+
+        self._pool.run(reset_one, envs)
 
     def diverged(self) -> list[int]:
         """The clients whose state is not finite."""
@@ -220,7 +240,16 @@ class VectorSimulation:
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
 
-        sizes = (n_joints, n_joints, 3, 3, 7 * n_objects, 6 * n_objects)
+        # Objects that have joints: their ids, joints, and where in the tensors.
+        self._jointed_objects: list[tuple[int, tuple[int, ...], slice]] = []
+        n_more = 0
+        for body, joints in zip(scene.objects, scene.object_joints, strict=True):
+            if joints:
+                own = slice(n_more, n_more + len(joints))
+                self._jointed_objects.append((body, joints, own))
+                n_more += len(joints)
+        arm = (n_joints, n_joints, 3, 3, 4)
+        sizes = (*arm, 7 * n_objects, 6 * n_objects, n_more, n_more)
         # In one tensor, which one check finds finite or not.
         self._state = zeros(sum(sizes))
         (
@@ -228,8 +257,11 @@ class VectorSimulation:
             self.joint_velocity,
             self.ee_position,
             self.ee_velocity,
+            self.ee_orientation,
             object_pose,
             object_velocity,
+            self.object_joint_position,
+            self.object_joint_velocity,
         ) = self._state.split(sizes, dim=1)
         self.object_pose = object_pose.unflatten(1, (n_objects, 7))
         self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
@@ -255,18 +287,30 @@ class VectorSimulation:
         velocities = self.object_velocity[env].tolist()
         for body, pose, velocity in zip(scene.objects, poses, velocities, strict=True):
             client.set_base(body, pose[:3], pose[3:], velocity[:3], velocity[3:])
+        positions = self.object_joint_position[env].tolist()
+        velocities = self.object_joint_velocity[env].tolist()
+        for body, joints, own in self._jointed_objects:
+            client.set_joints(body, joints, positions[own], velocities[own])
         self._read(env)
 
     def _read(self, env: int) -> None:
         """Copy the state of one client into the tensors."""
         client, scene = self._clients[env], self.scene
-        joints, speeds, ee_position, ee_velocity, poses, velocities = self._rows[env]
+        joints, speeds, ee_position, ee_velocity, ee_orientation, *objects = self._rows[
+            env
+        ]
+        poses, velocities, object_joints, object_speeds = objects
         state = client.state(scene.robot, link_velocities=True)
         joints[:] = state.joint_positions
         speeds[:] = state.joint_velocities
-        ee_position[:] = state.link_pose(scene.ee_link)[:3]
+        pose = state.link_pose(scene.ee_link)
+        ee_position[:], ee_orientation[:] = pose[:3], pose[3:]
         ee_velocity[:] = state.link_velocity(scene.ee_link)[:3]
         for k, body in enumerate(scene.objects):
             state = client.state(body)
             poses[7 * k : 7 * k + 7] = state.base_pose
             velocities[6 * k : 6 * k + 6] = state.base_velocity
+        for body, _, own in self._jointed_objects:
+            state = client.state(body)
+            object_joints[own] = state.joint_positions
+            object_speeds[own] = state.joint_velocities

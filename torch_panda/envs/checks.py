@@ -74,18 +74,25 @@ def check_functions(
         (task, "observation", task.observation_dim),
         (task, "achieved_goal", task.goal_dim),
     ):
-        _check(owner, name, getattr(owner, name)(simulation), (n, size))
+        check_result(owner, name, getattr(owner, name)(simulation), (n, size))
     goals = task.achieved_goal(simulation).float(), goal.float()
-    _check(task, "compute_reward", task.compute_reward(*goals), (n, 1))
-    success = task.is_success(*goals)
-    _check(task, "is_success", success, (n, 1))
-    if success.dtype != torch.bool:
-        raise ValueError(
-            f"{type(task).__name__}.is_success must return bool, got {success.dtype}"
-        )
+    check_result(task, "compute_reward", task.compute_reward(*goals), (n, 1))
+    check_result(task, "is_success", task.is_success(*goals), (n, 1), torch.bool)
 
 
-def _check(owner: object, name: str, value: object, shape: tuple[int, ...]) -> None:
+def check_result(
+    owner: object,
+    name: str,
+    value: object,
+    shape: tuple[int, ...],
+    dtype: torch.dtype | None = None,
+) -> None:
+    """Make sure that a function of a robot or task gives such a tensor.
+
+    Raises:
+        ValueError: it has another shape or dtype.
+        TypeError: it is no tensor.
+    """
     function = f"{type(owner).__name__}.{name}"
     if not isinstance(value, Tensor):
         raise TypeError(f"{function} must return a tensor, got {value!r}")
@@ -93,3 +100,6 @@ def _check(owner: object, name: str, value: object, shape: tuple[int, ...]) -> N
         raise ValueError(
             f"{function} must return shape {shape}, got {tuple(value.shape)}"
         )
+    if dtype is not None and value.dtype != dtype:
+        kind = str(dtype).removeprefix("torch.")
+        raise ValueError(f"{function} must return {kind}, got {value.dtype}")

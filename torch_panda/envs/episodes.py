@@ -19,10 +19,13 @@ from torch_panda.closing import Closing
 from torch_panda.envs.action import read_action
 from torch_panda.envs.checks import check_functions, check_kinds, check_positive
 from torch_panda.envs.history import History
+from torch_panda.envs.hooks import TaskHooks
 from torch_panda.envs.scene import TaskScene
 from torch_panda.envs.seeds import EpisodeSeeds, integer
 from torch_panda.envs.start import draw_start
 from torch_panda.envs.state import GivenState, check_rotations, read_state
+from torch_panda.envs.variation import Variation
+from torch_panda.randomization import Randomization
 from torch_panda.rendering import (
     Camera,
     RendererName,
@@ -32,7 +35,7 @@ from torch_panda.rendering import (
     segmentation_ids,
 )
 from torch_panda.robots import Robot
-from torch_panda.sensors import Sensor, join_entries, read_sensors
+from torch_panda.sensors import Observer, Sensor, join_entries, read_sensors
 from torch_panda.tasks import Task
 
 if TYPE_CHECKING:  # needs an extra
@@ -67,8 +70,11 @@ class Episodes(Closing):
         sensors: Sequence[Sensor | str] = (),
         renderer: RendererName = "tiny",
         on_divergence: OnDivergence = "raise",
+        randomize: Randomization | None = None,
     ) -> None:
         check_kinds(robot, task)
+        if not isinstance(randomize, Randomization | None):
+            raise TypeError(f"randomize must be a Randomization, got {randomize!r}")
         check_positive(
             num_envs=num_envs,
             num_threads=num_threads,
@@ -108,7 +114,18 @@ class Episodes(Closing):
                 sensor.attach(self.simulation, self._renderer, robot)
                 for sensor in sensors
             ]
-            self.sensed = join_entries(self._readings)
+            self._hooks = TaskHooks(task, self.simulation, robot.action_dim)
+            self._variation = Variation(
+                randomize,
+                robot,
+                task,
+                self.simulation,
+                self.physics,
+                has_hook=self._hooks.randomizes,
+            )
+            observers: list[Observer] = [*self._readings, self._hooks, self._variation]
+            self.entries = join_entries(observers)
+            self._observers = [each for each in observers if each.entries]
             self._history = History(self._state(), robot.action_dim)
         except BaseException:
             self.simulation.close()
@@ -203,9 +220,11 @@ class Episodes(Closing):
             for reading in self._readings:
                 reading.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe()
-            reward = self.task.compute_reward(
-                observed["achieved_goal"], observed["desired_goal"]
-            ).float()
+            goals = observed["achieved_goal"], observed["desired_goal"]
+            if self._hooks.reward is None:
+                reward = self.task.compute_reward(*goals).float()
+            else:
+                reward = self._hooks.reward(action, *goals).float()
             observed["reward"] = reward if stepped is None else reward * stepped
             return observed
 
@@ -269,14 +288,19 @@ class Episodes(Closing):
     def _state(self) -> dict[str, Tensor]:
         """The tensors that hold the physical state, (n, ...); not copies."""
         simulation = self.simulation
-        return {
+        state = {
             "joint_position": simulation.joint_position,
             "joint_velocity": simulation.joint_velocity,
             "object_pose": simulation.object_pose,
             "object_velocity": simulation.object_velocity,
             "desired_goal": self._goal,
             "step_count": self._step_count,
+            **self._variation.state,
         }
+        if any(simulation.scene.object_joints):
+            state["object_joint_position"] = simulation.object_joint_position
+            state["object_joint_velocity"] = simulation.object_joint_velocity
+        return state
 
     def _watched(self) -> Observed:
         """What a viewer says of the environments as they are, (n, ...)."""
@@ -296,6 +320,8 @@ class Episodes(Closing):
         self._step_count[env] = 0
         rng = self.seeds.next_generator(env)
         draw_start(env, rng, self.robot, self.task, self.simulation, self._goal)
+        if self._variation.is_on:
+            self._variation.draw(env, self.seeds.physics_seed(env))
 
     def _place(self, envs: list[int]) -> None:
         """Put robots, objects and markers where the state tensors say."""
@@ -305,7 +331,8 @@ class Episodes(Closing):
             check_rotations("desired_goal", pose, envs)
             simulation.marker_pose[envs] = pose
         self._history.begin(envs, self._state())
-        simulation.reset(envs)
+        varies = self._variation.changes_physics
+        simulation.reset(envs, self._variation.apply if varies else None)
         for reading in self._readings:
             reading.after_reset(envs)
 
@@ -351,9 +378,11 @@ class Episodes(Closing):
         started = self._step_count > 0
         truncated = self._step_count >= self.max_episode_steps
         terminated = success & started & self.terminate_on_success
+        if self._hooks.failure is not None:
+            terminated = terminated | self._hooks.failure() & started
         observed: Observed = {}
-        for reading in self._readings:
-            observed |= reading.observe()
+        for observer in self._observers:
+            observed |= observer.observe()
         return {
             **observed,
             "observation": observation.float(),

@@ -16,6 +16,7 @@ from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
 from torch_panda.envs.persistence import PersistentEnv
 from torch_panda.envs.specs import Specs
 from torch_panda.envs.state import EXACT_KEYS, means_state
+from torch_panda.randomization import Randomization
 from torch_panda.rendering import Camera, RendererName, Window
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -64,6 +65,7 @@ class RobotTaskEnv(PersistentEnv, Closing):
         on_divergence: what happens when a step leaves an environment in a state that is
             not finite. It is put at the start of its next episode; then "raise" raises
             `BulletError`, while "reset" lets the step end there, ``truncated``.
+        randomize: physics that are drawn for every episode; None: they are the task's.
 
     Raises:
         ValueError: an argument is out of range.
@@ -93,6 +95,7 @@ class RobotTaskEnv(PersistentEnv, Closing):
         observe_state: bool = True,
         renderer: RendererName = "tiny",
         on_divergence: OnDivergence = "raise",
+        randomize: Randomization | None = None,
     ) -> None:
         device = check_device(device)
         episodes = Episodes(
@@ -107,6 +110,7 @@ class RobotTaskEnv(PersistentEnv, Closing):
             sensors=sensors,
             renderer=renderer,
             on_divergence=on_divergence,
+            randomize=randomize,
         )
         super().__init__(device=device, batch_size=episodes.batch_shape)
         self.episodes, self.num_envs = episodes, num_envs
@@ -168,7 +172,10 @@ class RobotTaskEnv(PersistentEnv, Closing):
             ``joint_position`` and ``joint_velocity`` (*batch, n_joints),
             ``object_pose`` (*batch, n_objects, 7), ``object_velocity`` (*batch,
             n_objects, 6), ``desired_goal`` (*batch, goal_dim), all float64, and
-            ``step_count`` (*batch, 1), int64.
+            ``step_count`` (*batch, 1), int64. Where objects have joints, also
+            ``object_joint_position`` and ``object_joint_velocity`` (*batch,
+            n_object_joints); where physics vary, what they depend on:
+            ``physics_parameters`` (*batch, k) float64, ``physics_seed`` (*batch, 1).
 
         Raises:
             BulletError: the environment is closed or was never reset.

@@ -41,11 +41,13 @@ class TaskScene:
         bodies = self._build_task(client)
         for sensor in self._sensors:
             sensor.build(client, body, robot)
+        objects = tuple(bodies.objects)
         return Scene(
             robot=body,
-            joints=tuple(j.index for j in client.joints(body) if j.is_movable),
+            joints=_movable_joints(client, body),
             ee_link=robot.ee_link,
-            objects=tuple(bodies.objects),
+            objects=objects,
+            object_joints=tuple(_movable_joints(client, k) for k in objects),
             markers=tuple(bodies.markers),
         )
 
@@ -60,3 +62,7 @@ class TaskScene:
                 f"{type(self._task).__name__}.build must return Bodies, got {bodies!r}"
             )
         return bodies
+
+
+def _movable_joints(client: PhysicsClient, body: int) -> tuple[int, ...]:
+    return tuple(joint.index for joint in client.joints(body) if joint.is_movable)

@@ -30,7 +30,7 @@ class Specs:
         if observe_state:
             size = robot.observation_dim + task.observation_dim
             observed["observation"] = self._numbers(size)
-        for key, entry in episodes.sensed.items():
+        for key, entry in episodes.entries.items():
             observed[key] = self._sensed(entry)
         self.observation = Composite(observed, shape=self._batch, device=device)
         self.action = Bounded(
@@ -56,6 +56,8 @@ class Specs:
 
     def _sensed(self, entry: Entry) -> TensorSpec:
         shape, dtype = (*self._batch, *entry.shape), entry.dtype
+        if dtype == torch.bool:
+            return Binary(shape=shape, device=self._device, dtype=dtype)
         if entry.high is None:
             return Unbounded(shape, dtype=dtype, device=self._device)
         return Bounded(0, entry.high, shape, dtype=dtype, device=self._device)

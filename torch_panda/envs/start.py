@@ -26,7 +26,7 @@ def draw_start(
         env: which environment.
         rng: of this episode.
         robot: starts neutral.
-        task: draws the goal, then the objects.
+        task: draws the goal, then the objects, then their joints.
         simulation: receives the state.
         goal: (n, goal_dim), receives the goal.
 
@@ -45,6 +45,12 @@ def draw_start(
                     f"sample_objects must return unit quaternions, got {[x, y, z, w]}"
                 )
         simulation.object_velocity[env] = 0.0
+    if any(simulation.scene.object_joints):
+        joints = simulation.object_joint_position[env]
+        drawn = _double(task.sample_object_joints(rng))
+        drawn = drawn.expand_as(joints) if drawn.shape == (1,) else drawn
+        _fill(joints, drawn, "sample_object_joints")
+        simulation.object_joint_velocity[env] = 0.0
 
 
 def _double(values: object) -> Tensor:

@@ -8,14 +8,22 @@ import torch
 from torch import Tensor
 
 from torch_panda.envs.history import ACTIONS, NUM_ACTIONS, START
+from torch_panda.envs.variation import PHYSICS
 
 QUATERNION_TOLERANCE = 1e-3
 # Far beyond any scene. Where squares overflow, Bullet gives NaN.
 _LARGEST = 1e6  # [m], [rad], [m/s], [rad/s]
 
-# Where a robot and its objects are, and how fast.
-PHYSICAL = ("joint_position", "joint_velocity", "object_pose", "object_velocity")
-STATE = (*PHYSICAL, "desired_goal", "step_count")
+# Where a robot and its objects are, and how fast; joints, where objects have them.
+PHYSICAL = (
+    "joint_position",
+    "joint_velocity",
+    "object_pose",
+    "object_velocity",
+    "object_joint_position",
+    "object_joint_velocity",
+)
+STATE = (*PHYSICAL, "desired_goal", "step_count", *PHYSICS)
 # What an exact state has beside them.
 EXACT_KEYS = (*(START + key for key in STATE), ACTIONS, NUM_ACTIONS)
 
@@ -138,10 +146,11 @@ def read_state(
         }
 
     state = GivenState(read())
+    needed = {START + key for key in like} | {ACTIONS, NUM_ACTIONS}
     found = set(EXACT_KEYS).intersection(given.keys())
     if not found:
         return state
-    if missing := {*EXACT_KEYS, *STATE}.difference(given.keys()):
+    if missing := (needed | like.keys()).difference(given.keys()):
         raise ValueError(
             f"an exact state needs all its entries, without {sorted(missing)}; leave "
             f"out {sorted(found)} to start from the rest"

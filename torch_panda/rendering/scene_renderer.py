@@ -12,6 +12,8 @@ from torch_panda.rendering.frames import Frames, blend
 from torch_panda.rendering.visual_client import VisualClient
 
 NOTHING = -1  # in a segmentation
+# What changes nothing that is seen: robots do so, too.
+_NOT_SEEN = {"set_dynamics", "set_joint_friction"}
 
 
 class SceneBuilder(Protocol):
@@ -82,7 +84,11 @@ class SceneRenderer:
         simulation, solids = self._simulation, self._solids
         scene = simulation.scene
         pose_solids(solids, scene, simulation, env)
-        image = solids.draw(camera, segmentation=frames.segmentation is not None)
+        hand = [
+            *simulation.ee_position[env].tolist(),
+            *simulation.ee_orientation[env].tolist(),
+        ]
+        image = solids.draw(camera, hand, segmentation=frames.segmentation is not None)
         pixels = frames.pixels[row].numpy()
         pixels[:] = image.rgb
         if frames.depth is not None:
@@ -91,7 +97,7 @@ class SceneRenderer:
             frames.segmentation[row].numpy()[..., 0] = image.segmentation
         if self._markers is not None:
             pose_bodies(self._markers, self._marker_bodies, simulation.marker_pose[env])
-            overlay = self._markers.draw(camera, segmentation=True, shadow=False)
+            overlay = self._markers.draw(camera, hand, segmentation=True, shadow=False)
             assert overlay.segmentation is not None
             seen = overlay.depth < image.depth
             opacity = self._opacity[overlay.segmentation[seen]]
@@ -101,7 +107,7 @@ class SceneRenderer:
 def _check_same_task(markers: VisualClient, solids: VisualClient) -> None:
     """Make sure that the task has built the same bodies, after the robot's."""
     ours, theirs = (
-        [command for command in client.blueprint if command[0] != "set_friction"]
+        [command for command in client.blueprint if command[0] not in _NOT_SEEN]
         for client in (markers, solids)
     )
     if ours != theirs[len(theirs) - len(ours) :]:
@@ -117,6 +123,11 @@ def pose_solids(
     joints = simulation.joint_position[env].tolist()
     client.set_joints(scene.robot, scene.joints, joints, (0.0,) * len(joints))
     pose_bodies(client, scene.objects, simulation.object_pose[env])
+    positions = simulation.object_joint_position[env].tolist()
+    for body, joints in zip(scene.objects, scene.object_joints, strict=True):
+        own, positions = positions[: len(joints)], positions[len(joints) :]
+        if joints:
+            client.set_joints(body, joints, own, (0.0,) * len(joints))
 
 
 def pose_bodies(client: PhysicsClient, bodies: tuple[int, ...], poses: Tensor) -> None:

@@ -228,8 +228,11 @@ def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | Non
 
 
 def _has_texture(mesh: trimesh.Trimesh) -> bool:
-    look = mesh.visual
-    return look.kind == "texture" and look.material.image is not None
+    """Whether it has one of its own; trimesh's stand-in has 2 x 2 pixels."""
+    if mesh.visual.kind != "texture":
+        return False
+    image = mesh.visual.material.image
+    return image is not None and image.width > 2
 
 
 def _origin(element: ElementTree.Element) -> tuple[Floats, SO3]:

@@ -1,6 +1,6 @@
 """Sensors: each is an object that an environment is given."""
 
-from torch_panda.sensors.base import Entry, Reading, Sensor, join_entries
+from torch_panda.sensors.base import Entry, Observer, Reading, Sensor, join_entries
 from torch_panda.sensors.cameras import CameraSensor
 from torch_panda.sensors.forces import (
     FORCE_SENSORS,
@@ -18,6 +18,7 @@ __all__ = [
     "FingerContact",
     "ForceSensor",
     "JointTorque",
+    "Observer",
     "Reading",
     "Sensor",
     "WristForceTorque",

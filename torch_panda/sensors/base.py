@@ -65,15 +65,31 @@ class Sensor(ABC):
         """Read the sensor in all environments of a simulation."""
 
 
-def join_entries(readings: Sequence[Reading]) -> dict[str, Entry]:
-    """The entries of all sensors.
+class Observer(Protocol):
+    """What observes something beside the state of robot and task."""
+
+    entries: dict[str, Entry]
+
+    def observe(self) -> dict[str, Tensor]:
+        """What is observed now in all environments, by entry: (n, ...), new tensors."""
+
+
+# What an environment observes and returns in any case.
+_OWN = {"observation", "achieved_goal", "desired_goal", "success", "action", "reward"}
+_OWN |= {"terminated", "truncated", "done"}
+
+
+def join_entries(observers: Sequence[Observer]) -> dict[str, Entry]:
+    """The entries of all observers.
 
     Raises:
-        ValueError: two sensors observe the same.
+        ValueError: two observe the same, or one what the environment does.
     """
     entries: dict[str, Entry] = {}
-    for reading in readings:
-        if twice := entries.keys() & reading.entries.keys():
+    for observer in observers:
+        if own := _OWN & observer.entries.keys():
+            raise ValueError(f"{sorted(own)} are the environment's own, not a sensor's")
+        if twice := entries.keys() & observer.entries.keys():
             raise ValueError(f"two sensors observe {sorted(twice)}")
-        entries |= reading.entries
+        entries |= observer.entries
     return entries

@@ -24,7 +24,8 @@ class Bodies(NamedTuple):
     """What a task has built in a client, by body id.
 
     Attributes:
-        objects: movable objects, in the order in which observations name them.
+        objects: movable objects, in the order in which observations name them. Their
+            joints, if they have any, are part of the state, too.
         markers: bodies that nothing touches, which show the goal.
     """
 
@@ -42,6 +43,9 @@ class Task(ABC):
     A task sets ``goal_dim``, ``observation_dim`` and, unless it is 50,
     ``max_episode_steps``. Its numbers are by default those of the ids -v1;
     `torch_panda.versions` has them beside those of -v3.
+
+    `randomize`, `reward`, `failure` and `extra_observation` are hooks: a task has those
+    that it overrides, and the others are never called.
 
     Args:
         reward_type: "sparse": 0 on success and -1 otherwise; "dense": -distance.
@@ -74,6 +78,75 @@ class Task(ABC):
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
         """Draw start poses: (n_objects, 7), position and quaternion xyzw."""
         return ()
+
+    def sample_object_joints(self, rng: np.random.Generator) -> Sequence[float]:
+        """Draw start positions of the objects' joints [rad] or [m], by default 0.
+
+        Called if the objects have joints, after `sample_objects`.
+
+        Returns:
+            (n_object_joints,), as `VectorSimulation.object_joint_position`; or one
+            number for all.
+        """
+        return (0.0,)
+
+    def randomize(  # noqa: B027 (most tasks need nothing)
+        self, client: PhysicsClient, bodies: Bodies, rng: np.random.Generator
+    ) -> None:
+        """Change the physics of an environment before each of its episodes.
+
+        A hook, which runs in the thread that resets the environment. What it changes
+        must depend on ``rng`` alone, and whatever it changes once it must set every
+        time: what the last episode had is still there.
+
+        Args:
+            client: of the environment; see `PhysicsClient.set_dynamics`.
+            bodies: what `build` has built.
+            rng: of this episode, and of nothing else.
+        """
+
+    def reward(
+        self,
+        simulation: VectorSimulation,
+        action: Tensor,
+        achieved_goal: Tensor,
+        desired_goal: Tensor,
+    ) -> Tensor:
+        """The reward of a step, which may depend on state and action.
+
+        A hook. By default it is `compute_reward`, which remains the function of goals
+        that hindsight relabelling calls.
+
+        Args:
+            simulation: the state after the step.
+            action: (num_envs, action_dim) float32 in [-1, 1].
+            achieved_goal: (num_envs, goal_dim) float32, after the step.
+            desired_goal: (num_envs, goal_dim) float32.
+
+        Returns:
+            (num_envs, 1).
+        """
+        return self.compute_reward(achieved_goal, desired_goal)
+
+    def failure(self, simulation: VectorSimulation) -> Tensor:
+        """Where an episode has failed, and ends as ``terminated``.
+
+        A hook. By default none fails.
+
+        Returns:
+            (num_envs, 1), bool.
+        """
+        return torch.zeros(simulation.num_envs, 1, dtype=torch.bool, device="cpu")
+
+    def extra_observation(self, simulation: VectorSimulation) -> dict[str, Tensor]:
+        """What is observed beside ``observation``, each under a key of its own.
+
+        A hook. By default nothing is.
+
+        Returns:
+            By key (num_envs, ...); float64 is observed as float32.
+        """
+        return {}
 
     def marker_pose(self, goal: Tensor) -> Tensor:
         """Where goals put the markers: (..., goal_dim) -> (..., n_markers, 7).

@@ -1,0 +1,175 @@
+"""Physics that are drawn for every episode."""
+
+import time
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import torch_panda
+from torch_panda import Randomization
+from torch_panda.randomization import PARAMETERS
+
+ALL = Randomization(
+    object_mass=(0.5, 2.0),
+    object_friction=(0.5, 1.5),
+    table_friction=(0.5, 1.5),
+    finger_friction=(0.5, 1.5),
+    object_restitution=(0.0, 0.5),
+    joint_damping=(0.5, 2.0),
+    gravity=(0.9, 1.1),
+    joint_position=0.05,
+    observe=True,
+)
+ID = "PandaPickAndPlace-v1"
+
+
+def play(env, steps=25, start=None):
+    """The hand goes for the cube and pushes it."""
+    td, seen = env.reset() if start is None else start, []
+    for _ in range(steps):
+        action = torch.zeros(env.action_spec.shape)
+        action[..., :3] = (td["achieved_goal"] - td["observation"][..., :3]) * 10
+        td = env.step(td.clone().set("action", action))["next"]
+        seen.append(td)
+    return torch.stack(seen)
+
+
+def make(randomize=ALL, **options):
+    return torch_panda.make(
+        ID, **({"num_envs": 3, "seed": 0} | options), randomize=randomize
+    )
+
+
+def test_parameters_are_drawn_per_environment_and_episode(loop):
+    with make() as env:
+        check_env_specs(env)
+        env.set_seed(0)
+        drawn = torch.stack([env.reset()["physics_parameters"] for _ in range(4)])
+    assert drawn.shape == (4, 3, len(PARAMETERS))
+    assert len(drawn.flatten().unique()) == drawn.numel()
+    low, high = torch.tensor([getattr(ALL, name) for name in PARAMETERS]).T
+    assert ((low <= drawn) & (drawn <= high)).all()
+    with make(num_envs=1) as other:  # whatever the number of environments
+        for expected in drawn:
+            assert torch.equal(other.reset()["physics_parameters"], expected[:1])
+
+
+def test_episodes_are_reproducible_and_states_exact(loop):
+    with make() as env, make(num_threads=1) as other:
+        play(env)
+        env.set_seed(0)
+        first = play(env)
+        assert (play(other) == first).all()
+        state = env.get_state(exact=True)
+        after = env.rand_step(first[-1].exclude("reward", "action"))
+        again = env.reset(state[[2, 2, 2]], set_state=True)
+        again["action"] = after["action"][[2, 2, 2]]
+        assert (env.step(again)["next"] == after["next"][[2, 2, 2]]).all()
+
+
+def test_without_it_nothing_changes():
+    """What is drawn beside it, too: goals and objects are those of before."""
+    with make(None) as plain, make() as varied, make(Randomization()) as empty:
+        start, other = plain.reset(), varied.reset()
+        for key in ("desired_goal", "achieved_goal"):
+            assert torch.equal(start[key], other[key])
+        assert not torch.equal(start["observation"], other["observation"])
+        plain.set_seed(0)
+        assert (play(plain) == play(empty)).all()
+        assert set(plain.get_state().keys()) == set(empty.get_state().keys())
+
+
+def test_factors_of_one_change_nothing():
+    ones = Randomization(
+        **{name: (1.0, 1.0) for name in PARAMETERS[:4]}, gravity=(1, 1)
+    )
+    with make(None) as plain, make(ones) as same:
+        assert (play(plain) == play(same)).all()
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_every_parameter_changes_what_happens(name):
+    factor = 0.01 if name == "finger_friction" else 0.6
+
+    def drop(env):
+        env.reset()
+        state = env.get_state()
+        state["object_pose"][..., 2] += 0.1
+        return play(env, start=env.reset(state, set_state=True))
+
+    with make(Randomization(**{name: (factor, factor)})) as env, make(None) as plain:
+        expected, found = drop(plain), drop(env)
+    assert not torch.equal(found["observation"], expected["observation"])
+    if name == "object_restitution":
+        height = found["achieved_goal"][8:, :, 2].amax(0)
+        assert (height > expected["achieved_goal"][8:, :, 2].amax(0) + 0.005).any()
+
+
+def test_mass_is_changed_and_can_be_given():
+    with make(Randomization(object_mass=(0.5, 2.0))) as env:
+        env.reset()
+        client = env.episodes.simulation.clients[1]
+        (cube,) = env.episodes.simulation.scene.objects
+        factor = env.get_state()["physics_parameters"][1].item()
+        assert client.mass(cube) == pytest.approx(2.0 * factor)
+        state = env.get_state()
+        state["physics_parameters"][:] = torch.tensor([[0.5], [0.25], [3.0]])
+        env.reset(state, set_state=True)
+        assert client.mass(cube) == 0.5
+        env.reset()
+        assert client.mass(cube) != 0.5
+
+
+def test_joint_positions_start_around_neutral():
+    with make(Randomization(joint_position=0.1)) as env:
+        env.reset()
+        state = env.get_state()
+        offset = state["joint_position"] - torch.tensor(
+            env.robot.neutral_joint_position, dtype=torch.float64
+        )
+        assert "physics_parameters" not in state
+    assert (offset[:, :7].abs() <= 0.1).all() and (offset[:, :7].abs() > 0).all()
+    assert not offset[:, 7:].any()
+
+
+@pytest.mark.parametrize("env_id", ["PandaReach-v1", "PandaStack-v3"])
+def test_any_task_takes_it(env_id):
+    with torch_panda.make(env_id, randomize=ALL) as env:
+        assert env.reset()["physics_parameters"].shape == (len(PARAMETERS),)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"object_mass": (2.0, 1.0)},
+        {"object_mass": (0.0, 1.0)},
+        {"gravity": 1.0},
+        {"table_friction": (-1.0, 1.0)},
+        {"joint_position": float("nan")},
+        {"observe": True},
+    ],
+)
+def test_bad_ranges(options):
+    with pytest.raises(ValueError, match=r"must be|needs a range"):
+        Randomization(**options)
+
+
+def test_a_reset_costs_at_most_a_fifth_of_a_millisecond(capsys):
+    """CPU time of the same resets with and without, in turn."""
+    with (
+        make(num_threads=1, num_envs=1) as env,
+        make(None, num_threads=1, num_envs=1) as plain,
+    ):
+        costs = []
+        for _ in range(5):
+            seconds = []
+            for each in (plain, env):
+                start = time.process_time()
+                for _ in range(40):
+                    each.episodes.reset()
+                seconds.append((time.process_time() - start) / 40)
+            costs.append(seconds[1] - seconds[0])
+    with capsys.disabled():
+        print(f"randomising costs {1e6 * min(costs):.0f} us a reset")
+    assert min(costs) < 2e-4

@@ -1,0 +1,208 @@
+"""A user's task with all hooks and a drawer, by public names only."""
+
+import gymnasium
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import torch_panda
+from torch_panda import Panda, Task
+from torch_panda.tasks import Bodies, create_table
+
+# A box on a slide along x, with a knob towards the robot.
+DRAWER = """
+<robot name="drawer">
+  <link name="frame"/>
+  <joint name="slide" type="prismatic">
+    <parent link="frame"/>
+    <child link="box"/>
+    <axis xyz="1 0 0"/>
+    <limit lower="-0.2" upper="0.1" effort="100" velocity="10"/>
+  </joint>
+  <link name="box">
+    <inertial><mass value="0.5"/>
+      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial>
+    <collision><geometry><box size="0.06 0.3 0.2"/></geometry></collision>
+    <visual><geometry><box size="0.06 0.3 0.2"/></geometry></visual>
+  </link>
+</robot>
+"""
+
+
+class Shove(Task):
+    """Shove a drawer, of a friction that nobody knows, to a position."""
+
+    goal_dim = 1
+    observation_dim = 2
+
+    def __init__(self, *, urdf=None, force=2.0, **options):
+        super().__init__(**options)
+        self.urdf, self.force = urdf, force
+
+    def build(self, client):
+        create_table(client)
+        drawer = client.load_urdf(self.urdf, position=(0.1, 0, 0.12), fixed_base=True)
+        return Bodies(objects=(drawer,))
+
+    def sample_goal(self, rng):
+        return (rng.uniform(0.03, 0.09),)
+
+    def sample_objects(self, rng):
+        return ((0.1, rng.uniform(-0.05, 0.05), 0.12, 0, 0, 0, 1),)
+
+    def sample_object_joints(self, rng):
+        return (rng.uniform(-0.03, 0.0),)
+
+    def randomize(self, client, bodies, rng):
+        friction = rng.uniform(0.5, 1.5) * self.force
+        client.set_joint_friction(bodies.objects[0], 0, friction)
+
+    def observation(self, simulation):
+        position = simulation.object_joint_position
+        return torch.cat((position, simulation.object_joint_velocity), dim=1)
+
+    def achieved_goal(self, simulation):
+        return simulation.object_joint_position
+
+    def reward(self, simulation, action, achieved_goal, desired_goal):
+        effort = action.square().sum(1, keepdim=True)
+        return self.compute_reward(achieved_goal, desired_goal) - 0.1 * effort
+
+    def failure(self, simulation):
+        return simulation.ee_position[:, 2:] > 0.3
+
+    def extra_observation(self, simulation):
+        return {"ee_orientation": simulation.ee_orientation}
+
+
+ID = "Shove-v0"
+
+
+@pytest.fixture(autouse=True)
+def shove(tmp_path):
+    file = tmp_path / "drawer.urdf"
+    file.write_text(DRAWER)
+    torch_panda.register(
+        ID,
+        robot=lambda **options: Panda(block_gripper=True, **options),
+        task=lambda **options: Shove(urdf=file, **options),
+        max_episode_steps=30,
+    )
+    yield ID
+
+
+def forward(env, steps=12):
+    """Push along x; all that was observed."""
+    td, seen = env.reset(), []
+    for _ in range(steps):
+        action = torch.zeros(env.action_spec.shape)
+        action[..., 0] = 1.0
+        td = env.step(td.set("action", action))["next"]
+        seen.append(td.clone())
+    return torch.stack(seen)
+
+
+def test_the_drawer_is_state_goal_and_observation(loop):
+    with torch_panda.make(ID, num_envs=3, seed=0) as env:
+        check_env_specs(env)
+        seen = forward(env)
+        assert env.max_episode_steps == 30
+        found = env.get_state()
+        assert found["object_joint_position"].shape == (3, 1)
+        assert torch.equal(
+            found["object_joint_position"].float(), seen[-1]["achieved_goal"]
+        )
+        assert (seen[-1]["achieved_goal"] > 0.02).all()  # it was shoved
+        assert len(found["object_pose"][:, 0, 1].unique()) == 3
+        # The friction of each is another one, so they are not shoved as far.
+        assert len(seen[-1]["observation"][:, -2].unique()) == 3
+
+
+def test_hooks(loop):
+    with torch_panda.make(ID, num_envs=2, seed=0) as env:
+        td = env.reset()
+        assert not td["terminated"].any()
+        action = torch.zeros(2, 3)
+        action[0, 2] = 1.0
+        for _ in range(8):
+            td = env.step(td.set("action", action))["next"]
+        goals = td["achieved_goal"], td["desired_goal"]
+        effort = torch.tensor([[0.1], [0.0]])
+        torch.testing.assert_close(td["reward"], env.compute_reward(*goals) - effort)
+        assert td["ee_orientation"].shape == (2, 4)
+        assert td["terminated"].tolist() == [[True], [False]] == td["done"].tolist()
+        assert not td["truncated"].any()
+        td["_reset"] = td["done"]
+        assert not env.reset(td)["done"].any()
+
+
+def test_episodes_are_reproducible_and_states_exact(loop):
+    with (
+        torch_panda.make(ID, num_envs=3, seed=5) as env,
+        torch_panda.make(ID, num_envs=2, seed=5, num_threads=1) as other,
+    ):
+        forward(env)  # which leaves friction and contacts behind
+        env.set_seed(5)
+        first = forward(env)
+        assert (forward(other) == first[:, :2]).all()
+        state = env.get_state(exact=True)
+        after = env.rand_step(first[-1].exclude("reward", "action"))
+        # One exact state in all environments: their friction comes with it.
+        again = env.reset(state, set_state=True)
+        again["action"] = after["action"]
+        assert (env.step(again)["next"] == after["next"]).all()
+        fork = state[[1, 1, 1]]
+        again = env.reset(fork, set_state=True)
+        again["action"] = after["action"][[1, 1, 1]]
+        forked = env.step(again)["next"]
+        assert (forked == after["next"][[1, 1, 1]]).all()
+
+
+def test_options():
+    with torch_panda.make(
+        ID, task_options={"distance_threshold": 0.01}, robot_options={}
+    ) as env:
+        assert env.task.distance_threshold == 0.01
+    with pytest.raises(TypeError, match=r"robot_options of .*colour"):
+        torch_panda.make("PandaPush-v1", robot_options={"colour": 1})
+    with pytest.raises(ValueError, match=f"registered: {ID}"):
+        torch_panda.make("Shov")
+    with pytest.raises(ValueError, match="ships"):
+        torch_panda.register("PandaPush-v1", robot=Panda, task=Shove)
+
+
+def test_gymnasium():
+    with gymnasium.make(
+        f"torch_panda/{ID}", task_options={"distance_threshold": 0.01}
+    ) as env:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        steps = 0
+        ended = False
+        while not ended:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample() * 0)
+            ended, steps = terminated or truncated, steps + 1
+        assert steps == 30
+        assert env.unwrapped.torch_env.task.distance_threshold == 0.01
+    vector = gymnasium.make_vec(f"torch_panda/{ID}", num_envs=2)
+    assert vector.unwrapped.torch_env.max_episode_steps == 30
+    vector.reset(seed=0)
+    vector.close()
+
+
+def test_stable_baselines3():
+    from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
+
+    env = SB3VecEnv(ID, num_envs=2, task_options={"force": 1.0})
+    assert env.vector_env.torch_env.task.force == 1.0
+    assert env.reset()["observation"].shape == (2, 8)
+    env.close()
+
+
+def test_the_drawer_is_drawn():
+    with torch_panda.make(ID, seed=0) as env:
+        env.reset()
+        before = env.render(size=64)
+        forward(env)
+        assert (env.render(size=64) != before).any()
+        assert "object" in env.segmentation_ids
