@@ -1,57 +1,121 @@
-"""Draw the picture of all tasks, at the end of an expert's episode.
+"""Draw the tasks: a picture, an animation, or policies step by step.
 
 python examples/gallery.py --out gallery.png
+python examples/gallery.py --out gallery.gif --size 150 200
+python examples/gallery.py --policies examples/policies/*.pt --out policies.png
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
-import torch
+import numpy.typing as npt
 import tyro
 from PIL import Image, ImageDraw
+from tensordict.nn import TensorDictModuleBase
 
 import torch_panda
 from experts import make_expert
-from video import tile
+from training.files import prepare
+from training.policies import load_policy, read_checkpoint
+from video import FPS, play, tile
 
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+NEAR = torch_panda.Camera(distance=1.0, yaw=60, pitch=-25, target=(-0.2, 0.0, 0.23))
+# Slide's goals are out of reach.
+FAR = torch_panda.Camera(distance=1.5, yaw=50, pitch=-25, target=(0.05, 0.0, 0.12))
+COLUMNS = (0, 4, 8, 14, 24)  # steps of a policy that are drawn
+
+Picture = npt.NDArray[np.uint8]
 
 
 @dataclass
 class Args:
     """What to draw, and where."""
 
+    policies: tuple[Path, ...] = ()
+    """checkpoints to draw step by step, a row each; none: all tasks, by the experts"""
     step: int = 15
-    """step of the episode that is drawn"""
+    """of all tasks, the step of the episode that is drawn; an animation has all"""
     seed: int = 4
     """of the environments"""
     size: tuple[int, int] = (300, 400)
     """height and width of a cell [pixels]"""
     out: Path = Path("gallery.png")
-    """picture to write"""
+    """picture (.png) or animation (.gif) to write"""
+
+
+def draw(
+    env_id: str,
+    policy: TensorDictModuleBase | Path,
+    steps: int,
+    *,
+    seed: int,
+    size: tuple[int, int],
+) -> list[Picture]:
+    """An episode's pictures (height, width, 3) from its start on, with its name.
+
+    Args:
+        env_id: the task.
+        policy: what acts, or its checkpoint.
+        steps: how many.
+        seed: of the environment.
+        size: height and width [pixels].
+    """
+    name = env_id.removeprefix("Panda").partition("-")[0]
+    cells = []
+    with torch_panda.make(env_id, num_envs=1, seed=seed) as env:
+        if isinstance(policy, Path):
+            policy = load_policy(read_checkpoint(policy), env)
+        for step, _ in zip(range(steps + 1), play(env, policy), strict=False):
+            camera = FAR if name == "Slide" else NEAR
+            cell = Image.fromarray(env.render(0, camera=camera, size=size).numpy())
+            pen = ImageDraw.Draw(cell)
+            pen.text((8, 6), name, fill=(0, 0, 0), font_size=size[0] // 15)
+            pen.text((8, size[0] - 18), f"step {step}", fill=(90, 90, 90))
+            cells.append(np.asarray(cell))
+    return cells
+
+
+def write(path: Path, pictures: list[Picture]) -> None:
+    """Write one picture, or an animation, in 256 colours: a third of the size."""
+    images = [Image.fromarray(picture).quantize(256) for picture in pictures]
+    if path.suffix == ".gif":
+        options = {"append_images": images[1:], "save_all": True, "loop": 0}
+        images[0].save(path, duration=2000 // FPS, **options)
+    else:
+        images[0].save(path, optimize=True)
 
 
 def main(args: Args) -> None:
-    """Draw all tasks in one picture."""
-    cells = []
-    for task in TASKS:
-        far = task == "Slide"  # its goals are
-        camera = torch_panda.Camera(
-            distance=1.3 if far else 0.85, target=(0.25 if far else 0.0, 0.0, 0.1)
-        )
-        env_id = f"Panda{task}-v1"
-        with (
-            torch_panda.make(env_id, num_envs=1, seed=args.seed) as env,
-            torch.no_grad(),
-        ):
-            env.rollout(args.step, make_expert(env_id))
-            pixels = env.render(camera=camera, size=args.size)[0].numpy()
-        cell = Image.fromarray(pixels)
-        ImageDraw.Draw(cell).text((10, 8), task, fill=(0, 0, 0), font_size=20)
-        cells.append(np.asarray(cell))
-    iio.imwrite(args.out, tile(cells))
+    """Draw what was asked for."""
+    options = {"seed": args.seed, "size": args.size}
+    try:
+        if args.out.suffix not in (".png", ".gif"):
+            raise ValueError(f"out must end in .png or .gif, got {args.out.name!r}")
+        prepare(args.out)
+        if args.policies:
+            rows = [
+                np.hstack([cells[step] for step in COLUMNS])
+                for path in args.policies
+                for cells in [
+                    draw(read_checkpoint(path)["env_id"], path, max(COLUMNS), **options)
+                ]
+            ]
+            pictures = [np.vstack(rows)]
+        else:
+            animated = args.out.suffix == ".gif"
+            steps = 50 if animated else args.step
+            episodes = [
+                draw(env_id, make_expert(env_id), steps, **options)
+                for env_id in (f"Panda{task}-v1" for task in TASKS)
+            ]
+            # Every other step, in real time.
+            shown = range(0, steps + 1, 2) if animated else (steps,)
+            pictures = [tile([cells[step] for cells in episodes]) for step in shown]
+        write(args.out, pictures)
+    except (ValueError, OSError) as error:
+        raise SystemExit(str(error)) from None
     print(f"wrote {args.out}")
 
 

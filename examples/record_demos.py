@@ -1,15 +1,19 @@
 """Record demonstrations of the scripted experts, and say how often they succeed.
 
 python examples/record_demos.py --env-id PandaPush-v1 --episodes 200 --out demos.pt
+python examples/record_demos.py --format minari --out panda/push-expert-v0
+python examples/record_demos.py --format lerobot --out push_lerobot
 """
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule
 from tqdm import tqdm
@@ -17,6 +21,7 @@ from tqdm import tqdm
 import torch_panda
 from evaluate import wilson_interval
 from experts import make_expert
+from formats import Writer, load_format
 from limits import Positive, Seed, Weight, check_limits
 from training.files import prepare, save
 
@@ -39,8 +44,38 @@ class Args:
     """the standard deviation of Gaussian noise on the actions that are executed; saved
     are the actions without it, so that who imitates them learns to correct himself
     (DART, arXiv 1703.09327)"""
+    format: Literal["tensors", "minari", "lerobot"] = "tensors"
+    """a file of a nested dict of tensors of shape (steps, ...), or a data set"""
     out: Path | None = None
-    """where to save the transitions, a nested dict of tensors of shape (steps, ...)"""
+    """the file; for minari the data set's id, for lerobot its folder"""
+    image_size: Positive = 128
+    """height and width of lerobot's pictures [pixels]"""
+
+
+class TensorWriter:
+    """Writes all transitions into one file, which `torch.load` reads.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        OSError: it could not be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        prepare(path)
+        self.path = path
+        self.episodes: list[TensorDictBase] = []
+
+    def add(self, episode: TensorDictBase, seed: int) -> None:
+        """Keep an episode."""
+        self.episodes.append(episode)
+
+    def close(self) -> str:
+        """Ctrl-C leaves the file as it was, or makes the whole of it."""
+        demos = join(self.episodes)
+        save(self.path, demos.to_dict())
+        return str(self.path)
 
 
 def disturb(
@@ -80,18 +115,36 @@ def join(episodes: list[TensorDictBase]) -> TensorDictBase:
     return transitions
 
 
-def print_success(env_id: str, episodes: list[TensorDictBase]) -> None:
-    """Print how many episodes succeeded, with 95 % intervals."""
-    success = [episode["next", "success"] for episode in episodes]
+def print_success(env_id: str, success: list[Tensor]) -> None:
+    """Print how many episodes succeeded, with 95 % intervals.
+
+    Args:
+        env_id: the task.
+        success: of each episode, after each step, (steps, 1).
+    """
     for when, count in (
         ("at the end", sum(bool(flags[-1]) for flags in success)),
         ("at any time", sum(bool(flags.any()) for flags in success)),
     ):
-        low, high = wilson_interval(count, len(episodes))
+        low, high = wilson_interval(count, len(success))
         print(
-            f"{env_id}: success {when} {count}/{len(episodes)} = "
-            f"{count / len(episodes):.1%} (95 % interval {low:.1%} to {high:.1%})"
+            f"{env_id}: success {when} {count}/{len(success)} = "
+            f"{count / len(success):.1%} (95 % interval {low:.1%} to {high:.1%})"
         )
+
+
+def open_writer(args: Args, env: torch_panda.RobotTaskEnv) -> Writer | None:
+    """What writes the episodes; None: they are only counted.
+
+    Raises:
+        ValueError: the format's library is not installed, or refuses the name.
+        OSError: the data could not be written.
+    """
+    if args.out is None:
+        return None
+    if args.format == "tensors":
+        return TensorWriter(args.out)
+    return load_format(args.format).open_writer(args.out, args.env_id, env)
 
 
 def main(args: Args) -> None:
@@ -99,31 +152,42 @@ def main(args: Args) -> None:
     try:
         check_limits(args)
         expert: TensorDictModuleBase = make_expert(args.env_id)
-        if args.out is not None:
-            prepare(args.out)
+        if args.noise_eps and args.format == "minari":
+            raise ValueError("minari's episodes hold what was executed: no noise_eps")
+        pictures: dict[str, Any] = {}
+        if args.format == "lerobot":
+            pictures = {"from_pixels": True, "render_size": args.image_size}
         env = torch_panda.make(
             args.env_id,
-            num_envs=args.num_envs,
+            num_envs=min(args.num_envs, args.episodes),
             num_threads=args.num_threads,
             seed=args.seed,
+            **pictures,
         )
+        writer = open_writer(args, env)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
     expert = disturb(expert, env, args.noise_eps)
-    episodes: list[TensorDictBase] = []
+    success: list[Tensor] = []
+    steps = 0
     try:
         with env, tqdm(total=args.episodes, unit="episode", desc=args.env_id) as bar:
-            while len(episodes) < args.episodes:
-                new = play(env, expert)[: args.episodes - len(episodes)]
-                episodes += new
+            while len(success) < args.episodes:
+                first = len(success)
+                if args.format != "tensors":  # each episode has a seed of its own
+                    for index in range(env.batch_size[0]):
+                        env.set_env_seed(index, args.seed + first + index)
+                new = play(env, expert)[: args.episodes - first]
+                for index, episode in enumerate(new, first):
+                    success.append(episode["next", "success"])
+                    if writer is not None:
+                        episode["action"] = episode.pop("intended")
+                        writer.add(episode, args.seed + index)
+                        steps += len(episode)
                 bar.update(len(new))
-        print_success(args.env_id, episodes)
-        if args.out is not None:
-            demos = join(episodes)
-            demos["action"] = demos.pop("intended")
-            # Ctrl-C leaves the file as it was, or makes the whole of it.
-            save(args.out, demos.to_dict())
-            print(f"{len(demos)} transitions in {args.out}")
+        print_success(args.env_id, success)
+        if writer is not None:
+            print(f"{steps} transitions in {writer.close()}")
     except KeyboardInterrupt:
         raise SystemExit("stopped") from None
 

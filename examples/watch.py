@@ -1,11 +1,14 @@
-"""Watch a policy: a video of several environments side by side, or a window.
+"""Watch a policy: a video of environments side by side, a window, or a browser.
 
 python examples/watch.py --policy runs/PandaPush-v1-ddpg-relabel-0 --out push.mp4
 python examples/watch.py --policy expert --env-id PandaStack-v1 --out stack.gif
 python examples/watch.py --policy expert --env-id PandaStack-v1 --human
+python examples/watch.py --policy runs/PandaPush-v1-ddpg-relabel-0 --web
 """
 
+import itertools
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +22,8 @@ from experts import make_expert
 from limits import Positive, Seed, check_limits
 from training.policies import load_policy, read_checkpoint
 from video import FPS, play, record
+
+CAMERA = torch_panda.Camera(distance=1.1)  # where a browser's view starts
 
 
 def show(
@@ -38,6 +43,48 @@ def show(
             print(f"episode {episode} of {episodes}: {outcome}", flush=True)
 
 
+def serve(
+    env: torch_panda.RobotTaskEnv,
+    policies: Iterator[TensorDictModuleBase],
+    *,
+    host: str,
+    port: int,
+) -> None:
+    """Play episodes in a browser, in real time, with the next policy for each.
+
+    Args:
+        env: all its environments can be looked at.
+        policies: one for each episode; with the last one it ends.
+        host: the address at which the page is.
+        port: or the next one that is free.
+    """
+    with env.open_viewer(CAMERA, host=host, port=port) as viewer:
+        print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+        for number, policy in enumerate(policies, 1):
+            viewer.write(f"episode {number}")
+            for _ in play(env, policy):
+                due = time.perf_counter() + 1 / FPS
+                viewer.update()
+                viewer.wait()
+                time.sleep(max(0.0, due - time.perf_counter()))
+
+
+def follow(path: Path, env: torch_panda.RobotTaskEnv) -> Iterator[TensorDictModuleBase]:
+    """The policy of a run, time and again; anew when a training has saved it.
+
+    Args:
+        path: folder of the run, or a checkpoint.
+        env: where it acts.
+    """
+    file = path / "checkpoint.pt" if path.is_dir() else path
+    seen = None
+    while True:
+        saved = file.stat().st_mtime_ns
+        if saved != seen:
+            policy, seen = load_policy(read_checkpoint(file), env), saved
+        yield policy
+
+
 @dataclass
 class Args:
     """What to watch, and where to write it."""
@@ -54,6 +101,13 @@ class Args:
     """video to write, .mp4 or .gif"""
     human: bool = False
     """show it in a window of pybullet's GUI instead, at the speed of the real robot"""
+    web: bool = False
+    """show it in a browser instead (extra viewer), episode after episode; the policy of
+    a run that is training is read again as it changes"""
+    host: str = "127.0.0.1"
+    """with --web, the address to serve at; 0.0.0.0 lets other machines in"""
+    port: Positive = 8080
+    """with --web, the port, or the next one that is free"""
 
 
 def main(args: Args) -> None:
@@ -78,12 +132,17 @@ def main(args: Args) -> None:
                 policy = make_expert(env_id)
             else:
                 policy = RandomPolicy(env.action_spec)
-            if args.human:
+            if args.web:
+                policies = itertools.repeat(policy)
+                if checkpoint:
+                    policies = follow(Path(args.policy), env)
+                serve(env, policies, host=args.host, port=args.port)
+            elif args.human:
                 show(env, policy, args.num_envs)
             else:
                 record(env, policy, args.out)
                 print(f"wrote {args.out}")
-    except (ValueError, OSError, torch_panda.BulletError) as error:
+    except (ValueError, OSError, ImportError, torch_panda.BulletError) as error:
         raise SystemExit(str(error)) from None
     except KeyboardInterrupt:
         raise SystemExit("stopped") from None

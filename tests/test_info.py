@@ -1,10 +1,14 @@
 """``python -m torch_panda info``."""
 
 import re
+from pathlib import Path
 
 import torch_panda
+from torch_panda import info
 from torch_panda.__main__ import main
 from torch_panda.info import stepping
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_names_the_loop(loop):
@@ -25,3 +29,22 @@ def test_names_versions_ids_and_spaces(capsys):
         for suffix in suffixes.split(",")
     ]
     assert sorted(named) == sorted(torch_panda.ENV_IDS)
+
+
+def test_says_how_to_get_what_is_missing(monkeypatch):
+    monkeypatch.setattr(info, "find_spec", lambda name: None)
+    monkeypatch.setattr(info, "loop_name", lambda: "ctypes")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    extras = "\n".join(info.extras())
+    assert "pip install -e '.[viewer]'" in extras
+    missing = "\n".join(info.missing())
+    assert "C compiler" in missing
+    assert "egl" in missing
+
+
+def test_knows_the_extras():
+    """Those for users; `test` and `docs` are for who changes the package."""
+    text = (ROOT / "pyproject.toml").read_text()
+    section = text.split("[project.optional-dependencies]")[1].split("[tool.")[0]
+    declared = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
+    assert declared - {"test", "docs"} == set(info._EXTRAS)

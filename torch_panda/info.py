@@ -3,8 +3,11 @@
 import os
 import platform
 import re
+import sys
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+
+import torch
 
 import torch_panda
 from torch_panda.bullet.native import loop_name
@@ -21,6 +24,16 @@ _PACKAGES = (
     "stable-baselines3",
     "gymnasium-robotics",
 )
+
+# Extras: what they are for, and a module that each brings; see pyproject.toml.
+_EXTRAS = {
+    "examples": ("training, evaluating, videos, plots", "tyro"),
+    "viewer": ("env.open_viewer(), watch.py --web", "viser"),
+    "minari": ("Minari data sets of demonstrations", "minari"),
+    "lerobot": ("LeRobot data sets; in an environment of its own", "lerobot"),
+    "ray": ("training on many machines", "ray"),
+    "bench": ("python -m torch_panda bench", "tqdm"),
+}
 
 
 def num_cores() -> int:
@@ -69,6 +82,30 @@ def renderers() -> list[str]:
     return ["TinyRenderer (CPU): in pybullet", f"OpenGL (EGL plugin): {egl}"]
 
 
+def extras() -> list[str]:
+    """A line for each extra: what it is for, and how to get what is missing."""
+    lines = []
+    for extra, (purpose, module) in _EXTRAS.items():
+        found = find_spec(module) is not None
+        get = "installed" if found else f"missing: pip install -e '.[{extra}]'"
+        lines.append(f"{extra} ({purpose}): {get}")
+    return lines
+
+
+def missing() -> list[str]:
+    """What does not work here although it is installed, and what would help."""
+    lines = []
+    if loop_name() != "native":
+        lines.append("the native loop: install a C compiler, then torch_panda anew")
+    if find_spec("eglRenderer") is None:
+        lines.append('renderer="egl": this build of pybullet is without it')
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        lines.append("open_window(): there is no DISPLAY; open_viewer() needs none")
+    if not torch.cuda.is_available():
+        lines.append("CUDA: trainings run on the CPU, as does physics in any case")
+    return lines or ["nothing"]
+
+
 def stepping() -> str:
     """Which loop steps the environments."""
     if loop_name() == "native":
@@ -84,6 +121,8 @@ def describe() -> str:
         "threads": [f"{threads}, at most one an environment"],
         "stepping": [stepping()],
         "renderers": renderers(),
+        "extras": extras(),
+        "missing": missing(),
         "environments": environments(),
     }
     return "\n".join(

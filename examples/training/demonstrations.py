@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from tqdm import tqdm
 
+from formats import format_of, load_format
 from torch_panda import RobotTaskEnv
 from training import files
 from training.buffers import STORED_KEYS
@@ -16,14 +17,21 @@ from training.checkpoint import SAVE_INTERVAL, Checkpoint
 def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     """Transitions (n,) of whole episodes.
 
+    Args:
+        path: a file of `record_demos.py`, or the folder of a data set; see `formats`.
+        env: the environment that they are for.
+
     Raises:
-        ValueError: the file holds none, or none of such an environment.
+        ValueError: it holds none, or none of such an environment.
     """
-    content = files.read(path, "demonstrations", STORED_KEYS)
-    try:
-        demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
-    except (RuntimeError, TypeError) as error:  # other lengths, or no tensors
-        raise ValueError(f"{path} does not hold demonstrations: {error}") from None
+    if (name := format_of(path)) is not None:
+        demos = load_format(name).read(path).select(*STORED_KEYS)
+    else:
+        content = files.read(path, "demonstrations", STORED_KEYS)
+        try:
+            demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
+        except (RuntimeError, TypeError) as error:  # other lengths, or no tensors
+            raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
     for key in ("observation", "action", "desired_goal"):

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -112,3 +113,18 @@ def test_gallery(tmp_path):
     picture = iio.imread(tmp_path / "gallery.png")
     assert picture.shape == (120, 240, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_gallery_of_policies(tmp_path):
+    out = tmp_path / "policies.png"
+    box = sorted(Path(gallery.__file__).parent.glob("policies/*.pt"))
+    gallery.main(gallery.Args(policies=tuple(box), size=(60, 80), out=out))
+    picture = iio.imread(out).astype(int)
+    assert picture.shape == (60 * len(box), 80 * len(gallery.COLUMNS), 3)
+    first, last = picture[:, :80], picture[:, -80:]
+    assert all(np.abs(first - last)[60 * k :][:60].max() > 100 for k in range(len(box)))
+
+
+def test_gallery_writes_pictures_only(tmp_path):
+    with pytest.raises(SystemExit, match=r"must end in .png or .gif, got 'a.jpg'"):
+        gallery.main(gallery.Args(out=tmp_path / "a.jpg"))

@@ -1,7 +1,8 @@
 """Episodes of a robot at a task: start, act, observe. Plain torch, without torchrl."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -36,6 +37,9 @@ from torch_panda.rendering import (
 from torch_panda.robots import Robot
 from torch_panda.sensors import Observer, Sensor, join_entries, read_sensors
 from torch_panda.tasks import Task
+
+if TYPE_CHECKING:  # needs an extra
+    from torch_panda.rendering.web_viewer import WebViewer
 
 OnDivergence = Literal["raise", "reset"]
 
@@ -253,6 +257,24 @@ class Episodes(Closing):
             self._check_open()
             return Window(self.simulation, self._build_scene, camera)
 
+    def open_viewer(self, camera: Camera, host: str, port: int) -> "WebViewer":
+        """Serve the scene to browsers; see `RobotTaskEnv.open_viewer`."""
+        if find_spec("viser") is None:
+            raise ImportError("viewers need viser: pip install -e '.[viewer]'")
+        from torch_panda.rendering.web_viewer import WebViewer
+
+        with self._guard:
+            self._check_open()
+            return WebViewer(
+                self.simulation,
+                self._watched,
+                max_episode_steps=self.max_episode_steps,
+                title=type(self.task).__name__,
+                camera=camera,
+                host=host,
+                port=port,
+            )
+
     def close(self) -> None:
         """Free all clients and threads. Closing again does nothing."""
         with self._guard:
@@ -279,6 +301,18 @@ class Episodes(Closing):
             state["object_joint_position"] = simulation.object_joint_position
             state["object_joint_velocity"] = simulation.object_joint_velocity
         return state
+
+    def _watched(self) -> Observed:
+        """What a viewer says of the environments as they are, (n, ...)."""
+        self._check_was_reset()
+        achieved_goal = self.task.achieved_goal(self.simulation).float()
+        desired_goal = self._goal.float()
+        return {
+            "step_count": self._step_count,
+            "achieved_goal": achieved_goal,
+            "desired_goal": desired_goal,
+            "success": self.task.is_success(achieved_goal, desired_goal),
+        }
 
     def _draw_start(self, env: int) -> None:
         """Put the start of an environment's next episode into the state tensors."""

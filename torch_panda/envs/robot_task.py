@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from torch_panda.robots import Robot
 from torch_panda.sensors import Sensor
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
+
+if TYPE_CHECKING:  # needs an extra
+    from torch_panda.rendering.web_viewer import WebViewer
 
 
 class RobotTaskEnv(PersistentEnv, Closing):
@@ -223,6 +226,30 @@ class RobotTaskEnv(PersistentEnv, Closing):
             BulletError: there is no display, or the environment is closed.
         """
         return self.episodes.open_window(camera or Camera())
+
+    def open_viewer(
+        self,
+        camera: Camera | None = None,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> "WebViewer":
+        """Serve the scene to browsers, in three dimensions; needs the extra ``viewer``.
+
+        Call ``update()`` of the result after each reset and step: the page then shows
+        them, and its slider goes back over the episode. Close it, or use it under
+        ``with``.
+
+        Args:
+            camera: where the view starts; None means `Camera`'s defaults.
+            host: the address at which it serves; "0.0.0.0" lets other machines in.
+            port: or, if it is taken, the next one that is free; see ``url``.
+
+        Raises:
+            ImportError: viser is not installed.
+            BulletError: the environment is closed.
+        """
+        return self.episodes.open_viewer(camera or Camera(), host, port)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all clients and threads. Closing again does nothing."""

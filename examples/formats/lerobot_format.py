@@ -1,0 +1,153 @@
+"""LeRobot's format, version 3: tables of frames, and the pictures as videos.
+
+A frame holds what is seen before an action, and what follows from it in numbers; what
+is seen after an episode's last action is not kept.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tensordict import TensorDict, TensorDictBase
+
+from torch_panda import RobotTaskEnv
+
+STATE = "observation.state"
+# The achieved goal, then the desired one: policies of LeRobot read this beside STATE.
+GOALS = "observation.environment_state"
+PICTURE = "observation.images.scene"
+FPS = 25  # steps a second
+
+INSTRUCTIONS = {
+    "Reach": "Move the gripper to the marker.",
+    "Push": "Push the cube onto the marker.",
+    "Slide": "Strike the puck so that it slides to the marker.",
+    "PickAndPlace": "Bring the cube to the marker.",
+    "Stack": "Stack the two cubes at the markers.",
+    "Flip": "Turn the cube as the marker is turned.",
+}
+
+
+class LeRobotWriter:
+    """Writes episodes one after the other.
+
+    Args:
+        folder: to write, new.
+        env_id: one of torch_panda.ENV_IDS.
+        env: observes ``pixels``.
+
+    Raises:
+        ValueError: there is such a folder already.
+        OSError: it could not be made.
+    """
+
+    def __init__(self, folder: Path, env_id: str, env: RobotTaskEnv) -> None:
+        if folder.exists():
+            raise ValueError(f"there is a {folder} already")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        name = type(env.task).__name__
+        self.instruction = INSTRUCTIONS.get(name, name)
+        # Ctrl-C leaves an unfinished folder of another name.
+        self.unfinished = folder.with_name(folder.name + ".new")
+        self.dataset = LeRobotDataset.create(
+            repo_id=f"torch_panda/{env_id}",
+            fps=FPS,
+            features=features(env),
+            root=self.unfinished,
+            robot_type="panda",
+        )
+
+    def add(self, episode: TensorDictBase, seed: int) -> None:
+        """Write an episode; ``seed`` is a column."""
+        following = episode["next"]
+        goals = torch.cat((episode["achieved_goal"], episode["desired_goal"]), -1)
+        columns = {
+            STATE: episode["observation"],
+            GOALS: goals,
+            PICTURE: episode["pixels"],
+            "action": episode["action"],
+            "next.reward": following["reward"],
+            "next.success": following["success"],
+            "next.terminated": following["terminated"],
+            "next.done": following["done"],
+            "seed": torch.full((len(episode), 1), seed),
+        }
+        for step in range(len(episode)):
+            frame = {key: values[step].numpy() for key, values in columns.items()}
+            self.dataset.add_frame(frame | {"task": self.instruction})
+        self.dataset.save_episode()
+
+    def close(self) -> str:
+        """Finish the data set."""
+        self.dataset.finalize()
+        os.replace(self.unfinished, self.folder)
+        return f"{self.folder}: LeRobotDataset({self.dataset.repo_id!r}, root=...)"
+
+
+def features(env: RobotTaskEnv) -> dict[str, dict[str, object]]:
+    """The columns of an environment's data set, and their shapes."""
+    sizes = {
+        STATE: env.observation_spec["observation"].shape[-1],
+        GOALS: 2 * env.task.goal_dim,
+        "action": env.action_spec.shape[-1],
+        "next.reward": 1,
+    }
+    result: dict[str, dict[str, object]] = {
+        key: {"dtype": "float32", "shape": (size,), "names": None}
+        for key, size in sizes.items()
+    }
+    for key in ("next.success", "next.terminated", "next.done"):
+        result[key] = {"dtype": "bool", "shape": (1,), "names": None}
+    result["seed"] = {"dtype": "int64", "shape": (1,), "names": None}
+    result[PICTURE] = {
+        "dtype": "video",
+        "shape": tuple(env.observation_spec["pixels"].shape[-3:]),
+        "names": ["height", "width", "channels"],
+    }
+    return result
+
+
+def open_writer(out: Path, env_id: str, env: RobotTaskEnv) -> LeRobotWriter:
+    """Begin a data set; ``out`` is its folder."""
+    return LeRobotWriter(out, env_id, env)
+
+
+def read(path: Path) -> TensorDict:
+    """The transitions of a data set's folder, without pictures; see `FormatModule`.
+
+    An episode's last transition, whose end was not kept, is left out: the one before
+    is the last.
+    """
+    dataset = LeRobotDataset(f"torch_panda/{path.name}", root=path)
+    table = dataset.hf_dataset.with_format("numpy")[:]
+
+    def column(key: str, dtype: torch.dtype) -> torch.Tensor:
+        values = torch.as_tensor(np.stack(table[key]))
+        return values.reshape(len(values), -1).to(dtype)
+
+    achieved, desired = column(GOALS, torch.float32).chunk(2, dim=-1)
+    number = column("episode_index", torch.int64).squeeze(-1)
+    kept = number[:-1] == number[1:]  # transitions whose end is the next frame
+    observed = {
+        "observation": column(STATE, torch.float32),
+        "achieved_goal": achieved,
+        "desired_goal": desired,
+    }
+    data = {
+        "action": column("action", torch.float32)[:-1],
+        ("collector", "traj_ids"): number[:-1],
+        ("next", "reward"): column("next.reward", torch.float32)[:-1],
+        ("next", "terminated"): column("next.terminated", torch.bool)[:-1],
+        ("next", "success"): column("next.success", torch.bool)[:-1],
+    }
+    for key, values in observed.items():
+        data[key], data["next", key] = values[:-1], values[1:]
+    transitions = TensorDict(data, [len(kept)])[kept]
+    numbers = transitions["collector", "traj_ids"]
+    last = numbers != numbers.roll(-1)
+    last[-1] = True
+    transitions["next", "done"] = last.unsqueeze(-1)
+    return transitions

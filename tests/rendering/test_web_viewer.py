@@ -1,0 +1,143 @@
+"""The viewer in the browser: what its server holds is what the environments are."""
+
+import numpy as np
+import pytest
+import torch
+
+import torch_panda
+
+pytest.importorskip("viser", reason="needs the extra viewer")
+
+from torch_panda.rendering import web_scene, web_viewer
+
+
+@pytest.fixture
+def env():
+    with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
+        yield env
+
+
+def world_pose(nodes, name):
+    """Of a node of the scene tree: position, rotation (4 x 4)."""
+    pose = np.eye(4)
+    while name:
+        node = nodes[name]
+        local = np.eye(4)
+        local[:3, :3] = web_scene.SO3(np.asarray(node.wxyz)).as_matrix()
+        local[:3, 3] = node.position
+        pose, name = local @ pose, name.rpartition("/")[0]
+    return pose
+
+
+def nodes_of(viewer):
+    return viewer._server.scene._handle_from_node_name
+
+
+class Click:
+    """As if a person had moved a control."""
+
+    client = "a browser"
+
+
+def test_the_page_shows_what_is(env):
+    env.reset()
+    bent = env.get_state()
+    bent["joint_position"] += torch.linspace(0.1, 0.4, 9) * 0.5
+    with env.open_viewer(port=8765) as viewer:
+        env.reset(bent, set_state=True)
+        viewer.update()
+        nodes, simulation = nodes_of(viewer), env.episodes.simulation
+        scene = simulation.scene
+        # Bullet's end-effector is between the fingers, a link without a shape.
+        ee = next(name for name in nodes if name.endswith("/panda_grasptarget"))
+        np.testing.assert_allclose(
+            world_pose(nodes, ee)[:3, 3], simulation.ee_position[0], atol=1e-6
+        )
+        for bodies, poses in (
+            (scene.objects, simulation.object_pose),
+            (scene.markers, simulation.marker_pose),
+        ):
+            for body, pose in zip(bodies, poses[0], strict=True):
+                node = nodes[f"/body{body}"]
+                np.testing.assert_array_equal(node.position, pose[:3])
+                np.testing.assert_array_equal(node.wxyz[[1, 2, 3, 0]], pose[3:])
+        env.step(env.full_action_spec.rand())
+        viewer.update()
+        assert "step 1" in viewer._status.content
+
+
+def test_pause_goes_back_and_on(env):
+    env.reset()
+    with env.open_viewer(port=8765) as viewer:
+        viewer.update()
+        shown = []
+        for step in range(1, 4):
+            env.step(env.full_action_spec.rand())
+            viewer.update()
+            shown.append(env.get_state()["object_pose"][:, 0, :3].clone())
+            assert viewer._step.value == step
+        viewer._chosen.value = 1
+        viewer._step.value = 2
+        viewer._go_to(Click)
+        assert viewer.paused
+        assert "environment 1" in viewer._status.content
+        assert "step 2" in viewer._status.content
+        objects = env.episodes.simulation.scene.objects
+        cube = nodes_of(viewer)[f"/body{objects[0]}"]
+        # viser does not send what moves by less than some micrometres.
+        np.testing.assert_allclose(cube.position, shown[1][1], atol=1e-5)
+        env.step(env.full_action_spec.rand())
+        viewer.update()  # recorded, not shown
+        assert viewer._step.value == 2
+        viewer._pause.value = False
+        assert not viewer.paused
+        env.step(env.full_action_spec.rand())
+        viewer.update()
+        assert viewer._step.value == 5
+        env.reset()
+        viewer.update()
+        assert viewer._step.value == 0
+        assert "step 0" in viewer._status.content
+
+
+def test_contacts_carry_the_cube():
+    """What the table exerts on the cube at rest is its weight."""
+    with torch_panda.make("PandaPush-v3", seed=1) as env:
+        env.reset()
+        for _ in range(5):
+            env.step(env.full_action_spec.zero())
+        simulation = env.episodes.simulation
+        forces = web_viewer.read_forces(simulation.clients[0], simulation)
+        near = abs(forces[:, 0, 2]) < 0.01  # not the hand's
+        assert forces[near, 1].sum(0) == pytest.approx((0, 0, 9.81), abs=0.2)
+    long = web_viewer.arrows(
+        np.array([[[0, 0, 0], [0, 0, 10]], [[0, 0, 0], [99, 0, 0]]])
+    )
+    np.testing.assert_allclose(long[:, 1], [[0, 0, 0.05], [0.12, 0, 0]])
+
+
+@pytest.mark.parametrize("task", ["Slide", "Flip"])
+def test_every_task_can_be_seen(task):
+    with torch_panda.make(f"Panda{task}-v1", seed=0) as env:
+        env.reset()
+        with env.open_viewer(port=8765) as viewer:
+            viewer.update()
+            nodes, scene = nodes_of(viewer), env.episodes.simulation.scene
+            for body in (*scene.objects, *scene.markers):
+                assert f"/body{body}" in nodes
+        viewer.close()
+
+
+def test_bad_calls_are_named(env, monkeypatch):
+    with env.open_viewer(port=8765) as viewer:
+        with pytest.raises(torch_panda.BulletError, match="never reset"):
+            viewer.update()
+        # The page is at the address that it names.
+        assert viewer.url.startswith("http://127.0.0.1:87")
+    monkeypatch.setattr("torch_panda.envs.episodes.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"pip install -e '\.\[viewer\]'"):
+        env.open_viewer()
+    env.close()
+    monkeypatch.undo()
+    with pytest.raises(torch_panda.BulletError, match="closed"):
+        env.open_viewer()

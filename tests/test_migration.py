@@ -1,0 +1,146 @@
+"""The tables for who comes from elsewhere: both columns of each row are run."""
+
+import functools
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+
+import torch_panda
+from tests.panda_gym_reference import make_reference
+from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
+
+GUIDE = Path(torch_panda.__file__).parent / "gymnasium_envs" / "README.md"
+A, D = np.float32([0.1, 0.0, 0.02]), np.float32([0.0, 0.1, 0.02])
+
+
+def rows(title):
+    section = GUIDE.read_text().split(f"## {title}")[1].split("\n## ")[0]
+    found = re.findall(r"^\| `(.+?)` \| `(.+?)` \|$", section, re.MULTILINE)
+    assert len(found) >= 7
+    return found
+
+
+def run(code, env, make):
+    names = {
+        "gymnasium": gymnasium,
+        "torch": torch,
+        "SubprocVecEnv": functools.partial(SubprocVecEnv, start_method="fork"),
+        "SB3VecEnv": SB3VecEnv,
+        "make": make,
+        "env": env,
+        "a": A,
+        "d": D,
+    }
+    return eval(code, names)
+
+
+def check_alike(theirs, ours, *, is_fetch):
+    """Interfaces of environments; values of what is computed."""
+    if isinstance(theirs, VecEnv | gymnasium.Env):
+        results = [play(env, 2) for env in (theirs, ours)]
+        for env in (theirs, ours):
+            env.close()
+        first, second = results
+        if is_fetch:  # other sizes, by its own robot; success as a number
+            first, second = (
+                {key: kind for key, (kind, _) in result.items()} for result in results
+            )
+            assert (first.pop("is_success"), second.pop("is_success")) == ("f", "b")
+        assert first == second
+    elif np.ndim(theirs) == 3:  # a picture
+        assert theirs.shape == ours.shape
+    else:
+        np.testing.assert_allclose(np.ravel(theirs), np.ravel(ours), atol=1e-6)
+
+
+def play(env, steps):
+    """What a reset and a step give: name to type and shape."""
+    start = env.reset()
+    observation = start if isinstance(env, VecEnv) else start[0]
+    result = {key: described(value) for key, value in observation.items()}
+    count = env.num_envs if isinstance(env, VecEnv) else None
+    for _ in range(steps):
+        action = np.zeros(env.action_space.shape, np.float32)
+        if count is not None:
+            action = np.stack([action] * count)
+        _, reward, done, *_, info = env.step(action)
+    infos = [info] if count is None else info
+    result |= {"reward": described(reward), "done": described(done)}
+    result["is_success"] = described(infos[0]["is_success"])
+    result["action"] = described(env.action_space.sample())
+    return result
+
+
+def described(value):
+    """Kind of number, and shape."""
+    array = np.asarray(value)
+    return array.dtype.kind, array.shape
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("theirs", "ours"), rows("From panda-gym 3"))
+def test_from_panda_gym(theirs, ours):
+    def make():
+        return make_reference("PandaPush-v3", render_mode="rgb_array")
+
+    options = {"render_mode": "rgb_array"}
+    env = gymnasium.make("torch_panda/PandaPush-v3", **options)
+    reference = make()
+    for each in (env, reference):
+        each.reset(seed=0)
+    results = [run(theirs, reference, make), run(ours, env, make)]
+    check_alike(*results, is_fetch=False)
+    for each in (env, reference):
+        each.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("theirs", "ours"), rows("From Fetch"))
+def test_from_fetch(theirs, ours):
+    robotics = pytest.importorskip(
+        "gymnasium_robotics", reason="needs gymnasium-robotics, which brings MuJoCo"
+    )
+    gymnasium.register_envs(robotics)
+
+    def make():
+        return gymnasium.make("FetchPush-v4")
+
+    env, reference = gymnasium.make("torch_panda/PandaPush-v1"), make()
+    for each in (env, reference):
+        each.reset(seed=0)
+    results = [run(theirs, reference, make), run(ours, env, make)]
+    check_alike(*results, is_fetch=True)
+    for each in (env, reference):
+        each.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_fetch_has_the_same_clock_and_scale():
+    robotics = pytest.importorskip(
+        "gymnasium_robotics", reason="needs gymnasium-robotics, which brings MuJoCo"
+    )
+    gymnasium.register_envs(robotics)
+    fetch = gymnasium.make("FetchReach-v4")
+    assert fetch.spec.max_episode_steps == 50
+    assert fetch.unwrapped.dt == pytest.approx(0.04)
+    assert fetch.action_space.shape == (4,)
+    fetch.close()
+
+
+def test_an_exact_state_goes_on():
+    """As `restore_state` is meant to."""
+    env = gymnasium.make("torch_panda/PandaPush-v3")
+    env.reset(seed=0)
+    action = np.float32([0.3, 0.2, -1.0])
+    for _ in range(5):
+        env.step(action)
+    state = env.unwrapped.torch_env.get_state(exact=True)
+    expected = env.step(action)[0]
+    env.reset(options={"state": state})
+    np.testing.assert_equal(env.step(action)[0], expected)
+    env.close()

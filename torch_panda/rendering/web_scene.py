@@ -1,0 +1,253 @@
+"""A scene in viser's scene tree, for browsers; needs the extra ``viewer``."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+import viser
+from PIL import Image
+from viser.transforms import SO3
+
+from torch_panda.bullet import Box, Cylinder, PhysicsClient, Scene, Sphere, Visual
+from torch_panda.bullet.shapes import LIGHT_GREY, Shape
+from torch_panda.rendering.mesh_decimation import decimated_urdf
+
+MESH_CELL = 0.003  # how coarse meshes are [m]
+MAKES_A_BODY = ("load_urdf", "create_body", "create_marker")  # in the order of ids
+YELLOW = (255, 190, 0)
+
+Floats = npt.NDArray[np.float64]
+Joint = tuple[Any, Floats, SO3, Floats, bool]  # see WebScene._add_urdf
+
+
+class WebScene:
+    """The bodies of a client, drawn by a viser server.
+
+    Args:
+        server: draws them.
+        client: that holds the scene; it is asked what was built, and left as it is.
+        scene: the body ids.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, client: PhysicsClient, scene: Scene
+    ) -> None:
+        self._tree = server.scene
+        self._tree.set_up_direction("+z")
+        self._joints: list[Joint] = []
+        self._nodes: dict[int, Any] = {}
+        build = [x for x in client.blueprint if x[0] in MAKES_A_BODY]
+        for body, (kind, *arguments) in enumerate(build):
+            name = f"/body{body}"
+            if kind == "load_urdf":
+                urdf, pose, _ = arguments
+                self._nodes[body] = self._tree.add_frame(name, show_axes=False)
+                _place(self._nodes[body], np.array(pose))
+                movable = {
+                    joint.name for joint in client.joints(body) if joint.is_movable
+                }
+                handles = self._add_urdf(name, urdf, movable)
+                if body == scene.robot:
+                    order = [j.name for j in client.joints(body) if j.is_movable]
+                    self._joints = [handles[joint] for joint in order]
+            else:
+                shape, _, position, visual = arguments
+                is_marker = kind == "create_marker"
+                node = self._add_shape(name, shape, visual, is_marker=is_marker)
+                if node is not None:
+                    self._nodes[body] = node
+                    node.position = position
+        self._objects = [self._nodes.get(body) for body in scene.objects]
+        self._markers = [self._nodes.get(body) for body in scene.markers]
+
+    def show(
+        self,
+        joint_position: Floats,
+        object_pose: Floats,
+        marker_pose: Floats,
+        arrows: Floats,
+    ) -> None:
+        """Show one environment.
+
+        Args:
+            joint_position: (n_joints,) [rad] or [m].
+            object_pose: (n_objects, 7), position [m] and quaternion xyzw.
+            marker_pose: (n_markers, 7).
+            arrows: (n, 2, 3), their starts and ends, world frame [m].
+        """
+        for (node, origin, rotation, axis, slides), q in zip(
+            self._joints, joint_position, strict=True
+        ):
+            if slides:
+                node.position = origin + rotation @ (axis * q)
+            else:
+                node.wxyz = (rotation @ SO3.exp(axis * q)).wxyz
+        for nodes, poses in (
+            (self._objects, object_pose),
+            (self._markers, marker_pose),
+        ):
+            for node, pose in zip(nodes, poses, strict=True):
+                if node is not None:
+                    _place(node, pose)
+        self._tree.add_arrows(
+            "/contacts",
+            arrows,
+            YELLOW,
+            shaft_radius=0.003,
+            head_radius=0.007,
+            head_length=0.015,
+            visible=len(arrows) > 0,
+        )
+
+    # ---- what is drawn -----------------------------------------------------------
+
+    def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
+        """Add a body's links, each below its parent: the tree does the kinematics.
+
+        Returns:
+            By joint: the link's node, the joint's origin and rotation in the parent's
+            frame, its axis, and whether it slides.
+        """
+        source = decimated_urdf(file, MESH_CELL)
+        tree = ElementTree.parse(source)
+        colors = {
+            material.get("name"): _numbers(color.get("rgba"), (1, 1, 1, 1))
+            for material in tree.iter("material")
+            if (color := material.find("color")) is not None
+        }
+        joints = {x.find("child").get("link"): x for x in tree.findall("joint")}  # type: ignore[union-attr]
+        names: dict[str, str] = {}
+        handles: dict[str, Joint] = {}
+
+        def path(link: str) -> str:
+            """The link's node, which is added when first asked for."""
+            if link in names:
+                return names[link]
+            joint = joints.get(link)
+            if joint is None:
+                names[link] = root
+                return root
+            parent = joint.find("parent").get("link")  # type: ignore[union-attr]
+            names[link] = f"{path(parent)}/{link}"  # type: ignore[arg-type]
+            origin, rotation = _origin(joint)
+            node = self._tree.add_frame(
+                names[link], show_axes=False, position=origin, wxyz=rotation.wxyz
+            )
+            axis = joint.find("axis")
+            direction = _numbers(None if axis is None else axis.get("xyz"), (1, 0, 0))
+            if joint.get("name") in movable:
+                slides = joint.get("type") == "prismatic"
+                handles[str(joint.get("name"))] = (
+                    node, origin, rotation, direction, slides,
+                )  # fmt: skip
+            return names[link]
+
+        for link in tree.findall("link"):
+            parent = path(str(link.get("name")))
+            for k, visual in enumerate(link.findall("visual")):
+                material = visual.find("material")
+                name = None if material is None else material.get("name")
+                mesh = _read_mesh(visual, source)
+                if mesh is not None:
+                    node_name = f"{parent}/visual{k}"
+                    origin, rotation = _origin(visual)
+                    pose = {"position": origin, "wxyz": rotation.wxyz}
+                    if _has_texture(mesh):
+                        self._tree.add_mesh_trimesh(node_name, mesh, **pose)
+                    else:
+                        self._tree.add_mesh_simple(
+                            node_name,
+                            mesh.vertices,
+                            mesh.faces,
+                            color=colors.get(name, np.ones(4))[:3],
+                            **pose,
+                        )
+        return handles
+
+    def _add_shape(
+        self, name: str, shape: Shape | None, visual: Visual, *, is_marker: bool
+    ) -> Any:  # noqa: ANN401 (viser's handles)
+        """Add a body of one shape; None: it has none."""
+        if isinstance(shape, Box) and visual.texture is not None and not is_marker:
+            return self._tree.add_mesh_trimesh(
+                name, textured_box(shape, visual.texture)
+            )
+        look: dict[str, Any] = {
+            "color": visual.color if visual.texture is None else LIGHT_GREY,
+            "opacity": visual.opacity if is_marker else None,
+        }
+        match shape:
+            case Box(half_extents):
+                size = tuple(2 * x for x in half_extents)
+                return self._tree.add_box(name, dimensions=size, **look)
+            case Cylinder(radius, height):
+                return self._tree.add_cylinder(name, radius, height, **look)
+            case Sphere(radius):
+                return self._tree.add_icosphere(name, radius, **look)
+        return None
+
+
+def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
+    """A box in the colours in the middle of a texture's six squares; see `Visual`."""
+    mesh = trimesh.creation.box(extents=[2 * x for x in box.half_extents])
+    mesh.unmerge_vertices()
+    axis = np.abs(mesh.face_normals).argmax(axis=1)
+    below = mesh.face_normals.sum(axis=1) < 0
+    middle = np.stack(((axis + 0.5) / 3, np.where(below, 0.25, 0.75)), axis=1)
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=np.repeat(middle, 3, axis=0),
+        # Without reflections, metal is black.
+        material=trimesh.visual.material.PBRMaterial(
+            baseColorTexture=Image.open(texture).convert("RGB"),
+            metallicFactor=0.0,
+            roughnessFactor=0.8,
+        ),
+    )
+    return mesh
+
+
+def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | None:
+    """The shape of a visual of a URDF; None: its geometry is not one we know."""
+    if (kind := visual.find("geometry/*")) is None:
+        return None
+    match kind.tag:
+        case "mesh":
+            mesh = trimesh.load(urdf.parent / str(kind.get("filename")), force="mesh")
+            return mesh.apply_scale(_numbers(kind.get("scale"), (1, 1, 1)))
+        case "box":
+            return trimesh.creation.box(_numbers(kind.get("size"), (1, 1, 1)))
+        case "sphere":
+            return trimesh.creation.icosphere(radius=float(kind.get("radius", 1)))
+        case "cylinder":
+            radius, length = (float(kind.get(x, 1)) for x in ("radius", "length"))
+            return trimesh.creation.cylinder(radius, length)
+    return None
+
+
+def _has_texture(mesh: trimesh.Trimesh) -> bool:
+    """Whether it has one of its own; trimesh's stand-in has 2 x 2 pixels."""
+    if mesh.visual.kind != "texture":
+        return False
+    image = mesh.visual.material.image
+    return image is not None and image.width > 2
+
+
+def _origin(element: ElementTree.Element) -> tuple[Floats, SO3]:
+    """Where a joint or a visual is in its link's frame."""
+    origin = element.find("origin")
+    attributes = {} if origin is None else origin.attrib
+    position = _numbers(attributes.get("xyz"), (0, 0, 0))
+    return position, SO3.from_rpy_radians(*_numbers(attributes.get("rpy"), (0, 0, 0)))
+
+
+def _numbers(text: str | None, default: tuple[float, ...]) -> Floats:
+    return np.array(default if text is None else text.split(), dtype=float)
+
+
+def _place(node: Any, pose: Floats) -> None:  # noqa: ANN401 (viser's handles)
+    """Put a node at a pose, (7,): position [m] and quaternion xyzw."""
+    node.position = pose[:3]
+    node.wxyz = pose[[6, 3, 4, 5]]

@@ -1,0 +1,221 @@
+"""A viewer in the browser: what was seen of each episode, live and in retrospect.
+
+This module needs the extra ``viewer``.
+"""
+
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import viser
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.closing import Closing
+from torch_panda.rendering.camera import Camera
+from torch_panda.rendering.web_scene import WebScene
+
+POSITION = 3  # numbers of an object's part of a goal
+ARROW_LENGTH = 0.005  # of a contact's force [m/N]
+LONGEST_ARROW = 0.12  # [m]
+
+
+class Frame(NamedTuple):
+    """An environment at one step; see `WebScene.show`."""
+
+    joint_position: npt.NDArray[np.float64]
+    object_pose: npt.NDArray[np.float64]
+    marker_pose: npt.NDArray[np.float64]
+    forces: npt.NDArray[np.float64]
+    status: str
+
+
+class WebViewer(Closing):
+    """Serves a page that shows one environment of a simulation.
+
+    See `RobotTaskEnv.open_viewer`. Call `update` after each reset and step, in the
+    thread that steps: it is what the page then shows and what its slider goes back to.
+
+    Args:
+        simulation: whose state is shown.
+        observe: gives ``step_count``, ``success`` (num_envs, 1), ``achieved_goal`` and
+            ``desired_goal`` (num_envs, goal_dim).
+        max_episode_steps: where the slider ends.
+        title: of the page.
+        camera: where the view starts.
+        host: the address at which it serves.
+        port: or the next one that is free.
+    """
+
+    def __init__(
+        self,
+        simulation: VectorSimulation,
+        observe: Callable[[], dict[str, Tensor]],
+        *,
+        max_episode_steps: int,
+        title: str,
+        camera: Camera,
+        host: str,
+        port: int,
+    ) -> None:
+        self._simulation, self._observe, self._title = simulation, observe, title
+        self._episodes: list[list[Frame]] = [[] for _ in range(simulation.num_envs)]
+        self._env = 0
+        # The page's controls act in threads of viser.
+        self._lock = threading.RLock()
+        self._resumed = threading.Event()
+        self._resumed.set()
+        self._server = server = viser.ViserServer(
+            host=host, port=port, label=title, verbose=False
+        )
+        server.initial_camera.look_at = camera.target
+        server.initial_camera.position = eye(camera)
+        self._scene = WebScene(server, simulation.clients[0], simulation.scene)
+        gui = server.gui
+        self._status = gui.add_markdown("waiting for the first step")
+        self._note = gui.add_markdown("")
+        self._chosen = gui.add_slider(
+            "environment", 0, max(simulation.num_envs - 1, 1), 1, 0,
+            disabled=simulation.num_envs == 1,
+        )  # fmt: skip
+        self._step = gui.add_slider("step", 0, max_episode_steps, 1, 0)
+        self._pause = gui.add_checkbox("pause", False)
+        self._contacts = gui.add_checkbox("contacts", True)
+        self._chosen.on_update(self._choose)
+        self._step.on_update(self._go_to)
+        self._pause.on_update(self._set_paused)
+        self._contacts.on_update(lambda _: self._draw())
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    @property
+    def paused(self) -> bool:
+        """Whether the page is held at a step."""
+        return not self._resumed.is_set()
+
+    def update(self) -> None:
+        """Take all environments as they are now; show the chosen one unless paused.
+
+        An environment at step 0 begins a new episode, and forgets the last one.
+        """
+        simulation, now = self._simulation, self._observe()
+        envs = range(simulation.num_envs)
+        steps = now["step_count"].flatten().tolist()
+        forces: list[npt.NDArray[np.float64]] = [np.zeros((0, 2, 3)) for _ in envs]
+
+        def feel(env: int) -> None:
+            forces[env] = read_forces(simulation.clients[env], simulation)
+
+        simulation.run(feel, [env for env in envs if steps[env] > 0])
+        with self._lock:
+            for env in envs:
+                if steps[env] == 0:
+                    self._episodes[env].clear()
+                self._episodes[env].append(
+                    Frame(
+                        simulation.joint_position[env].numpy().copy(),
+                        simulation.object_pose[env].numpy().copy(),
+                        simulation.marker_pose[env].numpy().copy(),
+                        forces[env],
+                        describe(steps[env], {key: x[env] for key, x in now.items()}),
+                    )
+                )
+            if not self.paused:
+                self._step.value = len(self._episodes[self._env]) - 1
+                self._draw()
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Return when the page is not, or no longer, paused, or after so long [s]."""
+        self._resumed.wait(timeout)
+
+    def write(self, note: str) -> None:
+        """Show a line of Markdown beside the scene, such as what policy acts."""
+        self._note.content = note
+
+    def close(self) -> None:
+        """Stop the server. Closing again does nothing."""
+        self._resumed.set()
+        self._server.stop()
+
+    # ---- the page's controls -----------------------------------------------------
+
+    def _choose(self, event: Any) -> None:  # noqa: ANN401 (viser's)
+        with self._lock:
+            self._env = min(int(self._chosen.value), len(self._episodes) - 1)
+            if not self.paused:
+                self._step.value = max(len(self._episodes[self._env]) - 1, 0)
+            self._draw()
+
+    def _go_to(self, event: Any) -> None:  # noqa: ANN401 (viser's)
+        if event.client is not None:  # a person's, not `update`'s
+            self._pause.value = True
+            self._draw()
+
+    def _set_paused(self, event: Any) -> None:  # noqa: ANN401 (viser's)
+        if self._pause.value:
+            self._resumed.clear()
+        else:
+            self._resumed.set()
+
+    def _draw(self) -> None:
+        """Show the chosen step of the chosen environment."""
+        with self._lock:
+            episode = self._episodes[self._env]
+            if not episode:
+                return
+            frame = episode[min(int(self._step.value), len(episode) - 1)]
+            number = f", environment {self._env}" if len(self._episodes) > 1 else ""
+            self._status.content = f"**{self._title}**{number}\n\n{frame.status}"
+            forces = frame.forces if self._contacts.value else frame.forces[:0]
+            with self._server.atomic():
+                self._scene.show(*frame[:3], arrows(forces))
+
+
+def read_forces(
+    client: PhysicsClient, simulation: VectorSimulation
+) -> npt.NDArray[np.float64]:
+    """Points and forces on objects, and on the robot otherwise: (n, 2, 3)."""
+    scene = simulation.scene
+    rank = {body: 2 for body in scene.objects} | {scene.robot: 1}
+    found = []
+    for contact in client.contact_points():
+        if rank.get(contact.body_a, 0) < rank.get(contact.body_b, 0):
+            contact = contact.swapped()
+        if contact.body_a in rank and contact.normal_force > 0:
+            found.append((contact.position_on_a, contact.force_on_a))
+    return np.array(found, dtype=float).reshape(-1, 2, POSITION)
+
+
+def arrows(forces: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """From where forces (n, 2, 3) act, along them: (n, 2, 3), start and end [m]."""
+    point, force = forces[:, 0], forces[:, 1]
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    length = np.minimum(ARROW_LENGTH * size, LONGEST_ARROW)
+    return np.stack((point, point + length * force / np.maximum(size, 1e-9)), axis=1)
+
+
+def describe(step: int, state: dict[str, Tensor]) -> str:
+    """Step, success and distance in Markdown."""
+    lines = [f"step {step}", "**success**" if state["success"] else "no success yet"]
+    difference = (state["achieved_goal"] - state["desired_goal"]).double()
+    if len(difference) % POSITION == 0:  # a position for each object
+        distance = difference.reshape(-1, POSITION).norm(dim=1).max()
+        lines.append(f"{100 * distance:.1f} cm from the goal")
+    return "  \n".join(lines)
+
+
+def eye(camera: Camera) -> tuple[float, float, float]:
+    """Where a camera is, world frame [m]; see `Camera`."""
+    yaw, pitch = np.radians(camera.yaw), np.radians(camera.pitch)
+    x, y, z = camera.target
+    flat = camera.distance * np.cos(pitch)
+    return (
+        x + flat * np.sin(yaw),
+        y - flat * np.cos(yaw),
+        z - camera.distance * np.sin(pitch),
+    )
