@@ -6,6 +6,7 @@ python examples/gallery.py --policies examples/policies/*.pt --out policies.png
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -81,15 +82,20 @@ def write(path: Path, pictures: list[Picture]) -> None:
     """Write one picture, or an animation, in 256 colours: a third of the size."""
     images = [Image.fromarray(picture).quantize(256) for picture in pictures]
     if path.suffix == ".gif":
-        options = {"append_images": images[1:], "save_all": True, "loop": 0}
-        images[0].save(path, duration=2000 // FPS, **options)
+        images[0].save(
+            path,
+            append_images=images[1:],
+            duration=2000 // FPS,
+            save_all=True,
+            loop=0,
+        )
     else:
         images[0].save(path, optimize=True)
 
 
 def main(args: Args) -> None:
     """Draw what was asked for."""
-    options = {"seed": args.seed, "size": args.size}
+    show = partial(draw, seed=args.seed, size=args.size)
     try:
         if args.out.suffix not in (".png", ".gif"):
             raise ValueError(f"out must end in .png or .gif, got {args.out.name!r}")
@@ -98,16 +104,14 @@ def main(args: Args) -> None:
             rows = [
                 np.hstack([cells[step] for step in COLUMNS])
                 for path in args.policies
-                for cells in [
-                    draw(read_checkpoint(path)["env_id"], path, max(COLUMNS), **options)
-                ]
+                for cells in [show(read_checkpoint(path)["env_id"], path, max(COLUMNS))]
             ]
             pictures = [np.vstack(rows)]
         else:
             animated = args.out.suffix == ".gif"
             steps = 50 if animated else args.step
             episodes = [
-                draw(env_id, make_expert(env_id), steps, **options)
+                show(env_id, make_expert(env_id), steps)
                 for env_id in (f"Panda{task}-v1" for task in TASKS)
             ]
             # Every other step, in real time.

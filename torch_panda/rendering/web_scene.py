@@ -39,7 +39,9 @@ class WebScene:
         self._tree.set_up_direction("+z")
         self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
-        build = [x for x in client.blueprint if x[0] in MAKES_A_BODY]
+        build: list[tuple[Any, ...]] = [
+            command for command in client.blueprint if command[0] in MAKES_A_BODY
+        ]
         for body, (kind, *arguments) in enumerate(build):
             name = f"/body{body}"
             if kind == "load_urdf":
@@ -104,7 +106,7 @@ class WebScene:
 
     # ---- what is drawn -----------------------------------------------------------
 
-    def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
+    def _add_urdf(self, root: str, file: str, movable: set[str]) -> dict[str, Joint]:
         """Add a body's links, each below its parent: the tree does the kinematics.
 
         Returns:
@@ -229,9 +231,10 @@ def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | Non
 
 def _has_texture(mesh: trimesh.Trimesh) -> bool:
     """Whether it has one of its own; trimesh's stand-in has 2 x 2 pixels."""
-    if mesh.visual.kind != "texture":
+    visual: Any = mesh.visual
+    if visual.kind != "texture":
         return False
-    image = mesh.visual.material.image
+    image = visual.material.image
     return image is not None and image.width > 2
 
 
