@@ -27,8 +27,9 @@ class Gripper:
     width: float
     scale: float = 0.2
     followers: tuple[int, ...] = ()
-    # Which joints lead, and by how much all move for each metre of width.
-    _leads: Tensor = field(init=False, repr=False, compare=False)
+    # The width is the joints times these, and an offset; and how far all move with it.
+    _weights: Tensor = field(init=False, repr=False, compare=False)
+    _offset: float = field(init=False, repr=False, compare=False)
     _per_width: Tensor = field(init=False, repr=False, compare=False)
     _closed: Tensor = field(init=False, repr=False, compare=False)
 
@@ -43,13 +44,16 @@ class Gripper:
             )
         if not self.width > 0:
             raise ValueError(f"width must be above 0 [m], got {self.width}")
-        object.__setattr__(self, "_closed", closed)
-        object.__setattr__(self, "_per_width", (opened - closed) / self.width)
+        per_width = (opened - closed) / self.width
         leads = closed != opened
         leads[list(self.followers)] = False
         if not leads.any():
             raise ValueError(f"not all joints can follow, got {self.followers}")
-        object.__setattr__(self, "_leads", leads)
+        weights = torch.where(leads, 1 / per_width, 0.0) / leads.sum()
+        object.__setattr__(self, "_closed", closed)
+        object.__setattr__(self, "_per_width", per_width)
+        object.__setattr__(self, "_weights", weights)
+        object.__setattr__(self, "_offset", -float((closed * weights).sum()))
 
     @property
     def num_joints(self) -> int:
@@ -58,9 +62,7 @@ class Gripper:
 
     def fingers_width(self, joints: Tensor) -> Tensor:
         """Distance between the fingers [m]: (n, num_joints) -> (n, 1)."""
-        leads = self._leads
-        widths = (joints - self._closed)[:, leads] / self._per_width[leads]
-        return widths.mean(dim=1, keepdim=True)
+        return (joints * self._weights).sum(dim=1, keepdim=True) + self._offset
 
     def setpoint(self, action: Tensor, joints: Tensor) -> Tensor:
         """Where an action sends the joints.
