@@ -7,6 +7,7 @@ python examples/gallery.py --policies examples/policies/*.pt --out policies.png
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -81,15 +82,20 @@ def write(path: Path, pictures: list[Picture]) -> None:
     """Write one picture, or an animation, in 256 colours: a third of the size."""
     images = [Image.fromarray(picture).quantize(256) for picture in pictures]
     if path.suffix == ".gif":
-        options = {"append_images": images[1:], "save_all": True, "loop": 0}
-        images[0].save(path, duration=2000 // FPS, **options)
+        images[0].save(
+            path,
+            save_all=True,
+            append_images=images[1:],
+            duration=2000 // FPS,
+            loop=0,
+        )
     else:
         images[0].save(path, optimize=True)
 
 
 def main(args: Args) -> None:
     """Draw what was asked for."""
-    options = {"seed": args.seed, "size": args.size}
+    options: dict[str, Any] = {"seed": args.seed, "size": args.size}
     try:
         if args.out.suffix not in (".png", ".gif"):
             raise ValueError(f"out must end in .png or .gif, got {args.out.name!r}")

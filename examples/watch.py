@@ -133,7 +133,7 @@ def main(args: Args) -> None:
             else:
                 policy = RandomPolicy(env.action_spec)
             if args.web:
-                policies = itertools.repeat(policy)
+                policies: Iterator[TensorDictModuleBase] = itertools.repeat(policy)
                 if checkpoint:
                     policies = follow(Path(args.policy), env)
                 serve(env, policies, host=args.host, port=args.port)

@@ -40,19 +40,17 @@ class WebScene:
         self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
         build = [x for x in client.blueprint if x[0] in MAKES_A_BODY]
+        arguments: Any  # of the commands that built the scene
         for body, (kind, *arguments) in enumerate(build):
             name = f"/body{body}"
             if kind == "load_urdf":
                 urdf, pose, _ = arguments
                 self._nodes[body] = self._tree.add_frame(name, show_axes=False)
                 _place(self._nodes[body], np.array(pose))
-                movable = {
-                    joint.name for joint in client.joints(body) if joint.is_movable
-                }
+                movable = [x.name for x in client.joints(body) if x.is_movable]
                 handles = self._add_urdf(name, urdf, movable)
                 if body == scene.robot:
-                    order = [j.name for j in client.joints(body) if j.is_movable]
-                    self._joints = [handles[joint] for joint in order]
+                    self._joints = [handles[joint] for joint in movable]
             else:
                 shape, _, position, visual = arguments
                 is_marker = kind == "create_marker"
