@@ -6,8 +6,8 @@ python examples/gallery.py --policies examples/policies/*.pt --out policies.png
 """
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -84,9 +84,9 @@ def write(path: Path, pictures: list[Picture]) -> None:
     if path.suffix == ".gif":
         images[0].save(
             path,
+            save_all=True,
             append_images=images[1:],
             duration=2000 // FPS,
-            save_all=True,
             loop=0,
         )
     else:
@@ -95,7 +95,7 @@ def write(path: Path, pictures: list[Picture]) -> None:
 
 def main(args: Args) -> None:
     """Draw what was asked for."""
-    show = partial(draw, seed=args.seed, size=args.size)
+    options: dict[str, Any] = {"seed": args.seed, "size": args.size}
     try:
         if args.out.suffix not in (".png", ".gif"):
             raise ValueError(f"out must end in .png or .gif, got {args.out.name!r}")
@@ -104,14 +104,16 @@ def main(args: Args) -> None:
             rows = [
                 np.hstack([cells[step] for step in COLUMNS])
                 for path in args.policies
-                for cells in [show(read_checkpoint(path)["env_id"], path, max(COLUMNS))]
+                for cells in [
+                    draw(read_checkpoint(path)["env_id"], path, max(COLUMNS), **options)
+                ]
             ]
             pictures = [np.vstack(rows)]
         else:
             animated = args.out.suffix == ".gif"
             steps = 50 if animated else args.step
             episodes = [
-                show(env_id, make_expert(env_id), steps)
+                draw(env_id, make_expert(env_id), steps, **options)
                 for env_id in (f"Panda{task}-v1" for task in TASKS)
             ]
             # Every other step, in real time.

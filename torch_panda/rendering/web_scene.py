@@ -39,22 +39,18 @@ class WebScene:
         self._tree.set_up_direction("+z")
         self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
-        build: list[tuple[Any, ...]] = [
-            command for command in client.blueprint if command[0] in MAKES_A_BODY
-        ]
+        build = [x for x in client.blueprint if x[0] in MAKES_A_BODY]
+        arguments: Any  # of the commands that built the scene
         for body, (kind, *arguments) in enumerate(build):
             name = f"/body{body}"
             if kind == "load_urdf":
                 urdf, pose, _ = arguments
                 self._nodes[body] = self._tree.add_frame(name, show_axes=False)
                 _place(self._nodes[body], np.array(pose))
-                movable = {
-                    joint.name for joint in client.joints(body) if joint.is_movable
-                }
+                movable = [x.name for x in client.joints(body) if x.is_movable]
                 handles = self._add_urdf(name, urdf, movable)
                 if body == scene.robot:
-                    order = [j.name for j in client.joints(body) if j.is_movable]
-                    self._joints = [handles[joint] for joint in order]
+                    self._joints = [handles[joint] for joint in movable]
             else:
                 shape, _, position, visual = arguments
                 is_marker = kind == "create_marker"
@@ -106,7 +102,7 @@ class WebScene:
 
     # ---- what is drawn -----------------------------------------------------------
 
-    def _add_urdf(self, root: str, file: str, movable: set[str]) -> dict[str, Joint]:
+    def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
         """Add a body's links, each below its parent: the tree does the kinematics.
 
         Returns:
@@ -231,10 +227,9 @@ def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | Non
 
 def _has_texture(mesh: trimesh.Trimesh) -> bool:
     """Whether it has one of its own; trimesh's stand-in has 2 x 2 pixels."""
-    visual: Any = mesh.visual
-    if visual.kind != "texture":
+    if mesh.visual.kind != "texture":
         return False
-    image = visual.material.image
+    image = mesh.visual.material.image
     return image is not None and image.width > 2
 
 
