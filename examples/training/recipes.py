@@ -53,7 +53,15 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
-    "Stack": {**OBJECT, "total_steps": 1_000_000, "her": "parts"},
+    "Stack": {
+        **OBJECT,
+        "relative_inputs": "fine",
+        "start_at_object": 0.5,
+        "her": "parts",
+        "anneal_lr": True,
+        "total_steps": 1_000_000,
+        "eval_interval": 20_000,
+    },
     "Flip": {**OBJECT, "total_steps": 1_000_000},
 }
 
