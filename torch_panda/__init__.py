@@ -14,7 +14,9 @@ from torch_panda.rendering import Camera
 from torch_panda.robots import Panda, Robot
 from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
+    Drawer,
     Flip,
+    PegInsertion,
     PickAndPlace,
     Push,
     Reach,
@@ -28,9 +30,11 @@ __all__ = [
     "BulletError",
     "Camera",
     "CameraSensor",
+    "Drawer",
     "Flip",
     "ForceSensor",
     "Panda",
+    "PegInsertion",
     "PhysicsName",
     "PhysicsParams",
     "PickAndPlace",

@@ -17,7 +17,9 @@ from torch_panda.rendering import Camera
 from torch_panda.robots import ControlType, Panda, Robot
 from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import (
+    Drawer,
     Flip,
+    PegInsertion,
     PickAndPlace,
     Push,
     Reach,
@@ -26,6 +28,7 @@ from torch_panda.tasks import (
     Stack,
     Task,
 )
+from torch_panda.tasks.peg_insertion import HOLE_WIDTH
 from torch_panda.versions import (
     NO_PAIRS,
     ROBOT_ARGUMENTS,
@@ -41,9 +44,16 @@ _TASKS: dict[str, type[Task]] = {
     "PickAndPlace": PickAndPlace,
     "Stack": Stack,
     "Flip": Flip,
+    "Drawer": Drawer,
+    "PegInsertion": PegInsertion,
 }
 # Tasks that are done with the gripper blocked, so without an action for it.
-_BLOCKED_GRIPPER = ("Reach", "Push", "Slide")
+_BLOCKED_GRIPPER = ("Reach", "Push", "Slide", "Drawer", "PegInsertion")
+# Those that panda-gym does not have, and what their robots are made with.
+_OWN_TASKS: dict[str, dict[str, Any]] = {
+    "Drawer": {},
+    "PegInsertion": {"fingers_width": HOLE_WIDTH, "finger_friction": 5.0},
+}
 _CONTROL: dict[str, ControlType] = {"": "ee", "Joints": "joints"}
 _REWARD: dict[str, RewardType] = {"": "sparse", "Dense": "dense"}
 
@@ -65,6 +75,7 @@ _ENVS = {
             control_type=_CONTROL[control],
             block_gripper=task in _BLOCKED_GRIPPER,
             **arguments_of(ROBOT_ARGUMENTS.get(task, NO_PAIRS), version),
+            **_OWN_TASKS.get(task, {}),
         ),
         task=partial(
             _TASKS[task],
@@ -75,10 +86,14 @@ _ENVS = {
         terminate_on_success=version == "v3",
     )
     for task, control, reward, version in product(_TASKS, _CONTROL, _REWARD, VERSIONS)
+    if task not in _OWN_TASKS or version == "v1"
 }
 
 ENV_IDS: tuple[str, ...] = tuple(_ENVS)
-"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}``."""
+"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}``.
+
+Tasks that panda-gym does not have are -v1 only.
+"""
 
 
 def register(
@@ -234,9 +249,11 @@ def _find(env_id: str) -> _Registration:
         close = difflib.get_close_matches(str(env_id), _ENVS, n=3)
         hint = f"did you mean {' or '.join(close)}? " if close else ""
         own = ", ".join(sorted(_ENVS.keys() - set(ENV_IDS)))
+        both = ",".join(task for task in _TASKS if task not in _OWN_TASKS)
         raise ValueError(
             f"unknown environment id {env_id!r}; {hint}accepted are "
-            f"Panda{{{','.join(_TASKS)}}}{{,Joints}}{{,Dense}}-v{{1,3}}"
+            f"Panda{{{both}}}{{,Joints}}{{,Dense}}-v{{1,3}}, "
+            f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1"
             + (f" and what was registered: {own}" if own else "")
         )
     return _ENVS[env_id]

@@ -15,6 +15,7 @@ EE_LINK = 11
 # The hand's mount, where the real arm carries a force and torque sensor.
 WRIST_JOINT = 8
 FINGER_LINKS = (9, 10)
+LARGEST_WIDTH = 0.08  # [m], between the fingers
 # An action of 1 opens the fingers by this much [m].
 GRIPPER_SCALE = 0.2
 
@@ -31,6 +32,7 @@ class Panda(Robot):
         control_type: "ee" or "joints".
         block_gripper: keep the gripper closed.
         base_position: of the base, world frame [m].
+        fingers_width: distance between the fingers at the start of an episode [m].
         finger_friction: lateral friction of the fingers.
         finger_spinning_friction: of the fingers; None leaves what the URDF has, 0.1.
     """
@@ -41,12 +43,19 @@ class Panda(Robot):
         control_type: ControlType = "ee",
         block_gripper: bool = False,
         base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+        fingers_width: float = 0.0,
         finger_friction: float = 1.0,
         finger_spinning_friction: float | None = None,
     ) -> None:
+        if not 0 <= fingers_width <= LARGEST_WIDTH:
+            raise ValueError(
+                f"fingers_width must be from 0 to {LARGEST_WIDTH} [m], got "
+                f"{fingers_width}"
+            )
+        fingers = (fingers_width / 2,) * 2
         super().__init__(
             urdf="franka_panda/panda.urdf",
-            neutral_joint_position=NEUTRAL_JOINT_POSITION,
+            neutral_joint_position=(*NEUTRAL_JOINT_POSITION[:7], *fingers),
             joint_forces=JOINT_FORCES,
             ee_link=EE_LINK,
             num_arm_joints=7,

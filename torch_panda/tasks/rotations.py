@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from torch import Tensor
 
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -17,6 +18,13 @@ def quaternion_to_euler(quaternion: Tensor) -> Tensor:
     # of tensors, and give the bits of the C library's functions.
     angles = [_euler_angles(*row) for row in quaternion.reshape(-1, 4).tolist()]
     return quaternion.new_tensor(angles).reshape(*quaternion.shape[:-1], 3)
+
+
+def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
+    """Rotate vectors by unit quaternions xyzw: (..., 4), (..., 3) -> (..., 3)."""
+    axis, w = quaternion[..., :3], quaternion[..., 3:]
+    turn = 2 * torch.linalg.cross(axis, vector.expand_as(axis))
+    return vector + w * turn + torch.linalg.cross(axis, turn)
 
 
 def _euler_angles(x: float, y: float, z: float, w: float) -> tuple[float, float, float]:
