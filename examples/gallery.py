@@ -16,7 +16,10 @@ import torch_panda
 from experts import make_expert
 from video import tile
 
-TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+TASKS = (
+    *("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip"),
+    *("Drawer", "PegInsertion"),
+)
 
 
 @dataclass

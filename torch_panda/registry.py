@@ -28,7 +28,7 @@ from torch_panda.tasks import (
     Stack,
     Task,
 )
-from torch_panda.tasks.peg_insertion import HOLE_WIDTH
+from torch_panda.tasks.peg_insertion import GRASP_WIDTH
 from torch_panda.versions import (
     NO_PAIRS,
     ROBOT_ARGUMENTS,
@@ -52,7 +52,7 @@ _BLOCKED_GRIPPER = ("Reach", "Push", "Slide", "Drawer", "PegInsertion")
 # Those that panda-gym does not have, and what their robots are made with.
 _OWN_TASKS: dict[str, dict[str, Any]] = {
     "Drawer": {},
-    "PegInsertion": {"fingers_width": HOLE_WIDTH, "finger_friction": 5.0},
+    "PegInsertion": {"fingers_width": GRASP_WIDTH, "finger_friction": 5.0},
 }
 _CONTROL: dict[str, ControlType] = {"": "ee", "Joints": "joints"}
 _REWARD: dict[str, RewardType] = {"": "sparse", "Dense": "dense"}

@@ -124,11 +124,12 @@ class Robot:
 
         Returns:
             (num_envs, k), float64: the end-effector's position [m] or the arm's joint
-            positions [rad], and behind it the positions of the other joints, here 0.
+            positions [rad], and behind it where the other joints start, at which they
+            stay here [rad] or [m].
         """
         arm = self.arm_setpoint(action, simulation)
-        others = len(self.joint_forces) - self.num_arm_joints
-        return torch.cat((arm, arm.new_zeros(len(arm), others)), dim=1)
+        others = arm.new_tensor(self.neutral_joint_position[self.num_arm_joints :])
+        return torch.cat((arm, others.expand(len(arm), -1)), dim=1)
 
     def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
         """The part of `setpoint` that is the arm's: (num_envs, 3 or arm joints)."""

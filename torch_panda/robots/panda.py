@@ -30,7 +30,7 @@ class Panda(Robot):
 
     Args:
         control_type: "ee" or "joints".
-        block_gripper: keep the gripper closed.
+        block_gripper: keep the fingers as they start, by default closed.
         base_position: of the base, world frame [m].
         fingers_width: distance between the fingers at the start of an episode [m].
         finger_friction: lateral friction of the fingers.
@@ -92,7 +92,7 @@ class Panda(Robot):
 
     def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
         """What actions ask the motors for; see `Robot.setpoint`."""
-        if self.block_gripper:  # closed: at 0
+        if self.block_gripper:
             return super().setpoint(action, simulation)
         arm = self.arm_setpoint(action, simulation)
         # In float32 throughout: so panda-gym computes it under NumPy 2.

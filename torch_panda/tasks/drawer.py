@@ -1,6 +1,5 @@
 """Drawer: open or close a drawer to a position."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ class Drawer(Task):
     Args:
         reward_type: "sparse" or "dense".
         distance_threshold: success is a distance below it [m].
-        cabinet_x_range: edge length along x of the rectangle of the cabinet's places [m].
+        cabinet_x_range: edge length along x of the rectangle of its places [m].
         cabinet_y_range: edge length along y [m].
         min_change: the least by which the drawer is to be moved, at most 0.125 [m].
         drawer_mass: [kg].
@@ -77,9 +76,7 @@ class Drawer(Task):
             x_offset=TABLE_X_OFFSET,
             friction=self.table_friction,
         )
-        drawer = client.load_urdf(
-            URDF, position=(CABINET_X, 0.0, 0.0), fixed_base=True
-        )
+        drawer = client.load_urdf(URDF, position=(CABINET_X, 0.0, 0.0), fixed_base=True)
         client.set_dynamics(drawer, SLIDE, mass=self.drawer_mass)
         client.set_joint_friction(drawer, SLIDE, self.drawer_friction)
         return Bodies(
@@ -88,8 +85,8 @@ class Drawer(Task):
 
     def sample_start(self, rng: np.random.Generator) -> Start:
         """Draw where the cabinet stands, how far it is open, and should be."""
-        ranges = np.array((self.cabinet_x_range, self.cabinet_y_range))
-        x, y = rng.uniform(-ranges / 2, ranges / 2) + (CABINET_X, 0.0)
+        x = CABINET_X + self.cabinet_x_range * rng.uniform(-0.5, 0.5)
+        y = self.cabinet_y_range * rng.uniform(-0.5, 0.5)
         # Uniform among the pairs that are far enough from each other.
         start, goal = rng.uniform(0.0, TRAVEL, size=2)
         while abs(goal - start) < self.min_change:

@@ -16,6 +16,9 @@ URDF = Path(__file__).with_name("hole.urdf")
 HOLE_WIDTH = 0.021  # [m], of the square hole
 HOLE_DEPTH = 0.05  # [m], as high as the block is
 PEG_LENGTH = 0.08  # [m]
+# Distance between the fingers at which they are kept [m]. Narrower than the peg, so
+# that they press on it; not much narrower, or it could move from one to the other.
+GRASP_WIDTH = 0.0198
 # Of the peg's centre at the start, world frame [m]: the fingers of a neutral Panda,
 # whose end-effector is at (0.0384, 0, 0.1974), hold its upper part.
 PEG_POSITION = (0.0384, 0.0, 0.1774)
