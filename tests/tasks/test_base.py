@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torch_panda import Flip, Push, Stack
-from torch_panda.tasks.rotations import quaternion_to_euler
+from torch_panda.tasks.rotations import quaternion_to_euler, rotate
 
 angle = st.floats(-math.pi, math.pi)
 
@@ -41,6 +41,15 @@ def test_euler_takes_any_leading_shape(shape):
         quaternion.reshape(-1, 4), angles.reshape(-1, 3), strict=True
     ):
         assert torch.equal(quaternion_to_euler(single), found)
+
+
+@given(angle, angle, angle)
+def test_rotate_equals_pybullet(roll, pitch, yaw):
+    quaternion = pybullet.getQuaternionFromEuler((roll, pitch, yaw))
+    vector = torch.tensor([[0.3, -0.2, 0.7], [-1.0, 2.0, 0.5]], dtype=torch.float64)
+    matrix = torch.tensor(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+    found = rotate(torch.tensor(quaternion, dtype=torch.float64), vector)
+    torch.testing.assert_close(found, vector @ matrix.double().T, atol=1e-6, rtol=0)
 
 
 def test_rewards_by_hand():

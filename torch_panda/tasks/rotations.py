@@ -22,8 +22,8 @@ def quaternion_to_euler(quaternion: Tensor) -> Tensor:
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
     """Rotate vectors by unit quaternions xyzw: (..., 4), (..., 3) -> (..., 3)."""
-    axis, w = quaternion[..., :3], quaternion[..., 3:]
-    turn = 2 * torch.linalg.cross(axis, vector.expand_as(axis))
+    axis, vector = torch.broadcast_tensors(quaternion[..., :3], vector)
+    w, turn = quaternion[..., 3:], 2 * torch.linalg.cross(axis, vector)
     return vector + w * turn + torch.linalg.cross(axis, turn)
 
 

@@ -34,6 +34,7 @@ def test_mirrored_starts_and_actions_give_mirrored_episodes(task):
         td = env.reset(state, set_state=True)
         for _ in range(10):
             action = 0.2 * torch.randn(len(geometry.action), generator=generator)
+            action[1] += 0.1  # out of the plane
             td["action"] = torch.stack((action, action * torch.tensor(geometry.action)))
             td = env.step(td)["next"]
             one, mirrored = td["observation"]
