@@ -9,13 +9,15 @@ from pathlib import Path
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule
 from tqdm import tqdm
 
 import torch_panda
 from evaluate import wilson_interval
 from experts import make_expert
-from limits import Positive, Seed, check_limits
+from limits import Positive, Seed, Weight, check_limits
 from training.files import prepare, save
 
 
@@ -33,15 +35,32 @@ class Args:
     """environments that are stepped in parallel"""
     num_threads: Positive | None = None
     """threads that step them; None means one per core"""
+    noise_eps: Weight = 0.0
+    """the standard deviation of Gaussian noise on the actions that are executed; saved
+    are the actions without it, so that who imitates them learns to correct himself
+    (DART, arXiv 1703.09327)"""
+    successful: bool = False
+    """save only the episodes that succeed at the end"""
     out: Path | None = None
     """where to save the transitions, a nested dict of tensors of shape (steps, ...)"""
 
 
+def disturb(
+    expert: TensorDictModule, env: torch_panda.RobotTaskEnv, noise_eps: float
+) -> TensorDictModuleBase:
+    """The expert with noise on its ``action``, which is kept as ``intended``."""
+    keep = TensorDictModule(torch.clone, ["action"], ["intended"])
+    noise = AdditiveGaussianModule(
+        env.action_spec, sigma_init=noise_eps, sigma_end=noise_eps
+    )
+    return TensorDictSequential(expert, keep, noise)
+
+
 def play(
-    env: torch_panda.RobotTaskEnv, expert: TensorDictModule
+    env: torch_panda.RobotTaskEnv, expert: TensorDictModuleBase
 ) -> list[TensorDictBase]:
     """One fresh episode of every environment, each with its transitions (steps,)."""
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         rollout = env.rollout(
             env.max_episode_steps,
             expert,
@@ -81,7 +100,7 @@ def main(args: Args) -> None:
     """Run the episodes, print the success rates, save the transitions."""
     try:
         check_limits(args)
-        expert = make_expert(args.env_id)
+        expert: TensorDictModuleBase = make_expert(args.env_id)
         if args.out is not None:
             prepare(args.out)
         env = torch_panda.make(
@@ -92,6 +111,7 @@ def main(args: Args) -> None:
         )
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
+    expert = disturb(expert, env, args.noise_eps)
     episodes: list[TensorDictBase] = []
     try:
         with env, tqdm(total=args.episodes, unit="episode", desc=args.env_id) as bar:
@@ -101,7 +121,12 @@ def main(args: Args) -> None:
                 bar.update(len(new))
         print_success(args.env_id, episodes)
         if args.out is not None:
+            if args.successful:
+                episodes = [x for x in episodes if x["next", "success"][-1]]
+                if not episodes:
+                    raise SystemExit("no episode succeeded: nothing was saved")
             demos = join(episodes)
+            demos["action"] = demos.pop("intended")
             # Ctrl-C leaves the file as it was, or makes the whole of it.
             save(args.out, demos.to_dict())
             print(f"{len(demos)} transitions in {args.out}")

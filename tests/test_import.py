@@ -17,6 +17,7 @@ ROOMS = (
     ("rendering", "robots", "tasks", "randomization"),
     ("sensors",),
     ("envs",),
+    ("noise",),
     ("versions",),
     ("registry",),
     ("gymnasium_envs",),

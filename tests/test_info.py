@@ -21,7 +21,7 @@ def test_names_versions_ids_and_spaces(capsys):
     assert f"{push}: observation 18, goal 3, action 3 in [-1, 1], 50 steps" in output
     named = [
         family + suffix
-        for family, suffixes in re.findall(r"(Panda\w+)\{(.*?)\}", output)
+        for family, suffixes in re.findall(r"(\w+)\{(.*?)\}", output)
         for suffix in suffixes.split(",")
     ]
     assert sorted(named) == sorted(torch_panda.ENV_IDS)

@@ -4,6 +4,7 @@ import time
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
@@ -119,6 +120,9 @@ def test_mass_is_changed_and_can_be_given():
         assert client.mass(cube) == 0.5
         env.reset()
         assert client.mass(cube) != 0.5
+        given = torch.full((3, 1), 1.5)
+        env.reset(TensorDict({"physics_parameters": given}, [3]), set_state=True)
+        assert client.mass(cube) == 3.0
 
 
 def test_joint_positions_start_around_neutral():
@@ -156,20 +160,15 @@ def test_bad_ranges(options):
 
 
 def test_a_reset_costs_at_most_a_fifth_of_a_millisecond(capsys):
-    """CPU time of the same resets with and without, in turn."""
-    with (
-        make(num_threads=1, num_envs=1) as env,
-        make(None, num_threads=1, num_envs=1) as plain,
-    ):
-        costs = []
-        for _ in range(5):
-            seconds = []
-            for each in (plain, env):
-                start = time.process_time()
-                for _ in range(40):
-                    each.episodes.reset()
-                seconds.append((time.process_time() - start) / 40)
-            costs.append(seconds[1] - seconds[0])
+    """CPU time of the fastest resets, with and without in turn."""
+    options = {"num_envs": 1, "num_threads": 1}
+    with make(**options) as env, make(None, **options) as plain:
+        seconds = {plain: [], env: []}
+        for each in (plain, env) * 300:
+            start = time.process_time()
+            each.episodes.reset()
+            seconds[each].append(time.process_time() - start)
+    cost = min(seconds[env]) - min(seconds[plain])
     with capsys.disabled():
-        print(f"randomising costs {1e6 * min(costs):.0f} us a reset")
-    assert min(costs) < 2e-4
+        print(f"randomising costs {1e6 * cost:.0f} us a reset")
+    assert cost < 2e-4

@@ -72,7 +72,8 @@ class Shove(Task):
         return simulation.ee_position[:, 2:] > 0.3
 
     def extra_observation(self, simulation):
-        return {"ee_orientation": simulation.ee_orientation}
+        low = simulation.ee_position[:, 2:] < 0.05
+        return {"ee_orientation": simulation.ee_orientation, "is_low": low}
 
 
 ID = "Shove-v0"
@@ -130,6 +131,7 @@ def test_hooks(loop):
         effort = torch.tensor([[0.1], [0.0]])
         torch.testing.assert_close(td["reward"], env.compute_reward(*goals) - effort)
         assert td["ee_orientation"].shape == (2, 4)
+        assert td["is_low"].dtype == torch.bool and not td["is_low"].any()
         assert td["terminated"].tolist() == [[True], [False]] == td["done"].tolist()
         assert not td["truncated"].any()
         td["_reset"] = td["done"]

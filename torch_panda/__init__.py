@@ -10,8 +10,8 @@ from torch_panda.registry import (
     register,
     register_with_gymnasium,
 )
-from torch_panda.rendering import Camera
-from torch_panda.robots import Panda, Robot
+from torch_panda.rendering import Camera, HandCamera
+from torch_panda.robots import Gripper, Kuka, Panda, Robot, XArm6, XArm6Gripper
 from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
     Drawer,
@@ -33,6 +33,9 @@ __all__ = [
     "Drawer",
     "Flip",
     "ForceSensor",
+    "Gripper",
+    "HandCamera",
+    "Kuka",
     "Panda",
     "PegInsertion",
     "PhysicsName",
@@ -48,6 +51,8 @@ __all__ = [
     "Stack",
     "Task",
     "WorkerError",
+    "XArm6",
+    "XArm6Gripper",
     "make",
     "max_episode_steps",
     "register",

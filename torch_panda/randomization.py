@@ -86,10 +86,9 @@ class Randomization:
         """What is drawn, in the order of ``physics_parameters``."""
         return tuple(name for name in PARAMETERS if getattr(self, name) is not None)
 
-    def draw(self, rng: np.random.Generator) -> npt.NDArray[np.float64]:
-        """Draw factors, (k,)."""
-        low, high = np.array([getattr(self, name) for name in self.names]).T
-        return rng.uniform(low, high)
+    def bounds(self) -> npt.NDArray[np.float64]:
+        """The lowest and the highest factors, (2, k)."""
+        return np.array([getattr(self, name) for name in self.names]).T
 
 
 class PhysicsFactors:

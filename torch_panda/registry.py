@@ -14,7 +14,14 @@ import torch
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.checks import check_positive
 from torch_panda.rendering import Camera
-from torch_panda.robots import ControlType, Panda, Robot
+from torch_panda.robots import (
+    ControlType,
+    Kuka,
+    Panda,
+    Robot,
+    XArm6,
+    XArm6Gripper,
+)
 from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import (
     Drawer,
@@ -89,11 +96,32 @@ _ENVS = {
     if task not in _OWN_TASKS or version == "v1"
 }
 
-ENV_IDS: tuple[str, ...] = tuple(_ENVS)
-"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}``.
+# Other robots at the tasks -v1; ``robot_options`` has their control types.
+_ROBOTS: tuple[tuple[type[Robot], str, dict[str, Any]], ...] = (
+    (Kuka, "Reach", {}),
+    (XArm6, "Reach", {}),
+    (XArm6Gripper, "Reach", {"block_gripper": True}),
+    (XArm6Gripper, "PickAndPlace", {"finger_friction": 5.0}),
+)
+_ENVS |= {
+    f"{robot.__name__}{task}{reward}-v1": _Registration(
+        robot=partial(robot, **robot_arguments),
+        task=partial(
+            _TASKS[task],
+            reward_type=_REWARD[reward],
+            **arguments_of(TASK_ARGUMENTS.get(task, NO_PAIRS), "v1"),
+        ),
+        max_episode_steps=_TASKS[task].max_episode_steps,
+        terminate_on_success=False,
+    )
+    for (robot, task, robot_arguments), reward in product(_ROBOTS, _REWARD)
+}
 
-Tasks that panda-gym does not have are -v1 only.
-"""
+ENV_IDS: tuple[str, ...] = tuple(_ENVS)
+"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}`` for the tasks
+of panda-gym, -v1 only for Drawer and PegInsertion,
+``{Kuka,XArm6,XArm6Gripper}Reach{,Dense}-v1`` and
+``XArm6GripperPickAndPlace{,Dense}-v1``."""
 
 
 def register(
@@ -253,7 +281,8 @@ def _find(env_id: str) -> _Registration:
         raise ValueError(
             f"unknown environment id {env_id!r}; {hint}accepted are "
             f"Panda{{{both}}}{{,Joints}}{{,Dense}}-v{{1,3}}, "
-            f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1"
+            f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1, "
+            + ", ".join(sorted({f"{r.__name__}{task}-v1" for r, task, _ in _ROBOTS}))
             + (f" and what was registered: {own}" if own else "")
         )
     return _ENVS[env_id]

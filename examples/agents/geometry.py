@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from experts.rotations import compose, inverse, same_half, straighten, to_matrix
 from torch_panda import Drawer, PegInsertion, RobotTaskEnv, Slide, Task
 
 # Factors that mirror a quantity in the plane y = 0, in which robot and table are
@@ -41,6 +42,8 @@ class Geometry:
         goal_positions: where they begin in a goal.
         goal_height: at which goals are shown to networks that see differences of
             positions [m]; None shows them where they are.
+        orientation: where the quaternion of the object begins in an observation, if
+            goals are orientations; else None.
     """
 
     later: tuple[int, ...]
@@ -51,11 +54,27 @@ class Geometry:
     positions: tuple[int, ...]
     goal_positions: tuple[int, ...]
     goal_height: float | None
+    orientation: int | None
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Objects from the end-effector and goals from objects, (..., n) [m]."""
         inputs = torch.cat((observation, goal), -1)
         return inputs[..., self.later] - inputs[..., self.earlier]
+
+    def turns(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Orientations as they are for a cube without colours, which has 24 equal ones.
+
+        Returns:
+            the observation with the smallest of the 24, the turn from the cube's
+            orientation to the goal's, a quaternion (..., 4), and its matrix (..., 9).
+        """
+        assert self.orientation is not None
+        place = slice(self.orientation, self.orientation + 4)
+        cube = observation[..., place]
+        observation = observation.clone()
+        observation[..., place] = same_half(compose(cube, inverse(straighten(cube))))
+        turn = same_half(compose(goal, inverse(cube)))
+        return observation, turn, to_matrix(turn).flatten(-2)
 
 
 def read_geometry(env: RobotTaskEnv) -> Geometry:
@@ -87,6 +106,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
         positions=(0, *starts),
         goal_positions=goals,
         goal_height=SLIDE_GOAL_HEIGHT if isinstance(task, Slide) else None,
+        orientation=starts[0] + 3 if rotates else None,
     )
 
 

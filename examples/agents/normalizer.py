@@ -32,7 +32,9 @@ class Normalizer(nn.Module):
         super().__init__()
         self.geometry, self.relative_inputs = geometry, relative_inputs
         self.heights = [start + 2 for start in geometry.goal_positions]
-        size += len(geometry.later) * ("none", "coarse", "fine").index(relative_inputs)
+        kinds = ("none", "coarse", "fine").index(relative_inputs)
+        size += len(geometry.later) * kinds
+        size += 9 if kinds and geometry.orientation is not None else 0
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
@@ -58,11 +60,14 @@ class Normalizer(nn.Module):
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
         inputs = [observation, goal]
         if self.relative_inputs != "none":
-            if self.geometry.goal_height is not None:
+            geometry = self.geometry
+            if geometry.goal_height is not None:
                 goal = goal.clone()
-                goal[..., self.heights] = self.geometry.goal_height
-            differences = self.geometry.differences(observation, goal)
+                goal[..., self.heights] = geometry.goal_height
+            differences = geometry.differences(observation, goal)
             inputs = [observation, goal, differences]
+            if geometry.orientation is not None:
+                inputs = [*geometry.turns(observation, goal), differences]
             if self.relative_inputs == "fine":
                 inputs.append(differences.clamp(-FINE, FINE))
         return torch.cat(inputs, -1).clamp_(-CLIP_OBSERVATION, CLIP_OBSERVATION)

@@ -14,6 +14,27 @@ def compose(first: Tensor, second: Tensor) -> Tensor:
     return torch.cat((a_w * b + b_w * a + torch.linalg.cross(a, b), scalar), -1)
 
 
+def inverse(quaternion: Tensor) -> Tensor:
+    """The quaternion of turning back, (..., 4)."""
+    return quaternion * quaternion.new_tensor((-1.0, -1.0, -1.0, 1.0))
+
+
+def to_matrix(quaternion: Tensor) -> Tensor:
+    """Rotation matrices, (..., 3, 3)."""
+    x, y, z, w = quaternion.unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def same_half(quaternion: Tensor) -> Tensor:
+    """Of the two quaternions of each orientation that with a positive w, (..., 4)."""
+    return quaternion * torch.where(quaternion[..., 3:] < 0, -1.0, 1.0)
+
+
 def turn(axis: int, angle: Tensor) -> Tensor:
     """The quaternion of a turn about a world axis by an angle [rad], (..., 1)."""
     parts = [torch.zeros_like(angle)] * 3

@@ -68,7 +68,8 @@ RECIPES: dict[str, dict[str, Any]] = {
 
 def find_recipe(env_id: str) -> dict[str, Any]:
     """The recipe of an environment's task; none of an unknown one."""
-    found = re.match(r"Panda([A-Za-z]+?)(Joints)?(Dense)?-v\d", env_id)
+    tasks = "|".join(RECIPES)
+    found = re.match(rf"[A-Z]\w*?({tasks})(Joints)?(Dense)?-v\d", env_id)
     recipe = RECIPES.get(found[1], {}) if found else {}
     if found and found[2]:
         return {k: x for k, x in recipe.items() if k not in END_EFFECTOR_OPTIONS}

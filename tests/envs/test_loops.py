@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 import torch_panda
 from torch_panda import Panda, PhysicsParams, Push, RobotTaskEnv, WorkerError
-from torch_panda.bullet import BulletError, PositionControl, capi, library, native
+from torch_panda.bullet import BulletError, MotorControl, capi, library, native
 
 IDS = (
     "PandaReachJoints-v3",
@@ -157,21 +157,21 @@ def test_a_closed_simulation(env):
     env.reset()
     simulation = env.episodes.simulation
     env.close()
-    control, setpoint = env.robot.position_control, np.zeros((N, 5))
+    control, setpoint = env.robot.motor_control, np.zeros((N, 5))
     with pytest.raises(WorkerError, match=r"environment 0: BulletError: .* is closed"):
         simulation.step(control, setpoint)
     simulation.close()
 
 
 def test_a_setpoint_of_another_shape(env):
-    control = env.robot.position_control
+    control = env.robot.motor_control
     with pytest.raises(ValueError, match=r"must have shape \(3, 5\), got \(3, 4\)"):
         env.episodes.simulation.step(control, np.zeros((N, 4)))
 
 
 def test_forces_of_another_robot(env):
     with pytest.raises(ValueError, match="a force for each of 9 joints, got 4"):
-        env.episodes.simulation.step(PositionControl((1.0,) * 4), np.zeros((N, 4)))
+        env.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
 
 
 # ---- interrupts, processes, threads --------------------------------------------------

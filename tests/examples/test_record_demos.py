@@ -8,6 +8,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 import record_demos
 import torch_panda
 from evaluate import wilson_interval
+from experts import make_expert
 from torch_panda.transforms import HindsightRelabel
 
 
@@ -30,6 +31,31 @@ def test_demonstrations_extend_a_replay_buffer(tmp_path, capsys):
     batch = buffer.sample()
     assert batch["desired_goal"].shape == (64, 3)
     assert (batch["next", "reward"] == 0).any()
+
+
+def test_what_is_saved_is_the_action_without_noise(tmp_path):
+    out = tmp_path / "demos.pt"
+    args = record_demos.Args("PandaReach-v1", 2, num_envs=2, noise_eps=0.3, out=out)
+    record_demos.main(args)
+    demos = TensorDict(torch.load(out)).auto_batch_size_(1)
+    saved = demos["action"].clone()
+    torch.testing.assert_close(make_expert(args.env_id)(demos)["action"], saved)
+    # What was executed is another one: the hand went elsewhere.
+    moved = demos["next", "observation"][:, :3] - demos["observation"][:, :3]
+    assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
+
+
+def test_only_successful_episodes_are_saved_if_wanted(tmp_path):
+    out = tmp_path / "demos.pt"
+    args = record_demos.Args("PandaFlip-v1", 12, num_envs=12, seed=1, out=out)
+    for successful in (False, True):
+        args.successful = successful
+        record_demos.main(args)
+        demos = TensorDict(torch.load(out)).auto_batch_size_(1)
+        ended = demos["next", "success"][demos["next", "done"]]
+        assert ended.all() == successful
+    assert 0 < len(ended) < 12
+    assert demos["collector", "traj_ids"].unique().tolist() == list(range(len(ended)))
 
 
 def stop(*arguments):

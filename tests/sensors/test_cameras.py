@@ -7,7 +7,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from torch_panda import Camera
+from torch_panda import Camera, CameraSensor, HandCamera
 from torch_panda.rendering import egl
 
 SIZE = 48
@@ -187,3 +187,44 @@ def test_no_blank_frames_without_egl(monkeypatch):
 def test_unknown_renderer():
     with pytest.raises(ValueError, match=r"renderer must be one of.*'gl'"):
         make(renderer="gl")
+
+
+def test_several_cameras_one_on_the_hand():
+    front = CameraSensor(Camera(width=48, height=48))
+    hand = CameraSensor(
+        HandCamera(width=64, height=48), depth=True, segmentation=True, name="wrist"
+    )
+    with torch_panda.make(
+        "PandaPickAndPlace-v1", num_envs=2, seed=0, sensors=(front, hand)
+    ) as env:
+        check_env_specs(env)
+        td = env.reset()
+        assert td["pixels"].shape == (2, 48, 48, 3)
+        assert td["wrist_pixels"].shape == (2, 48, 64, 3)
+        assert td["wrist_depth"].shape == (2, 48, 64, 1)
+        picture = env.render(camera=HandCamera(width=64, height=48))
+        assert (picture == td["wrist_pixels"]).all()
+        # The hand goes above the cube, opens, and sees it in the middle.
+        ids = env.segmentation_ids
+        for _ in range(20):
+            above = td["achieved_goal"] + torch.tensor((0.0, 0.0, 0.1))
+            error = above - td["observation"][:, :3]
+            action = torch.cat((10 * error, torch.ones(2, 1)), dim=1)
+            td = env.step(td.set("action", action))["next"]
+        seen = td["wrist_segmentation"][..., 0]
+        rows, columns = (seen[0] == ids["object"]).nonzero().double().T
+        assert len(rows) > 20 and abs(columns.mean() - 31.5) < 6
+        assert (seen == ids["robot"]).any()  # its fingers
+        near = td["wrist_depth"][0, ..., 0][seen[0] == ids["object"]]
+        assert 0.1 < near.min() < near.max() < 0.35
+        before = td["wrist_pixels"].clone()
+        action = torch.tensor([[0.0, 0.0, 1.0, 0.0]]).expand(2, -1)
+        td = env.step(td.set("action", action))["next"]
+        assert (td["wrist_pixels"] != before).any()
+
+
+def test_two_cameras_need_names():
+    with pytest.raises(ValueError, match="two sensors observe"):
+        torch_panda.make("PandaPush-v1", sensors=(CameraSensor(), CameraSensor()))
+    with pytest.raises(ValueError, match="line of sight"):
+        HandCamera(up=(0.0, 0.0, 1.0), eye=(0.0, 0.0, -0.1), target=(0.0, 0.0, 0.1))

@@ -2,7 +2,7 @@
 
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
-from torch_panda.bullet.control import Control, PositionControl
+from torch_panda.bullet.control import Control, MotorControl
 from torch_panda.bullet.guard import ThreadGuard
 from torch_panda.bullet.physics import (
     EXACT,
@@ -23,10 +23,10 @@ __all__ = [
     "BulletError",
     "Control",
     "Cylinder",
+    "MotorControl",
     "PhysicsClient",
     "PhysicsName",
     "PhysicsParams",
-    "PositionControl",
     "Scene",
     "Sphere",
     "ThreadGuard",

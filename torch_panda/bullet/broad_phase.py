@@ -14,11 +14,11 @@ happened before. The broad phase holds
 No command resets them, so each is led back to where it was.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from torch_panda.bullet import capi
 from torch_panda.bullet.client import PhysicsClient
+from torch_panda.bullet.rotations import rotate
 
 # [m]; so much farther than the world is wide that a box put back lands beside those
 # that are back already, never among those that still wait.
@@ -106,7 +106,7 @@ class BroadPhase:
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):
             snapshot = self._built
-            offset = _rotate(pose[3:], client.centre_of_mass(body, link))
+            offset = rotate(pose[3:], client.centre_of_mass(body, link))
             if any(offset):
                 x, y, z = (x - dx for x, dx in zip(base[:3], offset, strict=True))
                 client.set_base(body, (x, y, z), base[3:])
@@ -120,15 +120,3 @@ def _read_poses(client: PhysicsClient, body: int) -> list[tuple[float, ...]]:
     """Poses of the centres of mass of a body's base and links."""
     state = client.state(body)
     return [tuple(pose.tolist()) for pose in (state.base_pose, *state.link_poses)]
-
-
-def _rotate(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """Rotate a vector by a quaternion xyzw."""
-    x, y, z, w = quaternion
-    a, b, c = vector
-    p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return [
-        a + w * p + y * r - z * q,
-        b + w * q + z * p - x * r,
-        c + w * r + x * q - y * p,
-    ]

@@ -481,6 +481,15 @@ view_matrix = bind(
     c_int,  # up axis
     _floats,
 )
+view_matrix_from_positions = bind(
+    _cheap,
+    "b3ComputeViewMatrixFromPositions",
+    None,
+    _floats,  # eye
+    _floats,  # target
+    _floats,  # up
+    _floats,
+)
 projection_matrix = bind(
     _cheap,
     "b3ComputeProjectionMatrixFOV",

@@ -125,30 +125,47 @@ class PhysicsClient(SceneClient):
         self._submit(command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state")
 
     def control_joints(
-        self, body: int, setpoint: Doubles, forces: Sequence[float]
+        self,
+        body: int,
+        positions: Doubles,
+        forces: Sequence[float],
+        velocities: Sequence[float] | Doubles = (),
     ) -> None:
-        """Drive all movable joints to positions.
+        """Drive the first movable joints to velocities, the others to positions.
 
-        Does what pybullet's ``setJointMotorControlArray`` does in position control,
-        with the position gain of the client's physics. The desired velocity that it
-        sets is Bullet's default, 0.
+        Does what pybullet's ``setJointMotorControlArray`` does in velocity and in
+        position control, with the position gain of the client's physics. For positions
+        the desired velocity is Bullet's default, 0.
 
         Args:
             body: the body.
-            setpoint: as many positions as there are forces [rad] or [m].
+            positions: of the others [rad] or [m].
             forces: the most each motor may exert [N m] or [N].
+            velocities: of the first ones [rad/s] or [m/s].
         """
         command = capi.motor_init(
             self._open(), body, capi.CONTROL_MODE_POSITION_VELOCITY_PD
         )
-        for k, (position, force) in enumerate(zip(setpoint, forces, strict=True)):
+        for k, velocity in enumerate(velocities):
+            capi.motor_set_velocity(command, U_OFFSET + k, velocity)
+            capi.motor_set_kp(command, U_OFFSET + k, 0.0)
+        for k, position in enumerate(positions, start=len(velocities)):
             capi.motor_set_position(command, Q_OFFSET + k, position)
             capi.motor_set_kp(command, U_OFFSET + k, self._position_gain)
+        for k, force in enumerate(forces):
             capi.motor_set_kd(command, U_OFFSET + k, VELOCITY_GAIN)
             capi.motor_set_force(command, U_OFFSET + k, force)
         # Bullet only takes notes: done before another thread could use the GIL.
         status = capi.submit_quick(self._open(), command)
         self._check(status, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints")
+
+    def apply_torques(self, body: int, torques: Doubles) -> None:
+        """Turn the first movable joints by torques [N m] for one time step."""
+        command = capi.motor_init(self._open(), body, capi.CONTROL_MODE_TORQUE)
+        for k, torque in enumerate(torques):
+            capi.motor_set_torque(command, U_OFFSET + k, torque)
+        status = capi.submit_quick(self._open(), command)
+        self._check(status, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "apply torques")
 
     def step(self, count: int = 1) -> None:
         """Advance the world by ``count`` time steps."""

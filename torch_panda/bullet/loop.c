@@ -25,7 +25,8 @@ enum {
     STEP_FORWARD_SIMULATION_COMPLETED = 26,
     CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43,
 
-    POSITION_VELOCITY_PD = 2,     /* enum for b3JointControlCommandInit2 */
+    TORQUE = 1,                   /* enum for b3JointControlCommandInit2 */
+    POSITION_VELOCITY_PD = 2,
     MAX_DEGREES_OF_FREEDOM = 128, /* of a body */
     Q_OFFSET = 7,                 /* joints follow the base: 7 of its pose, */
     U_OFFSET = 6,                 /* 6 of its velocity */
@@ -44,6 +45,8 @@ struct functions {
     int (*ik_result)(handle status, int *body, int *count, double *positions);
     handle (*motor_init)(handle client, int body, int mode);
     int (*motor_set_position)(handle command, int q_index, double position);
+    int (*motor_set_velocity)(handle command, int u_index, double velocity);
+    int (*motor_set_torque)(handle command, int u_index, double torque);
     int (*motor_set_kp)(handle command, int u_index, double gain);
     int (*motor_set_kd)(handle command, int u_index, double gain);
     int (*motor_set_force)(handle command, int u_index, double force);
@@ -68,9 +71,12 @@ struct scene { /* the same in every client */
     const int *object_joints; /* how many each object has */
 };
 
-struct control { /* PositionControl of control.py */
+enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
+struct control { /* MotorControl of control.py */
     int ik_link; /* whose position setpoints give; -1: they are of all joints */
     int num_arm_joints, setpoint_size;
+    int turns;    /* whether they give its orientation, too */
+    int arm_mode; /* of the arm's joints */
     double orientation[4], position_gain, velocity_gain;
     doubles forces; /* one a joint */
 };
@@ -120,12 +126,14 @@ static int find_joints(struct loop *loop, int env, double *joints) {
         return 1;
     }
     handle command = bullet->ik_init(loop->clients[env]->handle, loop->scene->robot);
-    bullet->ik_set_target(command, control->ik_link, setpoint, control->orientation);
+    bullet->ik_set_target(command, control->ik_link, setpoint,
+                          control->turns ? setpoint + 3 : control->orientation);
     handle status = submit(loop, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED);
     if (!status) return 0;
     int body, count;
     bullet->ik_result(status, &body, &count, joints);
-    memcpy(joints + arm, setpoint + 3, (num_joints - arm) * sizeof *joints);
+    setpoint += control->turns ? 7 : 3;
+    memcpy(joints + arm, setpoint, (num_joints - arm) * sizeof *joints);
     return 1;
 }
 
@@ -135,21 +143,45 @@ static int set_motors(struct loop *loop, int env, doubles joints) {
     handle client = loop->clients[env]->handle;
     int robot = loop->scene->robot, num_joints = loop->scene->num_joints;
     handle command = bullet->motor_init(client, robot, POSITION_VELOCITY_PD);
+    int arm = control->num_arm_joints, mode = control->arm_mode;
     for (int k = 0; k < num_joints; k++) {
-        bullet->motor_set_position(command, Q_OFFSET + k, joints[k]);
-        bullet->motor_set_kp(command, U_OFFSET + k, control->position_gain);
+        int joint_mode = k < arm ? mode : POSITIONS, has_torque = joint_mode == TORQUES;
+        if (joint_mode == POSITIONS) {
+            bullet->motor_set_position(command, Q_OFFSET + k, joints[k]);
+            bullet->motor_set_kp(command, U_OFFSET + k, control->position_gain);
+        } else {
+            double velocity = has_torque ? 0 : joints[k];
+            bullet->motor_set_velocity(command, U_OFFSET + k, velocity);
+            bullet->motor_set_kp(command, U_OFFSET + k, 0);
+        }
         bullet->motor_set_kd(command, U_OFFSET + k, control->velocity_gain);
-        bullet->motor_set_force(command, U_OFFSET + k, control->forces[k]);
+        /* Where torques are applied, motors must not brake. */
+        bullet->motor_set_force(command, U_OFFSET + k,
+                                has_torque ? 0 : control->forces[k]);
     }
     return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
 }
 
-static int advance(struct loop *loop, int env) {
+static int apply_torques(struct loop *loop, int env, doubles torques) {
+    const struct functions *bullet = loop->bullet;
+    handle client = loop->clients[env]->handle;
+    handle command = bullet->motor_init(client, loop->scene->robot, TORQUE);
+    for (int k = 0; k < loop->control->num_arm_joints; k++)
+        bullet->motor_set_torque(command, U_OFFSET + k, torques[k]);
+    return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
+}
+
+static int advance(struct loop *loop, int env, doubles joints) {
     struct client *client = loop->clients[env];
+    int has_torques = loop->control->arm_mode == TORQUES;
     /* A client has one command buffer, and stepping leaves it as it was. */
     handle command = loop->bullet->step_init(client->handle);
     for (int k = 0; k < loop->scene->num_substeps; k++) {
         client->num_detections++;
+        if (has_torques) { /* which Bullet forgets when it has stepped */
+            if (!apply_torques(loop, env, joints)) return 0;
+            command = loop->bullet->step_init(client->handle);
+        }
         if (!submit(loop, env, command, STEP_FORWARD_SIMULATION_COMPLETED)) return 0;
     }
     return 1;
@@ -207,7 +239,7 @@ static int step_client(struct loop *loop, int env) {
     int is_closed = loop->clients[env]->handle == NULL;
     loop->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0};
     return !is_closed && find_joints(loop, env, joints) &&
-           set_motors(loop, env, joints) && advance(loop, env) && read_state(loop, env);
+           set_motors(loop, env, joints) && advance(loop, env, joints) && read_state(loop, env);
 }
 
 /* ---- threads --------------------------------------------------------------------- */

@@ -16,6 +16,9 @@ LoopName = Literal["native", "ctypes"]
 # Chooses the loop of what is created from now on: for tests and comparisons.
 LOOP_VARIABLE = "TORCH_PANDA_LOOP"
 
+# ``enum arm_mode``
+ARM_MODES = {"position": 0, "velocity": 1, "torque": 2}
+
 # In a `Failure`, beside status codes.
 NO_ANSWER = -1  # as answer
 CLIENT_CLOSED = -2  # as expected
@@ -29,6 +32,8 @@ _BULLET = (
     capi.ik_result,
     capi.motor_init,
     capi.motor_set_position,
+    capi.motor_set_velocity,
+    capi.motor_set_torque,
     capi.motor_set_kp,
     capi.motor_set_kd,
     capi.motor_set_force,
@@ -68,6 +73,8 @@ class Control(Structure):
         ("ik_link", c_int),
         ("num_arm_joints", c_int),
         ("setpoint_size", c_int),
+        ("turns", c_int),
+        ("arm_mode", c_int),
         ("orientation", c_double * 4),
         ("position_gain", c_double),
         ("velocity_gain", c_double),

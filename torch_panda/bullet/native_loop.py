@@ -10,7 +10,7 @@ from torch_panda.bullet import capi, native
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
 from torch_panda.bullet.connection import BulletError, client_closed, refusal
-from torch_panda.bullet.control import PositionControl
+from torch_panda.bullet.control import MotorControl
 from torch_panda.bullet.physics import PhysicsParams
 from torch_panda.bullet.pool import WorkerError
 from torch_panda.bullet.scene import Scene
@@ -68,7 +68,7 @@ class NativeLoop:
         self._state = state
         self._failures = (native.Failure * n)()
         self._all = (c_int * n)(*range(n))
-        self._described: PositionControl | None = None  # by _control
+        self._described: MotorControl | None = None  # by _control
         self._control = native.Control()
         self._loop: int | None = None
         self._process = os.getpid()
@@ -81,7 +81,7 @@ class NativeLoop:
 
     def step(
         self,
-        control: PositionControl,
+        control: MotorControl,
         setpoint: Doubles,
         envs: Sequence[int] | None = None,
     ) -> None:
@@ -131,12 +131,14 @@ class NativeLoop:
         if self._loop is None:
             raise MemoryError
 
-    def _describe(self, control: PositionControl) -> None:
+    def _describe(self, control: MotorControl) -> None:
         self._control = native.Control(
             -1 if control.ik_link is None else control.ik_link,
             control.num_arm_joints,
             control.setpoint_dim,
-            control.ik_orientation,
+            control.ik_orientation is None,
+            native.ARM_MODES[control.arm_mode],
+            control.ik_orientation or (),
             self._physics.position_gain,
             VELOCITY_GAIN,
             (c_double * len(control.forces))(*control.forces),

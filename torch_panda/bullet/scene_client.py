@@ -10,7 +10,12 @@ from torch_panda.bullet import capi
 from torch_panda.bullet.checks import check_not_negative, check_quaternion
 from torch_panda.bullet.connection import Connection, doubles
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
-from torch_panda.bullet.urdf import check_collision_filters, find_urdf
+from torch_panda.bullet.urdf import (
+    Tool,
+    check_collision_filters,
+    find_urdf,
+    urdf_with_tool,
+)
 
 ORIGIN = (0.0, 0.0, 0.0)
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
@@ -33,14 +38,14 @@ class Joint:
     damping: float
 
 
-# What sets the arguments of `SceneClient.set_dynamics`.
-_DYNAMICS = {
-    "mass": capi.dynamics_set_mass,
-    "lateral_friction": capi.dynamics_set_lateral_friction,
-    "spinning_friction": capi.dynamics_set_spinning_friction,
-    "restitution": capi.dynamics_set_restitution,
-    "joint_damping": capi.dynamics_set_joint_damping,
-}
+# The arguments of `SceneClient.set_dynamics`, and what sets them.
+_DYNAMICS = (
+    ("mass", capi.dynamics_set_mass),
+    ("lateral_friction", capi.dynamics_set_lateral_friction),
+    ("spinning_friction", capi.dynamics_set_spinning_friction),
+    ("restitution", capi.dynamics_set_restitution),
+    ("joint_damping", capi.dynamics_set_joint_damping),
+)
 
 
 class SceneClient(Connection):
@@ -79,6 +84,7 @@ class SceneClient(Connection):
         position: Sequence[float] = ORIGIN,
         orientation: Sequence[float] = NO_ROTATION,
         fixed_base: bool = False,
+        tool: Tool | None = None,
     ) -> int:
         """Load a URDF, here without its visual shapes, and return its body id.
 
@@ -87,6 +93,7 @@ class SceneClient(Connection):
             position: of the base, world frame [m].
             orientation: of the base, quaternion xyzw.
             fixed_base: whether the base cannot move.
+            tool: a link to be added.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -95,6 +102,8 @@ class SceneClient(Connection):
             BulletError: Bullet cannot read it.
         """
         file = find_urdf(path)
+        if tool is not None:
+            file = urdf_with_tool(file, tool)
         check_collision_filters(file)
         check_quaternion("orientation", orientation)
         pose = tuple(map(float, (*position, *orientation)))
@@ -211,19 +220,19 @@ class SceneClient(Connection):
         Raises:
             ValueError: a number is negative or not finite.
         """
-        changes = {
-            "mass": mass,
-            "lateral_friction": lateral_friction,
-            "spinning_friction": spinning_friction,
-            "restitution": restitution,
-            "joint_damping": joint_damping,
-        }
-        check_not_negative(**changes)
-        self._note("set_dynamics", body, link, *changes.values())
+        numbers = (
+            mass,
+            lateral_friction,
+            spinning_friction,
+            restitution,
+            joint_damping,
+        )
+        self._note("set_dynamics", body, link, *numbers)
         command = capi.dynamics_init(self._open())
-        for name, value in changes.items():
+        for (name, change), value in zip(_DYNAMICS, numbers, strict=True):
             if value is not None:
-                _DYNAMICS[name](command, body, link, value)
+                check_not_negative(**{name: value})
+                change(command, body, link, value)
         # Bullet only takes notes: done before another thread could use the GIL.
         status = capi.submit_quick(self._open(), command)
         self._check(status, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics")

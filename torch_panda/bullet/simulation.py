@@ -12,7 +12,7 @@ from torch_panda.bullet.broad_phase import BroadPhase
 from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
-from torch_panda.bullet.control import Control, PositionControl
+from torch_panda.bullet.control import Control, MotorControl
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
@@ -146,7 +146,7 @@ class VectorSimulation:
             ValueError: ``control`` needs another ``setpoint``, or another robot.
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
-        if isinstance(control, PositionControl):
+        if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
                 self._pool.wait()  # after a second Ctrl-C, its threads may be at work
@@ -156,7 +156,12 @@ class VectorSimulation:
         def step_one(env: int) -> None:
             client = self._clients[env]
             control(client, self.scene.robot, setpoint[env])
-            client.step(self.n_substeps)
+            if isinstance(control, MotorControl):
+                control.advance(
+                    client, self.scene.robot, setpoint[env], self.n_substeps
+                )
+            else:
+                client.step(self.n_substeps)
             self._read(env)
 
         self._pool.run(step_one, range(self.num_envs) if envs is None else envs)

@@ -1,8 +1,23 @@
-"""URDF files: where they are, and what they must not say."""
+"""URDF files: where they are, what they must not say, and a link that they lack."""
 
+import functools
 import importlib.util
+import tempfile
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import NamedTuple
+
+
+class Tool(NamedTuple):
+    """A massless link that a robot's URDF lacks: the point between its fingers, say.
+
+    Attributes:
+        link: the name of the link that it is fixed to.
+        position: in the frame of that link [m].
+    """
+
+    link: str
+    position: tuple[float, float, float]
 
 
 def find_urdf(path: str | Path) -> str:
@@ -33,3 +48,45 @@ def check_collision_filters(file: str) -> None:
                 f"the collision shapes of a URDF must not have a group or a mask, "
                 f"got {sorted(chosen)} in {file}"
             )
+
+
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """A mesh of a URDF, looked for where Bullet does: in all folders above it."""
+    name = name.removeprefix("package://").removeprefix("file://")
+    candidates = [parent / name for parent in urdf.parents]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+@functools.cache
+def _scratch() -> tempfile.TemporaryDirectory[str]:
+    """Where URDFs with tools live until the process ends."""
+    return tempfile.TemporaryDirectory(prefix="torch_panda-")
+
+
+@functools.cache
+def urdf_with_tool(file: str, tool: Tool) -> str:
+    """A URDF file with one more link, the last one, named "tool".
+
+    Raises:
+        ValueError: there is no link for it to be fixed to.
+    """
+    source = Path(file).absolute()
+    tree = ElementTree.parse(source)
+    robot = tree.getroot()
+    links = [link.get("name") for link in robot.findall("link")]
+    if tool.link not in links:
+        raise ValueError(f"a tool must be fixed to one of {links}, got {tool.link!r}")
+    for mesh in tree.iter("mesh"):
+        if (found := find_mesh(mesh.get("filename", ""), source)) is not None:
+            mesh.set("filename", str(found))
+    robot.append(ElementTree.fromstring("<link name='tool'/>"))
+    x, y, z = tool.position
+    robot.append(
+        ElementTree.fromstring(
+            f"<joint name='tool' type='fixed'><parent link='{tool.link}'/>"
+            f"<child link='tool'/><origin xyz='{x} {y} {z}'/></joint>"
+        )
+    )
+    path = Path(tempfile.mkdtemp(dir=_scratch().name)) / source.name
+    tree.write(path)
+    return str(path)

@@ -49,14 +49,13 @@ class EpisodeSeeds:
         self._episodes[env] += 1
         return generator
 
-    def physics_seed(self, env: int) -> int:
-        """A seed of the physics of the episode whose generator was the last one.
+    def physics_seed(self, env: int) -> np.random.SeedSequence:
+        """The seed of the physics of the episode whose generator was the last one.
 
         Another stream than the generator's: what that draws stays as it is.
         """
         episode = (*self._streams[env], self._episodes[env] - 1)
-        sequence = np.random.SeedSequence(episode, spawn_key=(1,))
-        return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+        return np.random.SeedSequence(episode, spawn_key=(1,))
 
     def state(self) -> dict[str, Any]:
         """Plain numbers from which `load` goes on."""

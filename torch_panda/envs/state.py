@@ -131,7 +131,7 @@ def read_state(
             rotation; there is none beside ``step_count``, which torchrl's
             `StepCounter` has, too; or an exact state is not complete.
     """
-    if not {*PHYSICAL, "desired_goal"}.intersection(given.keys()):
+    if not {*PHYSICAL, "desired_goal", *PHYSICS}.intersection(given.keys()):
         raise ValueError(
             f"set_state=True needs a state with some of {', '.join(like)}; none came. "
             "torchrl's TransformedEnv and ParallelEnv do not pass states on: reset "

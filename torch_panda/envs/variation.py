@@ -60,6 +60,7 @@ class Variation:
             self.state[PHYSICS_SEED] = seed
         if names:
             k, double = len(names), torch.float64
+            self._bounds = self._randomization.bounds()
             self._factors = PhysicsFactors(
                 names, simulation.clients[0], scene, robot.finger_links, physics
             )
@@ -71,13 +72,14 @@ class Variation:
         self.changes_physics = bool(self.state)
         self.is_on = self.changes_physics or self._randomization.joint_position > 0
 
-    def draw(self, env: int, seed: int) -> None:
+    def draw(self, env: int, seed: np.random.SeedSequence) -> None:
         """Draw an environment's next episode, when the rest of its start is drawn."""
         if PHYSICS_SEED in self.state:
-            self.state[PHYSICS_SEED][env] = seed
+            number = int(seed.generate_state(1, np.uint64)[0])
+            self.state[PHYSICS_SEED][env] = number >> 1  # fits into int64
         rng = np.random.default_rng(seed)
         if PHYSICS_PARAMETERS in self.state:
-            drawn = self._randomization.draw(rng)
+            drawn = rng.uniform(*self._bounds)
             self.state[PHYSICS_PARAMETERS][env] = torch.from_numpy(drawn)
         if most := self._randomization.joint_position:
             arm = self._simulation.joint_position[env, : self._num_arm_joints]
@@ -91,7 +93,7 @@ class Variation:
             self._factors.apply(client, factors)
         if PHYSICS_SEED in self.state:
             seed = int(self.state[PHYSICS_SEED][env])
-            rng = np.random.default_rng((seed, 1))  # not what `draw` draws
+            rng = np.random.default_rng(seed)
             self._task.randomize(client, self._bodies, rng)
 
     def observe(self) -> dict[str, Tensor]:

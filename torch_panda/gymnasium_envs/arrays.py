@@ -21,14 +21,17 @@ _OUTCOME = {"success", "reward", "terminated", "truncated", "done"}
 def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     """The space of what one environment observes, and of its goals.
 
-    float32 without bounds, and integers with those of their type.
+    float32 without bounds, integers and booleans with those of their type.
     """
     boxes: dict[str, spaces.Space[Any]] = {}
     for key in observed_keys(env):
         zero = env.observation_spec[key].zero().cpu().numpy()
         shape = zero.shape[env.batch_dims :]
-        bounds = np.iinfo(zero.dtype) if zero.dtype.kind in "iu" else None
-        low, high = (bounds.min, bounds.max) if bounds else (-np.inf, np.inf)
+        low, high = -np.inf, np.inf
+        if zero.dtype.kind in "iu":
+            low, high = np.iinfo(zero.dtype).min, np.iinfo(zero.dtype).max
+        elif zero.dtype.kind == "b":
+            low, high = 0, 1
         boxes[key] = spaces.Box(low, high, shape, zero.dtype.type)
     return spaces.Dict(boxes)
 

@@ -2,10 +2,13 @@
 
 import dataclasses
 import operator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
+from torch_panda.bullet.rotations import rotate
 
 # The depth of a pixel in which nothing is seen, up to rounding.
 _BACKGROUND_DEPTH = np.float32(1 - 1e-6)
@@ -55,6 +58,57 @@ class Camera:
                 f"distance must be above 0, and near between 0 and far, got distance "
                 f"{self.distance}, near {self.near}, far {self.far}"
             )
+
+
+@dataclass(frozen=True)
+class HandCamera(Camera):
+    """A camera that moves with the end-effector, in whose frame it is described.
+
+    The Panda's frame lies between its fingertips, with z pointing out of the hand and y
+    from finger to finger; the defaults look past both fingers.
+
+    Attributes:
+        eye: where it is [m].
+        target: the point it looks at [m].
+        up: the direction that is up in the picture.
+        distance: from eye to target, whatever is given; ``yaw``, ``pitch`` and ``roll``
+            are not used.
+
+    Raises:
+        ValueError: up is the line of sight; or as for `Camera`.
+    """
+
+    eye: tuple[float, float, float] = (0.08, 0.0, -0.12)
+    target: tuple[float, float, float] = (0.01, 0.0, 0.03)
+    up: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    fov: float = 75.0
+    near: float = 0.01
+    far: float = 5.0
+
+    def __post_init__(self) -> None:
+        sight = np.subtract(self.target, self.eye)
+        if np.linalg.norm(np.cross(sight, self.up)) < 1e-6:
+            raise ValueError(
+                f"up must not be the line of sight, got {self.up}, from {self.eye} to "
+                f"{self.target}"
+            )
+        object.__setattr__(self, "distance", float(np.linalg.norm(sight)))
+        super().__post_init__()
+
+    def placed(
+        self, hand: Sequence[float]
+    ) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Eye, target and up in the world frame.
+
+        Args:
+            hand: (7,), position [m] and quaternion xyzw of the end-effector.
+        """
+        position, rotation = hand[:3], hand[3:]
+        eye, target = (
+            [x + dx for x, dx in zip(position, rotate(rotation, point), strict=True)]
+            for point in (self.eye, self.target)
+        )
+        return eye, target, rotate(rotation, self.up)
 
 
 def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:

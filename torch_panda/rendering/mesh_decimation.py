@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from torch_panda.bullet.urdf import find_mesh
+
 # Texture coordinates that differ by less belong to one colour.
 _TEXTURE_CELL = 0.1
 
@@ -45,7 +47,7 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
         for collision in link.findall("collision"):
             link.remove(collision)
         for mesh in link.iter("mesh"):
-            original = _find_mesh(mesh.get("filename", ""), source)
+            original = find_mesh(mesh.get("filename", ""), source)
             if original is not None and original.suffix == ".obj":
                 scale = np.array(mesh.get("scale", "1 1 1").split(), dtype=float)
                 original = _coarse_obj(original, folder, cell / scale)
@@ -54,13 +56,6 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
     path = folder / source.name
     tree.write(path)
     return path
-
-
-def _find_mesh(name: str, urdf: Path) -> Path | None:
-    """A mesh of a URDF, looked for where Bullet does: in all folders above it."""
-    name = name.removeprefix("package://").removeprefix("file://")
-    candidates = [parent / name for parent in urdf.parents]
-    return next((path for path in candidates if path.is_file()), None)
 
 
 def _coarse_obj(original: Path, folder: Path, cell: Floats) -> Path:

@@ -84,7 +84,11 @@ class SceneRenderer:
         simulation, solids = self._simulation, self._solids
         scene = simulation.scene
         pose_solids(solids, scene, simulation, env)
-        image = solids.draw(camera, segmentation=frames.segmentation is not None)
+        hand = [
+            *simulation.ee_position[env].tolist(),
+            *simulation.ee_orientation[env].tolist(),
+        ]
+        image = solids.draw(camera, hand, segmentation=frames.segmentation is not None)
         pixels = frames.pixels[row].numpy()
         pixels[:] = image.rgb
         if frames.depth is not None:
@@ -93,7 +97,7 @@ class SceneRenderer:
             frames.segmentation[row].numpy()[..., 0] = image.segmentation
         if self._markers is not None:
             pose_bodies(self._markers, self._marker_bodies, simulation.marker_pose[env])
-            overlay = self._markers.draw(camera, segmentation=True, shadow=False)
+            overlay = self._markers.draw(camera, hand, segmentation=True, shadow=False)
             assert overlay.segmentation is not None
             seen = overlay.depth < image.depth
             opacity = self._opacity[overlay.segmentation[seen]]

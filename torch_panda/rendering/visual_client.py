@@ -11,7 +11,7 @@ from torch_panda.bullet import PhysicsClient, capi
 from torch_panda.bullet.connection import BulletError, doubles
 from torch_panda.bullet.library import library_path
 from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Shape, Sphere, Visual
-from torch_panda.rendering.camera import Camera
+from torch_panda.rendering.camera import Camera, HandCamera
 from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.mesh_decimation import decimated_urdf
 
@@ -74,31 +74,41 @@ class VisualClient(PhysicsClient):
         self.visuals: dict[int, Visual] = {}
 
     def draw(
-        self, camera: Camera, *, segmentation: bool = False, shadow: bool = True
+        self,
+        camera: Camera,
+        hand: Sequence[float] = (),
+        *,
+        segmentation: bool = False,
+        shadow: bool = True,
     ) -> Image:
         """Draw what a camera sees.
 
         Args:
             camera: the camera.
+            hand: (7,), where a `HandCamera` is mounted; see `HandCamera.placed`.
             segmentation: whether to tell the bodies apart.
             shadow: whether bodies cast shadows.
         """
         view, projection = (c_float * 16)(), (c_float * 16)()
-        x, y, z = camera.target
-        capi.view_matrix(
-            (c_float * 3)(x, y, z),
-            camera.distance,
-            camera.yaw,
-            camera.pitch,
-            camera.roll,
-            _Z_AXIS,
-            view,
-        )
+        if isinstance(camera, HandCamera):
+            capi.view_matrix_from_positions(
+                *((c_float * 3)(*point) for point in camera.placed(hand)), view
+            )
+        else:
+            capi.view_matrix(
+                (c_float * 3)(*camera.target),
+                camera.distance,
+                camera.yaw,
+                camera.pitch,
+                camera.roll,
+                _Z_AXIS,
+                view,
+            )
         aspect = camera.width / camera.height
         capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
         while self._warm_up:
             self._warm_up -= 1
-            self.draw(camera, shadow=shadow)
+            self.draw(camera, hand, shadow=shadow)
         command = capi.camera_init(self._open())
         capi.camera_set_matrices(command, view, projection)
         capi.camera_set_size(command, camera.width, camera.height)

@@ -1,5 +1,6 @@
 """A robot arm on a fixed base."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
@@ -11,39 +12,81 @@ from torch import Tensor
 
 from torch_panda.bullet import (
     Control,
+    MotorControl,
     PhysicsClient,
-    PositionControl,
     VectorSimulation,
 )
 from torch_panda.bullet.checks import check_quaternion
+from torch_panda.bullet.control import ArmMode
+from torch_panda.bullet.urdf import Tool
+from torch_panda.robots.gripper import Gripper
+from torch_panda.robots.rotations import (
+    quaternion_product,
+    rotation_vector_to_quaternion,
+)
 
-# What an action displaces: the end-effector along x, y, z, or the arm's joints.
-ControlType = Literal["ee", "joints"]
+ControlType = Literal["ee", "ee_pose", "joints", "joint_velocity", "joint_torque"]
 
-# An action of 1 moves the end-effector by this [m], or a joint by this [rad].
-ACTION_SCALE = 0.05
+# What an action of 1 is: the end-effector's or a joint's displacement [m] or [rad], or
+# a joint's velocity, so that it moves as far in a step of 40 ms [rad/s], or a part of
+# the force that its motor may exert.
+ACTION_SCALES: dict[ControlType, float] = {
+    "ee": 0.05,
+    "ee_pose": 0.05,
+    "joints": 0.05,
+    "joint_velocity": 1.25,
+    "joint_torque": 1.0,
+}
+_ARM_MODES: dict[ControlType, ArmMode] = {
+    "joint_velocity": "velocity",
+    "joint_torque": "torque",
+}
+
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+# Lowest and highest x, y, z, world frame [m].
+Workspace = tuple[Sequence[float], Sequence[float]]
+_FAR = math.inf
+ABOVE_THE_TABLE: Workspace = ((-_FAR, -_FAR, 0.0), (_FAR, _FAR, _FAR))
 
 
 class Robot:
-    """A robot arm on a fixed base, described by a URDF.
+    """A robot arm on a fixed base, described by a URDF, with or without a gripper.
 
-    It is usable as it stands for an arm without a gripper; a gripper takes a subclass
-    (see `Panda`). One description serves all clients of a simulation.
+    One description serves all clients of a simulation. An action has the arm's numbers,
+    and a last one of the gripper's, if there is one that is not blocked: by how much
+    the fingers open. Observations are the end-effector's position [m] and velocity
+    [m/s], and then the distance between the fingers [m].
 
     Args:
         urdf: a file, or its name among those that pybullet ships.
         neutral_joint_position: where every movable joint starts [rad] or [m].
         joint_forces: the most each movable joint's motor may exert [N m] or [N].
         ee_link: index of the link whose centre of mass is the end-effector.
-        ee_orientation: quaternion xyzw that the end-effector keeps, world frame.
+        ee_orientation: quaternion xyzw that the end-effector keeps under the control
+            type "ee", world frame.
         num_arm_joints: how many movable joints, the first ones, are the arm; None
-            means all.
-        control_type: "ee": an action displaces the end-effector along x, y, z;
-            "joints": it displaces the arm's joints.
+            means all but the gripper's. Further joints stay where they start.
+        control_type: what an action does: "ee" displaces the end-effector along x, y, z
+            of the world; "ee_pose" also turns it, by a rotation vector in its own
+            frame; "joints" displaces the arm's joints, "joint_velocity" is their
+            velocity and "joint_torque" their motors' torque, without compensation of
+            gravity.
+        action_scale: what an action of 1 is: 0.05 m or rad, 1.25 rad/s, or this part of
+            ``joint_forces``, all of it; None means these.
+        gripper: of the last joints; None: there is none.
+        block_gripper: keep the fingers where they start.
         base_position: of the base, world frame [m].
+        base_orientation: of the base, quaternion xyzw.
+        workspace: the box in which actions send the end-effector, lowest and highest
+            (x, y, z), world frame [m]; by default all above the table.
+        tool: a link that the URDF lacks, which can be the end-effector.
         wrist_joint: index of the joint on which the hand is mounted, for the sensor of
             its force and torque; None means that there is none.
         finger_links: indices of the fingers' links, for the sensor of their contacts.
+
+    Raises:
+        ValueError: an argument is out of range, or two do not fit together.
     """
 
     def __init__(
@@ -56,7 +99,13 @@ class Robot:
         ee_orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
         num_arm_joints: int | None = None,
         control_type: ControlType = "ee",
+        action_scale: float | None = None,
+        gripper: Gripper | None = None,
+        block_gripper: bool = False,
         base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+        base_orientation: Sequence[float] = NO_ROTATION,
+        workspace: Workspace = ABOVE_THE_TABLE,
+        tool: Tool | None = None,
         wrist_joint: int | None = None,
         finger_links: Sequence[int] = (),
     ) -> None:
@@ -71,27 +120,61 @@ class Robot:
                 f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
             )
         check_quaternion("ee_orientation", ee_orientation)
+        check_quaternion("base_orientation", base_orientation)
+        if action_scale is None:
+            action_scale = ACTION_SCALES[control_type]
+        if not 0 < action_scale < math.inf:
+            raise ValueError(f"action_scale must be above 0, got {action_scale}")
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
         self.joint_forces = tuple(map(float, joint_forces))
         self.ee_link = ee_link
         x, y, z, w = ee_orientation
         self.ee_orientation = (float(x), float(y), float(z), float(w))
-        self.num_arm_joints = num_arm_joints or len(self.joint_forces)
+        num_fingers = 0 if gripper is None else gripper.num_joints
+        self.num_arm_joints = num_arm_joints or len(joint_forces) - num_fingers
+        if gripper is not None and self.num_arm_joints + num_fingers != len(
+            joint_forces
+        ):
+            raise ValueError(
+                f"a robot with a gripper must have {self.num_arm_joints} joints of the "
+                f"arm and {num_fingers} of the gripper, got {len(joint_forces)} in all"
+            )
         self.control_type: ControlType = control_type
+        self.action_scale = action_scale
+        self.gripper = gripper
+        self.block_gripper = block_gripper
         self.base_position = tuple(map(float, base_position))
+        self.base_orientation = tuple(map(float, base_orientation))
+        box = np.asarray(workspace, dtype=np.float64)
+        if box.shape != (2, 3) or not (box[0] <= box[1]).all():
+            raise ValueError(
+                f"workspace must be the lowest and the highest (x, y, z), got "
+                f"{workspace!r}"
+            )
+        self.workspace: Workspace = workspace
+        self._lowest, self._highest = torch.from_numpy(box)
+        self.tool = tool
         self.wrist_joint = wrist_joint
         self.finger_links = tuple(finger_links)
 
     @property
     def action_dim(self) -> int:
         """Number of action entries."""
-        return 3 if self.control_type == "ee" else self.num_arm_joints
+        return self._arm_action_dim + self._has_free_gripper
 
     @property
     def observation_dim(self) -> int:
         """Number of entries of its part of the observation."""
-        return 6
+        return 6 + self._has_free_gripper
+
+    @property
+    def _arm_action_dim(self) -> int:
+        return {"ee": 3, "ee_pose": 6}.get(self.control_type, self.num_arm_joints)
+
+    @property
+    def _has_free_gripper(self) -> bool:
+        return self.gripper is not None and not self.block_gripper
 
     def build(self, client: PhysicsClient) -> int:
         """Load the robot into a client and return its body id.
@@ -100,7 +183,13 @@ class Robot:
             FileNotFoundError: the URDF does not exist.
             ValueError: the URDF has another number of movable joints.
         """
-        body = client.load_urdf(self.urdf, position=self.base_position, fixed_base=True)
+        body = client.load_urdf(
+            self.urdf,
+            position=self.base_position,
+            orientation=self.base_orientation,
+            fixed_base=True,
+            tool=self.tool,
+        )
         joints = client.joints(body)
         movable = [joint.name for joint in joints if joint.is_movable]
         if len(movable) != len(self.joint_forces):
@@ -123,30 +212,56 @@ class Robot:
             simulation: whose robots are to act.
 
         Returns:
-            (num_envs, k), float64: the end-effector's position [m] or the arm's joint
-            positions [rad], and behind it where the other joints start, at which they
-            stay here [rad] or [m].
+            (num_envs, k), float64: the arm's part, as `arm_setpoint`, and behind it the
+            positions of the other joints [rad] or [m].
         """
-        arm = self.arm_setpoint(action, simulation)
-        others = arm.new_tensor(self.neutral_joint_position[self.num_arm_joints :])
+        arm = self.arm_setpoint(action[:, : self._arm_action_dim], simulation)
+        count = self.num_arm_joints
+        if self.gripper is None or self.block_gripper:
+            others = arm.new_tensor(self.neutral_joint_position[count:])
+        else:
+            fingers = simulation.joint_position[:, count:]
+            others = self.gripper.setpoint(action[:, -1:], fingers)
         return torch.cat((arm, others.expand(len(arm), -1)), dim=1)
 
     def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
-        """The part of `setpoint` that is the arm's: (num_envs, 3 or arm joints)."""
+        """The part of `setpoint` that is the arm's, by the control type.
+
+        Args:
+            action: (num_envs, k) float32 in [-1, 1], without the gripper's.
+            simulation: whose robots are to act.
+
+        Returns:
+            "ee": (num_envs, 3), position [m]; "ee_pose": (num_envs, 7), position and
+            quaternion xyzw; else (num_envs, arm joints): positions [rad], velocities
+            [rad/s] or torques [N m].
+        """
+        displacement = action * self.action_scale
+        match self.control_type:
+            case "joint_velocity":
+                return displacement.double()
+            case "joint_torque":
+                forces = simulation.joint_position.new_tensor(self.joint_forces)
+                return displacement * forces[: self.num_arm_joints]
+            case "joints":
+                return (
+                    simulation.joint_position[:, : self.num_arm_joints] + displacement
+                )
+        position = simulation.ee_position + displacement[:, :3]
+        # The end-effector must not be sent below the table.
+        position = position.clamp(self._lowest, self._highest)
         if self.control_type == "ee":
-            position = simulation.ee_position + action[:, :3] * ACTION_SCALE
-            # The end-effector must not be sent below the table.
-            position[:, 2].clamp_(min=0.0)
             return position
-        arm = self.num_arm_joints
-        return simulation.joint_position[:, :arm] + action[:, :arm] * ACTION_SCALE
+        turn = rotation_vector_to_quaternion(displacement[:, 3:].double())
+        orientation = quaternion_product(simulation.ee_orientation, turn)
+        return torch.cat((position, orientation), dim=1)
 
     def control(
         self, client: PhysicsClient, body: int, setpoint: npt.NDArray[np.float64]
     ) -> None:
         """Set the motors of one client's robot, in the thread that steps the client.
 
-        A robot that is driven otherwise than by `position_control` overrides this; its
+        A robot that is driven otherwise than by `motor_control` overrides this; its
         steps then go through Python.
 
         Args:
@@ -154,23 +269,39 @@ class Robot:
             body: its id.
             setpoint: (k,), a row of what `setpoint` gives.
         """
-        self.position_control(client, body, setpoint)
+        self.motor_control(client, body, setpoint)
 
     @property
-    def position_control(self) -> PositionControl:
+    def motor_control(self) -> MotorControl:
         """What `control` does, as data; read once, when an environment is made."""
-        if self.control_type == "joints":
-            return PositionControl(self.joint_forces)
-        return PositionControl(
-            self.joint_forces, self.ee_link, self.ee_orientation, self.num_arm_joints
-        )
+        arm, forces = self.num_arm_joints, self.joint_forces
+        if self.control_type == "ee":
+            return MotorControl(forces, self.ee_link, self.ee_orientation, arm)
+        if self.control_type == "ee_pose":
+            return MotorControl(forces, self.ee_link, num_arm_joints=arm)
+        mode = _ARM_MODES.get(self.control_type, "position")
+        return MotorControl(forces, num_arm_joints=arm, arm_mode=mode)
 
     @property
     def controller(self) -> Control:
         """`control`, as data unless a subclass has its own."""
         has_own = type(self).control is not Robot.control
-        return self.control if has_own else self.position_control
+        return self.control if has_own else self.motor_control
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """End-effector position [m] and velocity [m/s]: (num_envs, 6), float64."""
-        return torch.cat((simulation.ee_position, simulation.ee_velocity), dim=1)
+        """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""
+        parts = [simulation.ee_position, simulation.ee_velocity]
+        if self._has_free_gripper:
+            parts.append(self.fingers_width(simulation))
+        return torch.cat(parts, dim=1)
+
+    def fingers_width(self, simulation: VectorSimulation) -> Tensor:
+        """Distance between the fingers [m]: (num_envs, 1), float64.
+
+        Raises:
+            ValueError: there is no gripper.
+        """
+        if self.gripper is None:
+            raise ValueError(f"{type(self).__name__} has no gripper")
+        joints = simulation.joint_position[:, self.num_arm_joints :]
+        return self.gripper.fingers_width(joints)

@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 
-import torch
-from torch import Tensor
-
-from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.robots.base import ControlType, Robot
+from torch_panda.bullet import PhysicsClient
+from torch_panda.robots.base import (
+    ABOVE_THE_TABLE,
+    NO_ROTATION,
+    ControlType,
+    Robot,
+    Workspace,
+)
+from torch_panda.robots.gripper import Gripper
 
 # The same in panda-gym 1.1.0 and 3.0.7.
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
@@ -15,23 +19,19 @@ EE_LINK = 11
 # The hand's mount, where the real arm carries a force and torque sensor.
 WRIST_JOINT = 8
 FINGER_LINKS = (9, 10)
-LARGEST_WIDTH = 0.08  # [m], between the fingers
-# An action of 1 opens the fingers by this much [m].
-GRIPPER_SCALE = 0.2
+GRIPPER = Gripper(closed=(0.0, 0.0), opened=(0.04, 0.04), width=0.08)
 
 
 class Panda(Robot):
     """The Franka Emika Panda arm: 7 joints and two fingers.
 
-    Actions are 3 displacements of the end-effector or 7 of the joints, and one of the
-    fingers unless the gripper is blocked. Observations are the end-effector's position
-    [m] and velocity [m/s], and the distance between the fingers [m] unless the gripper
-    is blocked.
-
     Args:
-        control_type: "ee" or "joints".
-        block_gripper: keep the fingers as they start, by default closed.
+        control_type: see `Robot`, also for the next five.
+        action_scale: what an action of 1 is.
+        block_gripper: keep the fingers where they start, by default closed.
         base_position: of the base, world frame [m].
+        base_orientation: of the base, quaternion xyzw.
+        workspace: where the end-effector may be sent.
         fingers_width: distance between the fingers at the start of an episode [m].
         finger_friction: lateral friction of the fingers.
         finger_spinning_friction: of the fingers; None leaves what the URDF has, 0.1.
@@ -41,15 +41,18 @@ class Panda(Robot):
         self,
         *,
         control_type: ControlType = "ee",
+        action_scale: float | None = None,
         block_gripper: bool = False,
         base_position: Sequence[float] = (-0.6, 0.0, 0.0),
+        base_orientation: Sequence[float] = NO_ROTATION,
+        workspace: Workspace = ABOVE_THE_TABLE,
         fingers_width: float = 0.0,
         finger_friction: float = 1.0,
         finger_spinning_friction: float | None = None,
     ) -> None:
-        if not 0 <= fingers_width <= LARGEST_WIDTH:
+        if not 0 <= fingers_width <= GRIPPER.width:
             raise ValueError(
-                f"fingers_width must be from 0 to {LARGEST_WIDTH} [m], got "
+                f"fingers_width must be from 0 to {GRIPPER.width} [m], got "
                 f"{fingers_width}"
             )
         fingers = (fingers_width / 2,) * 2
@@ -60,23 +63,17 @@ class Panda(Robot):
             ee_link=EE_LINK,
             num_arm_joints=7,
             control_type=control_type,
+            action_scale=action_scale,
+            gripper=GRIPPER,
+            block_gripper=block_gripper,
             base_position=base_position,
+            base_orientation=base_orientation,
+            workspace=workspace,
             wrist_joint=WRIST_JOINT,
             finger_links=FINGER_LINKS,
         )
-        self.block_gripper = block_gripper
         self.finger_friction = finger_friction
         self.finger_spinning_friction = finger_spinning_friction
-
-    @property
-    def action_dim(self) -> int:
-        """Number of action entries."""
-        return super().action_dim + (not self.block_gripper)
-
-    @property
-    def observation_dim(self) -> int:
-        """Number of entries of its part of the observation."""
-        return super().observation_dim + (not self.block_gripper)
 
     def build(self, client: PhysicsClient) -> int:
         """Load the arm, and let its fingers grip."""
@@ -89,24 +86,3 @@ class Panda(Robot):
                 spinning=self.finger_spinning_friction,
             )
         return body
-
-    def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
-        """What actions ask the motors for; see `Robot.setpoint`."""
-        if self.block_gripper:
-            return super().setpoint(action, simulation)
-        arm = self.arm_setpoint(action, simulation)
-        # In float32 throughout: so panda-gym computes it under NumPy 2.
-        width = self.fingers_width(simulation).float()
-        finger = (width + action[:, -1:] * GRIPPER_SCALE) / 2
-        return torch.cat((arm, finger.double().expand(-1, 2)), dim=1)
-
-    def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""
-        observation = super().observation(simulation)
-        if self.block_gripper:
-            return observation
-        return torch.cat((observation, self.fingers_width(simulation)), dim=1)
-
-    def fingers_width(self, simulation: VectorSimulation) -> Tensor:
-        """Distance between the fingers [m]: (num_envs, 1), float64."""
-        return simulation.joint_position[:, self.num_arm_joints :].sum(1, keepdim=True)

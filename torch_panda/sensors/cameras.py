@@ -26,12 +26,15 @@ class CameraSensor(Sensor):
             line of sight [m], ``camera.far`` where nothing is.
         segmentation: observe ``segmentation``, (height, width, 1) int32: the body ids
             that `segmentation_ids` names, -1 where nothing is.
+        name: of the camera, where there are several: ``wrist`` observes
+            ``wrist_pixels``, ``wrist_depth`` and ``wrist_segmentation``.
     """
 
     camera: Camera = PIXELS_CAMERA
     pixels: bool = True
     depth: bool = False
     segmentation: bool = False
+    name: str | None = None
 
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
@@ -55,15 +58,16 @@ class _Pictures:
             segmentation=sensor.segmentation,
         )
         size = (sensor.camera.height, sensor.camera.width)
-        self.entries: dict[str, Entry] = {}
+        found: dict[str, Entry] = {}
         if sensor.pixels:
-            self.entries["pixels"] = Entry((*size, 3), torch.uint8, high=255)
+            found["pixels"] = Entry((*size, 3), torch.uint8, high=255)
         if sensor.depth:
-            self.entries["depth"] = Entry(
-                (*size, 1), torch.float32, high=sensor.camera.far
-            )
+            found["depth"] = Entry((*size, 1), torch.float32, high=sensor.camera.far)
         if sensor.segmentation:
-            self.entries["segmentation"] = Entry((*size, 1), torch.int32)
+            found["segmentation"] = Entry((*size, 1), torch.int32)
+        prefix = "" if sensor.name is None else f"{sensor.name}_"
+        self._sources = {prefix + key: key for key in found}
+        self.entries = {prefix + key: entry for key, entry in found.items()}
 
     def after_reset(self, envs: Sequence[int]) -> None:
         """Draw these environments."""
@@ -75,4 +79,7 @@ class _Pictures:
 
     def observe(self) -> dict[str, Tensor]:
         """The latest pictures of all environments."""
-        return {key: getattr(self._frames, key).clone() for key in self.entries}
+        return {
+            key: getattr(self._frames, source).clone()
+            for key, source in self._sources.items()
+        }

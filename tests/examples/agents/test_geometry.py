@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 import torch_panda
 from agents.geometry import read_geometry
+from experts.rotations import STRAIGHT, compose, to_matrix
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
 MIRROR_VELOCITY = torch.tensor([1, -1, 1, -1, 1, -1], dtype=torch.float64)
@@ -62,3 +64,26 @@ def test_differences(task):
         from_hand = objects - td["observation"][:, None, :3]
         expected = torch.cat((from_hand, goals - objects), 1).flatten(1)
         torch.testing.assert_close(found, expected)
+
+
+def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
+    generator = torch.Generator().manual_seed(0)
+    with torch_panda.make("PandaFlip-v1", seed=0) as env:
+        geometry = read_geometry(env)
+    place = slice(geometry.orientation, geometry.orientation + 4)
+    observation = torch.randn(20, 20, generator=generator)
+    goal = normalize(torch.randn(20, 4, generator=generator), dim=-1)
+    cube = observation[:, place] = normalize(observation[:, place], dim=-1)
+    seen, turn, matrix = geometry.turns(observation, goal)
+    # It leads from the cube to the goal, and no other of the 24 is nearer.
+    torch.testing.assert_close(matrix, to_matrix(turn).flatten(-2))
+    torch.testing.assert_close(
+        matrix.view(20, 3, 3) @ to_matrix(cube), to_matrix(goal), atol=1e-5, rtol=0
+    )
+    others = compose(cube[:, None], STRAIGHT)
+    torch.testing.assert_close(seen[:, place][:, 3], others[..., 3].abs().amax(1))
+    for same in STRAIGHT:
+        alike = observation.clone()
+        alike[:, place] = compose(cube, same)
+        again = geometry.turns(alike, compose(goal, same))
+        torch.testing.assert_close(again, (seen, turn, matrix), atol=1e-5, rtol=0)

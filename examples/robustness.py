@@ -1,0 +1,133 @@
+"""Draw how often policies succeed where objects are heavier or more slippery.
+
+    python examples/robustness.py runs/push runs/push-randomized --out robustness.png
+
+Each policy plays the same episodes in every cell of a grid of factors on the mass and
+the lateral friction of the objects. To train one for it: train.py --randomize 3
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display is needed
+
+import matplotlib.pyplot as plt
+import torch
+import tyro
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import torch_panda
+from limits import Positive, Seed, check_limits
+from torch_panda import Randomization
+from training.policies import load_policy, read_checkpoint
+
+
+@dataclass
+class Args:
+    """Which policies to compare, and on which grid."""
+
+    runs: Annotated[list[Path], tyro.conf.Positional]
+    """folders of runs, or policies (.pt)"""
+    masses: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
+    """factors on the mass of the objects"""
+    frictions: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
+    """factors on the lateral friction of the objects"""
+    episodes: Positive = 20
+    """number of episodes in each cell of the grid"""
+    seed: Seed = 1_000
+    """of the episodes"""
+    out: Path = Path("robustness.png")
+    """where to write the figure"""
+
+
+def success_grid(
+    env: torch_panda.RobotTaskEnv,
+    policy: TensorDictModuleBase,
+    factors: torch.Tensor,
+    episodes: int,
+) -> torch.Tensor:
+    """How often a policy succeeds at the end of an episode, in each environment.
+
+    Args:
+        env: an environment of batch size [n], made with a `Randomization` of k factors.
+        policy: the policy.
+        factors: (n, k), which environment has which.
+        episodes: number of episodes in each.
+
+    Returns:
+        (n,), from 0 to 1.
+    """
+    successes = torch.zeros(len(factors))
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(episodes):
+            env.reset()
+            state = env.get_state()
+            # All cells play the episodes of the first one.
+            state = state[[0] * len(factors)]
+            state["physics_parameters"] = factors.double()
+            start = env.reset(state, set_state=True)
+            played = env.rollout(
+                env.max_episode_steps, policy, auto_reset=False, tensordict=start
+            )
+            successes += played["next", "success"][:, -1, 0].cpu()
+    return successes / episodes
+
+
+def plot_grids(grids: dict[str, torch.Tensor], args: Args) -> None:
+    """Draw success over mass and friction, a panel a policy."""
+    figure, panels = plt.subplots(
+        1,
+        len(grids),
+        figsize=(3.5 * len(grids) + 1, 3.5),
+        layout="constrained",
+        squeeze=False,
+    )
+    for axes, (name, grid) in zip(panels[0], grids.items(), strict=True):
+        image = axes.imshow(grid, origin="lower", vmin=0, vmax=1, cmap="viridis")
+        axes.set_xticks(range(len(args.masses)), [f"{x:g}" for x in args.masses])
+        axes.set_yticks(range(len(args.frictions)), [f"{x:g}" for x in args.frictions])
+        axes.set(xlabel="mass", ylabel="friction", title=name)
+        for row, column in torch.cartesian_prod(*map(torch.arange, grid.shape)):
+            value = grid[row, column].item()
+            color = "black" if value > 0.5 else "white"
+            axes.text(column, row, f"{value:.0%}", ha="center", color=color)
+    figure.colorbar(image, ax=panels[0], label="success")
+    figure.savefig(args.out, dpi=120)
+    plt.close(figure)
+
+
+def main(args: Args) -> None:
+    """Evaluate each policy on the grid, print the means and draw them."""
+    check_limits(args)
+    factors = torch.cartesian_prod(
+        torch.tensor(args.frictions), torch.tensor(args.masses)
+    )
+    factors = factors.flip(1)  # mass first, as in physics_parameters
+    ranges = [(float(column.min()), float(column.max())) for column in factors.T]
+    randomize = Randomization(object_mass=ranges[0], object_friction=ranges[1])
+    grids: dict[str, torch.Tensor] = {}
+    for run in args.runs:
+        checkpoint = read_checkpoint(run)
+        with torch_panda.make(
+            checkpoint["env_id"],
+            num_envs=len(factors),
+            seed=args.seed,
+            randomize=randomize,
+        ) as env:
+            policy = load_policy(checkpoint, env)
+            success = success_grid(env, policy, factors, args.episodes)
+        name = run.stem if run.is_file() else run.name
+        grids[name] = success.reshape(len(args.frictions), len(args.masses))
+        print(f"{name}: {success.mean():.1%} over the grid, worst {success.min():.1%}")
+    plot_grids(grids, args)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except ValueError as error:
+        raise SystemExit(str(error)) from None

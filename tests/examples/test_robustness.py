@@ -1,0 +1,50 @@
+"""Policies on a grid of masses and frictions."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import robustness
+import torch_panda
+from torch_panda import Randomization
+
+POLICY = Path(__file__).parents[2] / "examples" / "policies" / "PandaPush-v1.pt"
+
+
+def test_draws_a_grid(tmp_path, capsys):
+    out = tmp_path / "grid.png"
+    args = robustness.Args(
+        [POLICY], masses=(1.0, 2.0), frictions=(1.0,), episodes=2, out=out
+    )
+    robustness.main(args)
+    assert "PandaPush-v1:" in capsys.readouterr().out
+    assert out.stat().st_size > 1000
+
+
+def test_cells_differ_in_physics_only():
+    factors = torch.tensor([[1.0, 1.0], [1.0, 1.0], [100.0, 100.0]])
+
+    class Spy(torch.nn.Module):
+        seen: list = []  # noqa: RUF012
+
+        def forward(self, td):
+            self.seen.append(td["desired_goal"].clone())
+            error = td["achieved_goal"] - td["observation"][:, :3]
+            return td.set("action", (10 * error).clamp(-1, 1))
+
+    with torch_panda.make(
+        "PandaPush-v1",
+        num_envs=3,
+        seed=0,
+        randomize=Randomization(object_mass=(1, 2), object_friction=(1, 2)),
+    ) as env:
+        spy = Spy()
+        success = robustness.success_grid(env, spy, factors, episodes=1)
+        cube = env.episodes.simulation.scene.objects[0]
+        masses = [client.mass(cube) for client in env.episodes.simulation.clients]
+        found = env.get_state()["object_pose"]
+    assert masses == pytest.approx([2.0, 2.0, 200.0])
+    assert (spy.seen[0] == spy.seen[0][0]).all()
+    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+    assert success.shape == (3,)

@@ -1,0 +1,233 @@
+"""What actions do under each control type, through either loop."""
+
+import math
+from itertools import product
+from typing import get_args
+
+import pybullet
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import torch_panda
+from torch_panda import Gripper, Panda, Reach, RobotTaskEnv
+from torch_panda.bullet import native
+from torch_panda.robots import ControlType
+from torch_panda.robots.rotations import (
+    quaternion_product,
+    rotation_vector_to_quaternion,
+)
+
+TYPES = get_args(ControlType)
+ID = "PandaPickAndPlace-v1"
+DIMS = {"ee": 3, "ee_pose": 6, "joints": 7, "joint_velocity": 7, "joint_torque": 7}
+SETTLED = 8  # steps
+
+
+def make(env_id=ID, *, num_envs=1, **options):
+    return torch_panda.make(env_id, num_envs=num_envs, seed=0, robot_options=options)
+
+
+def hold(env, action, steps=SETTLED):
+    """Repeat an action; simulation and last output."""
+    td = env.reset()
+    for _ in range(steps):
+        td = env.step(td.set("action", action.expand(env.action_spec.shape)))["next"]
+    return env.episodes.simulation, td
+
+
+def unit(size, index, value=1.0):
+    action = torch.zeros(size)
+    action[index] = value
+    return action
+
+
+@pytest.mark.parametrize("control_type", TYPES)
+def test_sizes(control_type):
+    with make(control_type=control_type) as env:
+        check_env_specs(env)
+        assert env.action_spec.shape == (1, DIMS[control_type] + 1)
+    with make("PandaPush-v1", control_type=control_type) as env:
+        assert env.action_spec.shape == (1, DIMS[control_type])
+
+
+@pytest.mark.parametrize("control_type", TYPES)
+def test_both_loops_give_the_same(control_type, monkeypatch):
+    if native.LIBRARY is None:
+        pytest.skip("installed where there was no C compiler")
+    rollouts = []
+    for loop in ("native", "ctypes"):
+        monkeypatch.setenv(native.LOOP_VARIABLE, loop)
+        torch.manual_seed(0)
+        with make(control_type=control_type, num_envs=2) as env:
+            rollouts.append(env.rollout(30, break_when_any_done=False))
+            assert rollouts[-1].shape == (2, 30)
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+def test_velocity(loop):
+    with make(control_type="joint_velocity") as env:
+        simulation, _ = hold(env, unit(8, 3, 0.4))
+        assert simulation.joint_velocity[0, 3] == pytest.approx(0.5, abs=0.02)
+        others = simulation.joint_velocity[0, [0, 1, 2, 4, 5, 6]]
+        assert others.abs().max() < 0.02
+    with make(control_type="joint_velocity", action_scale=0.2) as env:
+        simulation, _ = hold(env, unit(8, 3))
+        assert simulation.joint_velocity[0, 3] == pytest.approx(0.2, abs=0.02)
+
+
+def test_torque_is_what_the_joint_feels(loop):
+    """The arm falls without any; what pybullet does with the same torques."""
+    with make("PandaReach-v1", control_type="joint_torque", action_scale=0.1) as env:
+        action = torch.tensor([0.3, -0.2, 0.1, 0.4, 0.0, -0.5, 0.2])
+        simulation, _ = hold(env, action, steps=3)
+        found = simulation.joint_position[0, :7].tolist()
+        torques = action * 0.1 * torch.tensor(env.robot.joint_forces[:7])
+        start = env.robot.neutral_joint_position
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        import pybullet_data
+
+        pybullet.setTimeStep(1 / 500, physicsClientId=client)
+        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+        body = pybullet.loadURDF(
+            f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf",
+            useFixedBase=True,
+            physicsClientId=client,
+        )
+        joints = [0, 1, 2, 3, 4, 5, 6, 9, 10]
+        for joint, position in zip(joints, start, strict=True):
+            pybullet.resetJointState(body, joint, position, physicsClientId=client)
+        pybullet.setJointMotorControlArray(
+            body,
+            joints,
+            pybullet.VELOCITY_CONTROL,
+            forces=[0.0] * 7 + [170.0] * 2,
+            physicsClientId=client,
+        )
+        for _ in range(60):
+            pybullet.setJointMotorControlArray(
+                body,
+                joints[:7],
+                pybullet.TORQUE_CONTROL,
+                forces=torques.double().tolist(),
+                physicsClientId=client,
+            )
+            pybullet.stepSimulation(physicsClientId=client)
+        expected = [
+            pybullet.getJointState(body, joint, physicsClientId=client)[0]
+            for joint in joints[:7]
+        ]
+    finally:
+        pybullet.disconnect(client)
+    assert found == pytest.approx(expected, abs=1e-3)
+    moved = torch.tensor(found) - torch.tensor(start[:7])
+    assert moved.abs().max() > 0.02
+
+
+def test_pose_displaces_along_the_world_and_turns_in_the_hand(loop):
+    start = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    with make(control_type="ee_pose") as env:
+        simulation, td = hold(env, torch.zeros(7))
+        rest = td["observation"][0, :3]
+        _, td = hold(env, unit(7, 2, 0.5))
+        up = td["observation"][0, :3] - rest
+        assert up[2] > 0.1 and up[:2].abs().max() < 0.03
+        for axis, angle in product(range(3), (0.5, -0.5)):
+            simulation, td = hold(env, unit(7, 3 + axis, angle))
+            assert (td["observation"][0, :3] - rest).norm() < 0.04
+            vector = torch.zeros(1, 3, dtype=torch.float64)
+            # As fast as displacements, the hand lags behind what it is asked for.
+            vector[0, axis] = SETTLED * angle * 0.05
+            wanted = quaternion_product(start, rotation_vector_to_quaternion(vector))
+            cosine = (simulation.ee_orientation * wanted).sum().abs()
+            unturned = (start * wanted).sum().abs()
+            assert cosine.acos() < 0.6 * unturned.acos()
+
+
+def test_rotations_equal_pybullets():
+    torch.manual_seed(0)
+    vectors = torch.randn(20, 3, dtype=torch.float64)
+    turns = rotation_vector_to_quaternion(vectors)
+    for vector, turn in zip(vectors, turns, strict=True):
+        expected = pybullet.getQuaternionFromAxisAngle(
+            vector.tolist(), vector.norm().item()
+        )
+        assert turn.tolist() == pytest.approx(expected)
+    zero = rotation_vector_to_quaternion(torch.zeros(3, dtype=torch.float64))
+    assert zero.tolist() == [0, 0, 0, 1]
+    first, second = turns[:10], turns[10:]
+    for a, b, found in zip(
+        first, second, quaternion_product(first, second), strict=True
+    ):
+        _, expected = pybullet.multiplyTransforms(
+            (0, 0, 0), a.tolist(), (0, 0, 0), b.tolist()
+        )
+        sign = math.copysign(1.0, found[3] * expected[3])  # q and -q are the same
+        assert (sign * found).tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_action_scale():
+    with make(action_scale=0.02) as slow, make() as plain:
+        near = hold(slow, unit(4, 0), 4)[1]["observation"][0, 0]
+        far = hold(plain, unit(4, 0), 4)[1]["observation"][0, 0]
+        start = slow.reset()["observation"][0, 0]
+    assert 0 < near - start < 0.6 * (far - start)
+
+
+def test_workspace():
+    box = ((-0.1, -0.05, 0.15), (0.1, 0.05, 0.25))
+    with make(workspace=box) as env:
+        for action in product((-1.0, 1.0), repeat=3):
+            _, td = hold(env, torch.tensor((*action, 0.0)), 20)
+            position = td["observation"][0, :3]
+            low, high = torch.tensor(box)
+            assert (position > low - 0.02).all() and (position < high + 0.02).all()
+
+
+def test_base_pose():
+    """A robot that stands turned by 90 degrees does the same, turned."""
+    half = math.sqrt(0.5)
+    turned = {"base_position": (0.0, -0.6, 0.0), "base_orientation": (0, 0, half, half)}
+    with make("PandaReach-v1", control_type="joints") as plain:
+        _, first = hold(plain, torch.full((7,), 0.3))
+    with make("PandaReach-v1", control_type="joints", **turned) as env:
+        _, second = hold(env, torch.full((7,), 0.3))
+    x, y, z = first["observation"][0, :3].tolist()
+    found = second["observation"][0, :3].tolist()
+    assert found == pytest.approx((-y, x, z), abs=1e-3)
+    with make("PandaReach-v1", **turned) as env:  # inverse kinematics know of it
+        td = env.reset()
+        for _ in range(30):
+            error = td["desired_goal"] - td["achieved_goal"]
+            td = env.step(td.set("action", error * 10))["next"]
+        assert td["success"].all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"control_type": "force"}, "control_type must be one of"),
+        ({"action_scale": 0.0}, "action_scale must be above 0"),
+        ({"workspace": ((0, 0, 1), (0, 0, 0))}, "workspace must be"),
+        ({"workspace": (0.3, 0.3)}, "workspace must be"),
+        ({"base_orientation": (0, 0, 0, 0)}, "base_orientation must be"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        Panda(**options)
+
+
+def test_bad_grippers():
+    with pytest.raises(ValueError, match="of which one moves"):
+        Gripper(closed=(0.0,), opened=(0.0,), width=0.1)
+    with pytest.raises(ValueError, match="width must be above 0"):
+        Gripper(closed=(0.0,), opened=(0.1,), width=0.0)
+
+
+def test_fingers_go_where_the_action_says():
+    with RobotTaskEnv(robot=Panda(), task=Reach(), num_envs=1) as env:
+        simulation, td = hold(env, unit(4, 3))
+        assert td["observation"][0, 6] == pytest.approx(0.08, abs=0.001)
+        assert simulation.joint_position[0, 7:].sum().item() == pytest.approx(0.08)
