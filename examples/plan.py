@@ -1,10 +1,10 @@
 """Plan instead of learning: torchrl's cross-entropy method, with Bullet as its model.
 
-python examples/plan.py --env-id PandaPush-v1
+python examples/plan.py --episodes 3
 
-Every plan forks the exact state of one environment over many and tries an action
-sequence in each; the best ones say where to look for better ones. The first action of
-the last plan is taken, then comes the next plan.
+Every plan forks the exact state of one environment over many and tries a sequence of
+actions in each; the best ones say where to look for better ones. Then the first action
+is taken, and comes the next plan.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,15 @@ from typing import Any
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
+from torch.nn.functional import normalize
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import CEMPlanner
 
 import torch_panda
 from limits import Positive, Seed, Weight, check_limits
+
+BEHIND = 0.04  # [m] from its middle, where the hand pushes a cube
 
 
 @dataclass
@@ -31,108 +34,98 @@ class Args:
     """episodes to run"""
     seed: Seed = 0
     """of the episodes and of the plans"""
-    num_candidates: Positive = 48
+    num_candidates: Positive = 32
     """action sequences that are tried at once, each in an environment"""
-    top_k: Positive = 6
-    """how many of them, the best ones, the next ones are drawn around"""
+    top_k: Positive = 5
+    """the best ones, around which the next ones are drawn"""
     optim_steps: Positive = 3
-    """how often"""
+    """how often they are drawn for a plan"""
     planning_horizon: Positive = 4
     """actions in a sequence"""
-    hold: Positive = 3
+    hold: Positive = 4
     """steps for which each action is taken"""
-    approach: Weight = 0.3
-    """weight of the hand's distance to what is to be moved, beside the task's"""
+    action_scale: float = 0.02
+    """by how much an action of 1 moves the hand [m]"""
+    approach: Weight = 0.5
+    """weight of the hand's distance from behind the cube, beside the cube's distance"""
+
+
+def make(args: Args, **options: Any) -> torch_panda.RobotTaskEnv:  # noqa: ANN401
+    """The environments of an id, with actions that are small enough to be tried out."""
+    robot_options = {"action_scale": args.action_scale}
+    return torch_panda.make(args.env_id, robot_options=robot_options, **options)
 
 
 class Fork(EnvBase):
-    """Environments that go on from any exact state; what a planner takes for a model.
+    """What a planner takes for a model: environments that go on from an exact state.
 
     A rollout begins with the ``state`` of one environment and ``index`` 0.
-
-    Args:
-        args: the options.
     """
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> "Fork":  # noqa: ANN401 (torchrl's)
-        """Take a batch of any size, as planners need."""
+    def __new__(cls, *args: Any, **kwargs: Any) -> "Fork":  # noqa: ANN401, D102
         return super().__new__(cls, *args, _batch_locked=False, **kwargs)
 
     def __init__(self, args: Args) -> None:
         super().__init__(batch_size=[])
         self.hold, self.approach = args.hold, args.approach
-        self.model = torch_panda.make(args.env_id, num_envs=args.num_candidates)
-        size = self.model.action_spec.shape[-1:]
-        self.action_spec = Bounded(-1.0, 1.0, size)
+        self.model = make(args, num_envs=args.num_candidates)
+        self.action_spec = Bounded(-1.0, 1.0, self.model.action_spec.shape[-1:])
         self.observation_spec = Composite(index=Unbounded((1,), dtype=torch.int64))
         self.reward_spec = Unbounded((1,))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not tensordict["index"].any():
             self.now = self.model.reset(tensordict["state"], set_state=True)
-        reward = torch.zeros(*tensordict.batch_size, 1)
+        rewards = []
         for _ in range(self.hold):
-            action = self.now.set("action", tensordict["action"])
-            self.now = self.model.step(action)["next"]
-            hand, achieved = self.now["observation"][:, :3], self.now["achieved_goal"]
-            reward -= self.model.task.distance(achieved, self.now["desired_goal"])
-            reward -= self.approach * (achieved[:, :3] - hand).norm(dim=1, keepdim=True)
-        ended = torch.zeros_like(reward, dtype=torch.bool)
-        return TensorDict(
-            {
-                "index": tensordict["index"] + 1,
-                "reward": reward,
-                "done": ended,
-                "terminated": ended.clone(),
-            },
-            tensordict.batch_size,
-        )
+            self.now["action"] = tensordict["action"]
+            self.now = self.model.step(self.now)["next"]
+            goal, achieved = self.now["desired_goal"], self.now["achieved_goal"]
+            behind = achieved - BEHIND * normalize(goal - achieved, dim=1)
+            far = (behind - self.now["observation"][:, :3]).norm(dim=1, keepdim=True)
+            left = self.model.task.distance(achieved, goal)
+            rewards.append(-left - self.approach * far)
+        reward = torch.stack(rewards).sum(0)
+        # The end of an episode is no end of a plan.
+        done = torch.zeros_like(reward, dtype=torch.bool)
+        ends = {"done": done, "terminated": done.clone()}
+        index = tensordict["index"] + 1
+        return TensorDict({"index": index, "reward": reward, **ends}, reward.shape[:1])
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
-        return TensorDict({"index": torch.zeros(1, dtype=torch.int64)})
+        raise NotImplementedError("a fork starts from a state")
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing is drawn here."""
 
 
-def solve(
-    env: torch_panda.RobotTaskEnv, planner: CEMPlanner, args: Args
-) -> list[tuple[float, bool]]:
-    """Plan and act for an episode of an unbatched environment.
-
-    Returns:
-        After every action, the distance from the goal and whether that is success.
-    """
-    td, found = env.reset(), []
+def solve(env: torch_panda.RobotTaskEnv, fork: Fork, args: Args) -> TensorDictBase:
+    """Plan and act for an episode of one environment; return its last step."""
+    sizes = args.planning_horizon, args.optim_steps, args.num_candidates, args.top_k
+    planner = CEMPlanner(fork, *sizes)
+    td = env.reset()
     while not td["done"]:
-        state = env.get_state(exact=True)
-        start = {"state": state, "index": torch.zeros(1, dtype=torch.int64)}
+        start = {"state": env.get_state(exact=True), "index": torch.tensor([0])}
         action = planner(TensorDict(start))["action"]
         for _ in range(args.hold):
             if not td["done"]:
                 td = env.step(td.set("action", action))["next"]
-        distance = env.task.distance(td["achieved_goal"], td["desired_goal"])
-        found.append((distance.item(), bool(td["success"])))
-    return found
+    return td
 
 
 def main(args: Args) -> None:
     """Run the episodes and print how they end."""
     try:
         check_limits(args)
-        env = torch_panda.make(args.env_id, seed=args.seed)
-        fork = Fork(args)
+        env, fork = make(args, seed=args.seed), Fork(args)
     except ValueError as error:
         raise SystemExit(str(error)) from None
     torch.manual_seed(args.seed)
-    planner = CEMPlanner(
-        fork, args.planning_horizon, args.optim_steps, args.num_candidates, args.top_k
-    )
     with env, fork.model, torch.no_grad():
         for episode in range(args.episodes):
-            found = solve(env, planner, args)
-            distance, success = found[-1]
-            print(f"episode {episode}: success {success}, distance {distance:.3f}")
+            end = solve(env, fork, args)
+            left = env.task.distance(end["achieved_goal"], end["desired_goal"]).item()
+            print(f"episode {episode}: success {end['success'].item()}, {left:.3f} m")
 
 
 if __name__ == "__main__":
