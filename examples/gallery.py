@@ -21,7 +21,10 @@ from training.files import prepare
 from training.policies import load_policy, read_checkpoint
 from video import FPS, play, tile
 
-TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+TASKS = (
+    *("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip"),
+    *("Drawer", "PegInsertion"),
+)
 NEAR = torch_panda.Camera(distance=1.0, yaw=60, pitch=-25, target=(-0.2, 0.0, 0.23))
 # Slide's goals are out of reach.
 FAR = torch_panda.Camera(distance=1.5, yaw=50, pitch=-25, target=(0.05, 0.0, 0.12))

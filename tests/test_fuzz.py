@@ -122,7 +122,7 @@ def test_ids():
             except gymnasium.error.Error:
                 return
             # Without a version, Gymnasium takes the latest.
-            assert env.spec.id == f"torch_panda/{word}-v3"
+            assert env.spec.id.startswith(f"torch_panda/{word}-v")
             env.close()
 
     check()

@@ -14,7 +14,9 @@ from torch_panda.rendering import Camera, HandCamera
 from torch_panda.robots import Gripper, Kuka, Panda, Robot, XArm6, XArm6Gripper
 from torch_panda.sensors import CameraSensor, ForceSensor, Sensor
 from torch_panda.tasks import (
+    Drawer,
     Flip,
+    PegInsertion,
     PickAndPlace,
     Push,
     Reach,
@@ -28,12 +30,14 @@ __all__ = [
     "BulletError",
     "Camera",
     "CameraSensor",
+    "Drawer",
     "Flip",
     "ForceSensor",
     "Gripper",
     "HandCamera",
     "Kuka",
     "Panda",
+    "PegInsertion",
     "PhysicsName",
     "PhysicsParams",
     "PickAndPlace",

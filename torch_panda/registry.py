@@ -24,7 +24,9 @@ from torch_panda.robots import (
 )
 from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import (
+    Drawer,
     Flip,
+    PegInsertion,
     PickAndPlace,
     Push,
     Reach,
@@ -33,6 +35,7 @@ from torch_panda.tasks import (
     Stack,
     Task,
 )
+from torch_panda.tasks.peg_insertion import GRASP_WIDTH
 from torch_panda.versions import (
     NO_PAIRS,
     ROBOT_ARGUMENTS,
@@ -48,9 +51,16 @@ _TASKS: dict[str, type[Task]] = {
     "PickAndPlace": PickAndPlace,
     "Stack": Stack,
     "Flip": Flip,
+    "Drawer": Drawer,
+    "PegInsertion": PegInsertion,
 }
 # Tasks that are done with the gripper blocked, so without an action for it.
-_BLOCKED_GRIPPER = ("Reach", "Push", "Slide")
+_BLOCKED_GRIPPER = ("Reach", "Push", "Slide", "Drawer", "PegInsertion")
+# Those that panda-gym does not have, and what their robots are made with.
+_OWN_TASKS: dict[str, dict[str, Any]] = {
+    "Drawer": {},
+    "PegInsertion": {"fingers_width": GRASP_WIDTH, "finger_friction": 5.0},
+}
 _CONTROL: dict[str, ControlType] = {"": "ee", "Joints": "joints"}
 _REWARD: dict[str, RewardType] = {"": "sparse", "Dense": "dense"}
 
@@ -72,6 +82,7 @@ _ENVS = {
             control_type=_CONTROL[control],
             block_gripper=task in _BLOCKED_GRIPPER,
             **arguments_of(ROBOT_ARGUMENTS.get(task, NO_PAIRS), version),
+            **_OWN_TASKS.get(task, {}),
         ),
         task=partial(
             _TASKS[task],
@@ -82,6 +93,7 @@ _ENVS = {
         terminate_on_success=version == "v3",
     )
     for task, control, reward, version in product(_TASKS, _CONTROL, _REWARD, VERSIONS)
+    if task not in _OWN_TASKS or version == "v1"
 }
 
 # Other robots at the tasks -v1; ``robot_options`` has their control types.
@@ -106,8 +118,9 @@ _ENVS |= {
 }
 
 ENV_IDS: tuple[str, ...] = tuple(_ENVS)
-"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}`` for the six
-tasks, ``{Kuka,XArm6,XArm6Gripper}Reach{,Dense}-v1`` and
+"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}`` for the tasks
+of panda-gym, -v1 only for Drawer and PegInsertion,
+``{Kuka,XArm6,XArm6Gripper}Reach{,Dense}-v1`` and
 ``XArm6GripperPickAndPlace{,Dense}-v1``."""
 
 
@@ -264,9 +277,11 @@ def _find(env_id: str) -> _Registration:
         close = difflib.get_close_matches(str(env_id), _ENVS, n=3)
         hint = f"did you mean {' or '.join(close)}? " if close else ""
         own = ", ".join(sorted(_ENVS.keys() - set(ENV_IDS)))
+        both = ",".join(task for task in _TASKS if task not in _OWN_TASKS)
         raise ValueError(
             f"unknown environment id {env_id!r}; {hint}accepted are "
-            f"Panda{{{','.join(_TASKS)}}}{{,Joints}}{{,Dense}}-v{{1,3}}, "
+            f"Panda{{{both}}}{{,Joints}}{{,Dense}}-v{{1,3}}, "
+            f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1, "
             + ", ".join(sorted({f"{r.__name__}{task}-v1" for r, task, _ in _ROBOTS}))
             + (f" and what was registered: {own}" if own else "")
         )

@@ -6,13 +6,22 @@ import torch
 from torch import Tensor
 
 from experts.rotations import compose, inverse, same_half, straighten, to_matrix
-from torch_panda import RobotTaskEnv, Slide
+from torch_panda import Drawer, PegInsertion, RobotTaskEnv, Slide, Task
 
 # Factors that mirror a quantity in the plane y = 0, in which robot and table are
 # symmetric.
-_POINT = (1.0, -1.0, 1.0)  # also a velocity
-_ANGLES = (-1.0, 1.0, -1.0)  # also an angular velocity
+_POINT = (1.0, -1.0, 1.0)
+_ANGLES = (-1.0, 1.0, -1.0)
 _QUATERNION = (-1.0, 1.0, -1.0, 1.0)
+_FACTORS = {
+    "position": _POINT,
+    "velocity": _POINT,
+    "angles": _ANGLES,
+    "angular velocity": _ANGLES,
+    "quaternion": _QUATERNION,
+    "number": (1.0,),
+}
+_OBJECT = ("position", "angles", "velocity", "angular velocity")
 
 # [m]. Slide draws goals 1.5 cm above where its puck can be, by which networks would
 # tell them from hindsight goals.
@@ -71,14 +80,15 @@ class Geometry:
 def read_geometry(env: RobotTaskEnv) -> Geometry:
     """The geometry of one of `torch_panda.ENV_IDS`."""
     robot, task = env.robot, env.task
-    rotates = task.goal_dim == 4  # Flip: orientations are quaternions
-    gripper = (1.0,) * (robot.observation_dim - 6)
-    rotation = _QUATERNION if rotates else _ANGLES
-    one_object = (*_POINT, *rotation, *_POINT, *_ANGLES)
-    num_objects = task.observation_dim // len(one_object)
-    size = robot.observation_dim + task.observation_dim
+    gripper = ("number",) * (robot.observation_dim - 6)
+    layout = ("position", "velocity", *gripper, *_task_layout(task))
+    sizes = [len(_FACTORS[kind]) for kind in layout]
+    places = [sum(sizes[:k]) for k in range(len(layout))]
+    size = sum(sizes)
 
-    starts = [robot.observation_dim + len(one_object) * i for i in range(num_objects)]
+    positions = zip(places, layout, strict=True)
+    _, *starts = (place for place, kind in positions if kind == "position")
+    rotates = task.goal_dim == 4  # Flip: orientations are quaternions
     goals = () if rotates else tuple(range(0, task.goal_dim, 3))
     # What an object is seen from, and a goal: the hand, and what is to be moved there.
     pairs = [(0, start) for start in starts]
@@ -88,11 +98,25 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
     return Geometry(
         later=tuple(there + axis for _, there in pairs for axis in range(3)),
         earlier=tuple(here + axis for here, _ in pairs for axis in range(3)),
-        observation=(*_POINT, *_POINT, *gripper, *one_object * num_objects),
+        observation=tuple(factor for kind in layout for factor in _FACTORS[kind]),
         goal=_QUATERNION if rotates else _POINT * len(goals),
-        action=(*_POINT, *gripper) if robot.control_type == "ee" else None,
+        action=(*_POINT, *(1.0 for _ in gripper))
+        if robot.control_type == "ee"
+        else None,
         positions=(0, *starts),
         goal_positions=goals,
         goal_height=SLIDE_GOAL_HEIGHT if isinstance(task, Slide) else None,
         orientation=starts[0] + 3 if rotates else None,
     )
+
+
+def _task_layout(task: Task) -> tuple[str, ...]:
+    """What the numbers of a task's observation are, by names of `_FACTORS`."""
+    match task:
+        case Drawer():
+            return ("position", "number", "number")
+        case PegInsertion():
+            return (*_OBJECT, "position")
+    if task.goal_dim == 4:
+        return ("position", "quaternion", "velocity", "angular velocity")
+    return _OBJECT * (task.observation_dim // 12)

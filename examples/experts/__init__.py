@@ -13,7 +13,17 @@ from functools import partial
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from experts import flip, pick_and_place, push, reach, slide, stack
+import torch_panda
+from experts import (
+    drawer,
+    flip,
+    peg_insertion,
+    pick_and_place,
+    push,
+    reach,
+    slide,
+    stack,
+)
 
 # (observation, achieved_goal, desired_goal), each (..., size), to the action.
 Expert = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -25,6 +35,8 @@ EXPERTS: dict[str, Expert] = {
     "PickAndPlace": pick_and_place.act,
     "Stack": stack.act,
     "Flip": flip.act,
+    "Drawer": drawer.act,
+    "PegInsertion": peg_insertion.act,
 }
 # On the rougher table of -v3 a cube can be pushed, and spins less.
 V3_EXPERTS: dict[str, Expert] = EXPERTS | {
@@ -40,10 +52,10 @@ def make_expert(env_id: str) -> TensorDictModule:
         ValueError: there is no expert for it.
     """
     match = re.fullmatch(r"Panda([A-Za-z]+?)(Dense)?-v([13])", env_id)
-    if match is None or match[1] not in EXPERTS:
+    if match is None or match[1] not in EXPERTS or env_id not in torch_panda.ENV_IDS:
         raise ValueError(
-            f"no expert for {env_id!r}; accepted are "
-            f"Panda{{{','.join(EXPERTS)}}}{{,Dense}}-v{{1,3}}"
+            f"no expert for {env_id!r}; there are experts for the ids of "
+            f"{', '.join(EXPERTS)} with end-effector control"
         )
     keys = ["observation", "achieved_goal", "desired_goal"]
     experts = EXPERTS if match[3] == "1" else V3_EXPERTS

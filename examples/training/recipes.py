@@ -63,6 +63,14 @@ RECIPES: dict[str, dict[str, Any]] = {
         "eval_interval": 20_000,
     },
     "Flip": {**OBJECT, "total_steps": 1_000_000},
+    "Drawer": {**OBJECT, "total_steps": 50_000},
+    "PegInsertion": {
+        **OBJECT,
+        "relative_inputs": "fine",
+        "anneal_lr": True,
+        "total_steps": 200_000,
+        "eval_interval": 10_000,
+    },
 }
 
 

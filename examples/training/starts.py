@@ -15,6 +15,7 @@ from torchrl.envs import Transform
 import torch_panda
 from agents.geometry import read_geometry
 from experts.moves import carry, go_over, is_held, norm
+from torch_panda import Flip, Push, Slide, Stack
 
 APPROACH = 45  # steps
 # How far beside an object a hand that cannot grasp stops, between the centres [m]: the
@@ -42,7 +43,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
         left out.
 
     Raises:
-        ValueError: the task has no objects, or control is not of the end-effector.
+        ValueError: the task has no objects on the table, or control is not of the
+            end-effector.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -52,10 +54,11 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
     with torch_panda.make(env_id, num_envs=number, seed=seed) as env, torch.no_grad():
         geometry = read_geometry(env)
         _, *objects = geometry.positions
-        if not objects or geometry.action is None:
+        lies = isinstance(env.task, Push | Slide | Stack | Flip)
+        if not lies or geometry.action is None:
             raise ValueError(
-                "starts at objects need end-effector control and a task with objects, "
-                f"got {env_id}"
+                "starts at objects need end-effector control and a task with objects "
+                f"on the table, got {env_id}"
             )
         turns = [*objects, objects[-1]] if len(objects) > 1 else objects
         turn = torch.arange(number) % len(turns)

@@ -22,6 +22,11 @@ SIZES = {
     "Stack": (31, 6, 4, 100),
     "Flip": (20, 4, 4, 50),
 }
+# Those that panda-gym does not have, so without a -v3.
+OWN_SIZES = {
+    "Drawer": (11, 3, 3, 50),
+    "PegInsertion": (21, 3, 3, 50),
+}
 NUM_ENVS = 3
 
 
@@ -43,12 +48,18 @@ def env(made):
     return made[1]
 
 
-# Task, control and version of the paper's and panda-gym's ids.
-@pytest.mark.parametrize("parts", product(SIZES, ("", "Joints"), ("v1", "v3")))
+# Task, control and version.
+PARTS = [
+    *product(SIZES, ("", "Joints"), ("v1", "v3")),
+    *product(OWN_SIZES, ("", "Joints"), ("v1",)),
+]
+
+
+@pytest.mark.parametrize("parts", PARTS)
 def test_sizes_of_the_contract(parts):
     task, control, version = parts
     env_id = f"Panda{task}{control}-{version}"
-    observation, goal, action, steps = SIZES[task]
+    observation, goal, action, steps = (SIZES | OWN_SIZES)[task]
     assert {env_id, dense(env_id)} <= set(torch_panda.ENV_IDS)
     with torch_panda.make(env_id) as env:
         assert env.observation_spec["observation"].shape == (observation,)

@@ -27,6 +27,8 @@ def successes(env_id, episodes, seed):
         ("PandaPickAndPlace-v1", 16, 15),
         ("PandaStack-v1", 16, 12),
         ("PandaFlip-v1", 48, 28),
+        ("PandaDrawer-v1", 16, 15),
+        ("PandaPegInsertion-v1", 16, 15),
         ("PandaPush-v3", 16, 13),
         ("PandaFlip-v3", 32, 20),
     ],
@@ -74,7 +76,9 @@ def test_collectors_take_an_expert():
     assert data["next", "success"][:, [49, 99]].all()
 
 
-@pytest.mark.parametrize("env_id", ["PandaPushJoints-v1", "PandaFly-v1", "Push"])
+@pytest.mark.parametrize(
+    "env_id", ["PandaPushJoints-v1", "PandaFly-v1", "PandaDrawer-v3", "Push"]
+)
 def test_ids_without_an_expert(env_id):
     with pytest.raises(ValueError, match="no expert for"):
         experts.make_expert(env_id)

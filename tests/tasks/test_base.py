@@ -2,9 +2,24 @@
 
 import math
 
+import pybullet
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from torch_panda import Flip, Push, Stack
+from torch_panda.tasks.rotations import rotate
+
+angle = st.floats(-math.pi, math.pi)
+
+
+@given(angle, angle, angle)
+def test_rotate_equals_pybullet(roll, pitch, yaw):
+    quaternion = pybullet.getQuaternionFromEuler((roll, pitch, yaw))
+    vector = torch.tensor([[0.3, -0.2, 0.7], [-1.0, 2.0, 0.5]], dtype=torch.float64)
+    matrix = torch.tensor(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+    found = rotate(torch.tensor(quaternion, dtype=torch.float64), vector)
+    torch.testing.assert_close(found, vector @ matrix.double().T, atol=1e-6, rtol=0)
 
 
 def test_rewards_by_hand():

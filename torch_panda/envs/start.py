@@ -26,30 +26,33 @@ def draw_start(
         env: which environment.
         rng: of this episode.
         robot: starts neutral.
-        task: draws the goal, then the objects, then their joints.
+        task: draws goal, objects and their joints.
         simulation: receives the state.
         goal: (n, goal_dim), receives the goal.
 
     Raises:
         ValueError: the task draws a wrong shape, or what is not finite or no rotation.
     """
-    _fill(goal[env], task.sample_goal(rng), "sample_goal")
+    own = type(task).sample_start is not Task.sample_start
+    start = task.sample_start(rng)
+    _fill(goal[env], start.goal, "sample_start" if own else "sample_goal")
     simulation.joint_position[env] = _double(robot.neutral_joint_position)
     simulation.joint_velocity[env] = 0.0
     if simulation.scene.objects:
+        function = "sample_start" if own else "sample_objects"
         pose = simulation.object_pose
-        _fill(pose[env], task.sample_objects(rng), "sample_objects")
+        _fill(pose[env], start.object_pose, function)
         for *_, x, y, z, w in pose[env].tolist():
             if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
                 raise ValueError(
-                    f"sample_objects must return unit quaternions, got {[x, y, z, w]}"
+                    f"{function} must return unit quaternions, got {[x, y, z, w]}"
                 )
         simulation.object_velocity[env] = 0.0
     if any(simulation.scene.object_joints):
         joints = simulation.object_joint_position[env]
-        drawn = _double(task.sample_object_joints(rng))
+        drawn = _double(start.object_joint_position)
         drawn = drawn.expand_as(joints) if drawn.shape == (1,) else drawn
-        _fill(joints, drawn, "sample_object_joints")
+        _fill(joints, drawn, "sample_start" if own else "sample_object_joints")
         simulation.object_joint_velocity[env] = 0.0
 
 

@@ -75,7 +75,7 @@ class Robot:
         action_scale: what an action of 1 is: 0.05 m or rad, 1.25 rad/s, or this part of
             ``joint_forces``, all of it; None means these.
         gripper: of the last joints; None: there is none.
-        block_gripper: keep the gripper closed.
+        block_gripper: keep the fingers where they start.
         base_position: of the base, world frame [m].
         base_orientation: of the base, quaternion xyzw.
         workspace: the box in which actions send the end-effector, lowest and highest
@@ -216,13 +216,12 @@ class Robot:
             positions of the other joints [rad] or [m].
         """
         arm = self.arm_setpoint(action[:, : self._arm_action_dim], simulation)
-        count, joints = self.num_arm_joints, simulation.joint_position
-        if self.gripper is None:
+        count = self.num_arm_joints
+        if self.gripper is None or self.block_gripper:
             others = arm.new_tensor(self.neutral_joint_position[count:])
-        elif self.block_gripper:
-            others = arm.new_tensor(self.gripper.closed)
         else:
-            others = self.gripper.setpoint(action[:, -1:], joints[:, count:])
+            fingers = simulation.joint_position[:, count:]
+            others = self.gripper.setpoint(action[:, -1:], fingers)
         return torch.cat((arm, others.expand(len(arm), -1)), dim=1)
 
     def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:

@@ -28,10 +28,11 @@ class Panda(Robot):
     Args:
         control_type: see `Robot`, also for the next five.
         action_scale: what an action of 1 is.
-        block_gripper: keep the gripper closed.
+        block_gripper: keep the fingers where they start, by default closed.
         base_position: of the base, world frame [m].
         base_orientation: of the base, quaternion xyzw.
         workspace: where the end-effector may be sent.
+        fingers_width: distance between the fingers at the start of an episode [m].
         finger_friction: lateral friction of the fingers.
         finger_spinning_friction: of the fingers; None leaves what the URDF has, 0.1.
     """
@@ -45,12 +46,19 @@ class Panda(Robot):
         base_position: Sequence[float] = (-0.6, 0.0, 0.0),
         base_orientation: Sequence[float] = NO_ROTATION,
         workspace: Workspace = ABOVE_THE_TABLE,
+        fingers_width: float = 0.0,
         finger_friction: float = 1.0,
         finger_spinning_friction: float | None = None,
     ) -> None:
+        if not 0 <= fingers_width <= GRIPPER.width:
+            raise ValueError(
+                f"fingers_width must be from 0 to {GRIPPER.width} [m], got "
+                f"{fingers_width}"
+            )
+        fingers = (fingers_width / 2,) * 2
         super().__init__(
             urdf="franka_panda/panda.urdf",
-            neutral_joint_position=NEUTRAL_JOINT_POSITION,
+            neutral_joint_position=(*NEUTRAL_JOINT_POSITION[:7], *fingers),
             joint_forces=JOINT_FORCES,
             ee_link=EE_LINK,
             num_arm_joints=7,

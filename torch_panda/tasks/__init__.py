@@ -1,7 +1,15 @@
 """Tasks: their scene, goals, observation, success and reward."""
 
-from torch_panda.tasks.base import Bodies, RewardType, Task, object_observation
+from torch_panda.tasks.base import (
+    Bodies,
+    RewardType,
+    Start,
+    Task,
+    object_observation,
+)
+from torch_panda.tasks.drawer import Drawer
 from torch_panda.tasks.flip import Flip
+from torch_panda.tasks.peg_insertion import PegInsertion
 from torch_panda.tasks.pick_and_place import PickAndPlace
 from torch_panda.tasks.push import Push
 from torch_panda.tasks.reach import Reach
@@ -11,13 +19,16 @@ from torch_panda.tasks.table import create_table
 
 __all__ = [
     "Bodies",
+    "Drawer",
     "Flip",
+    "PegInsertion",
     "PickAndPlace",
     "Push",
     "Reach",
     "RewardType",
     "Slide",
     "Stack",
+    "Start",
     "Task",
     "create_table",
     "object_observation",

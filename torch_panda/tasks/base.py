@@ -13,7 +13,14 @@ from torch_panda.tasks.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
 
 # What tasks of users are made of is found here.
-__all__ = ["NO_ROTATION", "Bodies", "Task", "create_table", "object_observation"]
+__all__ = [
+    "NO_ROTATION",
+    "Bodies",
+    "Start",
+    "Task",
+    "create_table",
+    "object_observation",
+]
 
 RewardType = Literal["sparse", "dense"]
 # (achieved_goal, desired_goal), both (..., goal_dim), to (..., 1).
@@ -31,6 +38,20 @@ class Bodies(NamedTuple):
 
     objects: tuple[int, ...] = ()
     markers: tuple[int, ...] = ()
+
+
+class Start(NamedTuple):
+    """What a task draws for an episode; see `Task.sample_start`.
+
+    Attributes:
+        goal: (goal_dim,).
+        object_pose: (n_objects, 7), positions [m] and quaternions xyzw, world frame.
+        object_joint_position: (n_object_joints,) [rad] or [m]; or one number for all.
+    """
+
+    goal: Sequence[float]
+    object_pose: Sequence[Sequence[float]] = ()
+    object_joint_position: Sequence[float] = (0.0,)
 
 
 class Task(ABC):
@@ -71,9 +92,23 @@ class Task(ABC):
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the scene in a client."""
 
-    @abstractmethod
+    def sample_start(self, rng: np.random.Generator) -> Start:
+        """Draw what an episode starts with.
+
+        By default what the next three draw, in this order, each on its own. A task in
+        which one depends on another, such as a goal on where an object starts,
+        overrides this instead.
+        """
+        return Start(
+            self.sample_goal(rng),
+            self.sample_objects(rng),
+            self.sample_object_joints(rng),
+        )
+
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a goal: (goal_dim,)."""
+        name = type(self).__name__
+        raise NotImplementedError(f"{name} must have a sample_goal or a sample_start")
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
         """Draw start poses: (n_objects, 7), position and quaternion xyzw."""
@@ -82,7 +117,7 @@ class Task(ABC):
     def sample_object_joints(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw start positions of the objects' joints [rad] or [m], by default 0.
 
-        Called if the objects have joints, after `sample_objects`.
+        Unused if they have none.
 
         Returns:
             (n_object_joints,), as `VectorSimulation.object_joint_position`; or one

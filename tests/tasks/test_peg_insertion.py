@@ -1,0 +1,100 @@
+"""PegInsertion: a peg in the hand, and a hole that is as wide as it says."""
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda import PegInsertion
+
+N = 3
+
+
+def rest(env, td, steps):
+    for _ in range(steps):
+        td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
+    return td
+
+
+def place(env, offset, height, steps=25):
+    """Where a peg is some steps after it was let go over the hole.
+
+    Args:
+        env: of N environments.
+        offset: from the middle of the hole along x and y [m].
+        height: of the peg's lower end [m].
+        steps: that many.
+    """
+    env.reset()
+    state = env.get_state()
+    hole = state["object_pose"][:, 1, :3]
+    peg = state["object_pose"][:, 0]
+    peg[:, :2] = hole[:, :2] + torch.tensor(offset, dtype=torch.float64)
+    peg[:, 2] = height + 0.04
+    return rest(env, env.reset(state, set_state=True), steps)
+
+
+def test_the_hand_holds_the_peg():
+    with torch_panda.make("PandaPegInsertion-v1", num_envs=N, seed=0) as env:
+        td = env.reset()
+        start = td["achieved_goal"]
+        end = rest(env, td, 49)["achieved_goal"]
+        assert (end - start).norm(dim=1).max() < 0.002
+        action = torch.tensor((0.1, -0.1, 0.1)).expand(N, 3)
+        td = env.reset()
+        for _ in range(15):
+            td = env.step(td.set("action", action))["next"]
+        moved = td["achieved_goal"] - td["observation"][:, :3]
+        assert (moved - torch.tensor((0.0, 0.0, -0.06))).norm(dim=1).max() < 0.003
+
+
+@pytest.mark.parametrize("play", [0.001, 0.0005])
+def test_the_hole_is_wider_by_the_play(play):
+    options = {"play": play}
+    with torch_panda.make(
+        "PandaPegInsertion-v1", num_envs=N, seed=0, task_options=options
+    ) as env:
+        inside = place(env, (0.4 * play, -0.4 * play), 0.052)
+        assert (inside["achieved_goal"][:, 2] < 0.045).all()
+        on_top = place(env, (0.7 * play + 0.001, 0.0), 0.052)
+        assert (on_top["achieved_goal"][:, 2] > 0.045).all()
+
+
+def test_success_is_in_the_hole():
+    with torch_panda.make("PandaPegInsertion-v1", num_envs=N, seed=0) as env:
+        deep = place(env, (0.0, 0.0), 0.015, steps=0)
+        assert deep["success"].all()
+        # The goal is the end's place at 3 cm of the 5 cm.
+        goal = deep["desired_goal"]
+        hole = deep["observation"][:, -3:]
+        torch.testing.assert_close(goal, hole + torch.tensor((0.0, 0.0, 0.02)))
+        on_top = goal + torch.tensor((0.0, 0.0, 0.03))
+        beside = goal + torch.tensor((0.02, 0.0, 0.0))
+        for end in (on_top, beside):
+            assert not env.is_success(end, goal).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"play": 0.0}, "play must be between"),
+        ({"play": 0.03}, "play must be between"),
+        ({"depth": 0.06}, "depth must be from distance_threshold"),
+        ({"depth": 0.005}, "depth must be from distance_threshold"),
+    ],
+)
+def test_impossible_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        PegInsertion(**options)
+
+
+def test_fingers_start_where_the_robot_says():
+    for width in (0.0, 0.03):
+        robot_options = {"fingers_width": width}
+        with torch_panda.make("PandaReach-v1", robot_options=robot_options) as env:
+            td = env.reset()
+            for _ in range(3):
+                found = env.get_state()["joint_position"][7:].sum().item()
+                assert found == pytest.approx(width, abs=1e-4)
+                td = env.step(td.set("action", torch.ones(3)))["next"]
+    with pytest.raises(ValueError, match="fingers_width must be from 0"):
+        torch_panda.Panda(fingers_width=0.1)

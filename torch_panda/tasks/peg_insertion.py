@@ -1,0 +1,118 @@
+"""PegInsertion: put a peg that the hand holds into a hole."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
+from torch_panda.bullet.shapes import RED, Box
+from torch_panda.tasks.base import Bodies, RewardType, Start, Task, object_observation
+from torch_panda.tasks.rotations import NO_ROTATION, rotate
+from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_table
+
+URDF = Path(__file__).with_name("hole.urdf")
+HOLE_WIDTH = 0.021  # [m], of the square hole
+HOLE_DEPTH = 0.05  # [m], as high as the block is
+PEG_LENGTH = 0.08  # [m]
+# Distance between the fingers at which they are kept [m]. Narrower than the peg, so
+# that they press on it; not much narrower, or it could move from one to the other.
+GRASP_WIDTH = 0.0198
+# Of the peg's centre at the start, world frame [m]: the fingers of a neutral Panda,
+# whose end-effector is at (0.0384, 0, 0.1974), hold its upper part.
+PEG_POSITION = (0.0384, 0.0, 0.1774)
+
+
+class PegInsertion(Task):
+    """Put a square peg into a square hole.
+
+    The hand holds the peg from the start. Goals and achieved goals are positions of the
+    peg's lower end. It is as deep as the goal asks for, within ``distance_threshold``,
+    only where it is in the hole.
+
+    Args:
+        reward_type: "sparse" or "dense".
+        distance_threshold: success is a distance below it [m].
+        depth: how deep in the hole the peg's end should be [m].
+        play: by how much the hole is wider than the peg [m].
+        hole_xy_range: edge length of the square of the hole's places [m].
+        peg_mass: [kg].
+        peg_friction: lateral friction of the peg.
+        table_friction: lateral friction of the table.
+    """
+
+    goal_dim = 3
+    observation_dim = 15
+
+    def __init__(
+        self,
+        *,
+        reward_type: RewardType = "sparse",
+        distance_threshold: float = 0.01,
+        depth: float = 0.03,
+        play: float = 0.001,
+        hole_xy_range: float = 0.2,
+        peg_mass: float = 0.1,
+        peg_friction: float = 0.5,
+        table_friction: float = TABLE_FRICTION,
+    ) -> None:
+        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
+        if not 0 < play < HOLE_WIDTH:
+            raise ValueError(f"play must be between 0 and {HOLE_WIDTH} [m], got {play}")
+        if not distance_threshold <= depth <= HOLE_DEPTH:
+            raise ValueError(
+                f"depth must be from distance_threshold, {distance_threshold}, to "
+                f"{HOLE_DEPTH} [m], got {depth}"
+            )
+        self.depth = depth
+        self.play = play
+        self.hole_xy_range = hole_xy_range
+        self.peg_mass = peg_mass
+        self.peg_friction = peg_friction
+        self.table_friction = table_friction
+
+    def build(self, client: PhysicsClient) -> Bodies:
+        """Build the table, the peg, the block with the hole, and the marker, a peg."""
+        create_table(client, friction=self.table_friction)
+        side = (HOLE_WIDTH - self.play) / 2
+        shape = Box((side, side, PEG_LENGTH / 2))
+        peg = client.create_box(
+            shape.half_extents,
+            mass=self.peg_mass,
+            position=PEG_POSITION,
+            visual=Visual(RED, name="peg"),
+        )
+        client.set_friction(peg, lateral=self.peg_friction)
+        hole = client.load_urdf(URDF, fixed_base=True)
+        return Bodies(
+            objects=(peg, hole), markers=(client.create_marker(PEG_POSITION, shape),)
+        )
+
+    def marker_pose(self, goal: Tensor) -> Tensor:
+        """A peg whose lower end is at the goal: (..., 3) -> (..., 1, 7)."""
+        return super().marker_pose(goal + goal.new_tensor((0.0, 0.0, PEG_LENGTH / 2)))
+
+    def sample_start(self, rng: np.random.Generator) -> Start:
+        """Draw where the hole is; the peg is in the hand."""
+        x, y, _ = hole = sample_on_table(rng, self.hole_xy_range, height=0.0)
+        return Start(
+            (x, y, HOLE_DEPTH - self.depth),
+            ((*PEG_POSITION, *NO_ROTATION), (*hole, *NO_ROTATION)),
+        )
+
+    def observation(self, simulation: VectorSimulation) -> Tensor:
+        """The peg's and the hole's: (num_envs, 15).
+
+        Position of the peg's lower end, Euler angles and velocities of the peg, and the
+        position of the hole on the table.
+        """
+        peg = object_observation(simulation, 0)[:, 3:]
+        hole = simulation.object_pose[:, 1, :3]
+        return torch.cat((self.achieved_goal(simulation), peg, hole), dim=1)
+
+    def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
+        """Position of the peg's lower end: (num_envs, 3)."""
+        pose = simulation.object_pose[:, 0]
+        end = pose.new_tensor((0.0, 0.0, -PEG_LENGTH / 2))
+        return pose[:, :3] + rotate(pose[:, 3:], end)
