@@ -33,6 +33,7 @@ _EXTRAS = {
     "lerobot": ("LeRobot data sets; in an environment of its own", "lerobot"),
     "ray": ("training on many machines", "ray"),
     "bench": ("python -m torch_panda bench", "tqdm"),
+    "fetch": ("bench beside the Fetch robot on MuJoCo", "gymnasium_robotics"),
 }
 
 
