@@ -1,10 +1,8 @@
 """A robot and a task, as one batched TorchRL environment."""
 
-import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -14,21 +12,18 @@ from torch_panda.closing import Closing
 from torch_panda.envs.checks import check_device
 from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
 from torch_panda.envs.persistence import PersistentEnv
+from torch_panda.envs.pictures import PicturedEnv
 from torch_panda.envs.specs import Specs
 from torch_panda.envs.state import EXACT_KEYS, means_state
 from torch_panda.randomization import Randomization
-from torch_panda.rendering import Camera, RendererName, Window
-from torch_panda.rendering.camera import resized
+from torch_panda.rendering import RendererName
 from torch_panda.robots import Robot
 from torch_panda.sensors import Sensor
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
 
-if TYPE_CHECKING:  # needs an extra
-    from torch_panda.rendering.web_viewer import WebViewer
 
-
-class RobotTaskEnv(PersistentEnv, Closing):
+class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
     """Goal-conditioned environments of one robot and one task, stepped in parallel.
 
     What an environment draws depends on (``seed``, its index, the number of its
@@ -141,15 +136,6 @@ class RobotTaskEnv(PersistentEnv, Closing):
         """The task's pure success function; see `Task.is_success`."""
         return self.task.is_success
 
-    @functools.cached_property
-    def segmentation_ids(self) -> dict[str, int]:
-        """What the numbers in segmentations stand for, by name.
-
-        ``nothing`` (-1), ``robot``, ``ground``, ``table``, and ``object``, or
-        ``object1`` and ``object2``, unless the task's visuals name bodies otherwise.
-        """
-        return self.episodes.segmentation_ids
-
     # ---- what users call ---------------------------------------------------------
 
     def set_env_seed(self, env: int, seed: int) -> None:
@@ -181,75 +167,6 @@ class RobotTaskEnv(PersistentEnv, Closing):
             BulletError: the environment is closed or was never reset.
         """
         return self._emit(self.episodes.get_state(exact=exact))
-
-    def render(
-        self,
-        envs: int | Sequence[int] | None = None,
-        *,
-        camera: Camera | None = None,
-        size: int | tuple[int, int] | None = None,
-    ) -> Tensor:
-        """Draw the environments as they are now.
-
-        Args:
-            envs: which, by index; None means all.
-            camera: where from; None means `Camera`'s defaults, which are panda-gym's.
-            size: height and width of the picture [pixels], or both in one number;
-                None means the camera's.
-
-        Returns:
-            uint8, (num_envs, height, width, 3) or as many as were asked for;
-            (height, width, 3) for one index or an environment of batch size [].
-
-        Raises:
-            BulletError: the environment is closed.
-            ValueError: an index is out of range, or its environment was never reset.
-            TypeError: an index is no integer.
-        """
-        camera = resized(camera or Camera(), size)
-        if envs is None:
-            chosen, single = range(self.episodes.num_envs), self.num_envs is None
-        else:
-            chosen, single = np.atleast_1d(envs).tolist(), np.ndim(envs) == 0
-        pixels = self.episodes.render(chosen, camera).to(self.device)
-        return pixels[0] if single else pixels
-
-    def open_window(self, camera: Camera | None = None) -> Window:
-        """Open pybullet's GUI: ``show(i)`` of the result shows environment i.
-
-        It needs a display. Close it, or use it under ``with``.
-
-        Args:
-            camera: where the view starts; None means `Camera`'s defaults.
-
-        Raises:
-            BulletError: there is no display, or the environment is closed.
-        """
-        return self.episodes.open_window(camera or Camera())
-
-    def open_viewer(
-        self,
-        camera: Camera | None = None,
-        *,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-    ) -> "WebViewer":
-        """Serve the scene to browsers, in three dimensions; needs the extra ``viewer``.
-
-        Call ``update()`` of the result after each reset and step: the page then shows
-        them, and its slider goes back over the episode. Close it, or use it under
-        ``with``.
-
-        Args:
-            camera: where the view starts; None means `Camera`'s defaults.
-            host: the address at which it serves; "0.0.0.0" lets other machines in.
-            port: or, if it is taken, the next one that is free; see ``url``.
-
-        Raises:
-            ImportError: viser is not installed.
-            BulletError: the environment is closed.
-        """
-        return self.episodes.open_viewer(camera or Camera(), host, port)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all clients and threads. Closing again does nothing."""
