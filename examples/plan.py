@@ -2,26 +2,26 @@
 
 python examples/plan.py --episodes 3
 
-Every plan forks the exact state of one environment over many and tries a sequence of
-actions in each; the best ones say where to look for better ones. Then the first action
-is taken, and comes the next plan.
+Every plan forks the exact state of one environment over many, tries a sequence of
+actions in each, and looks for better ones near the best. The first action is taken.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
-from torch.nn.functional import normalize
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import CEMPlanner
 
 import torch_panda
-from limits import Positive, Seed, Weight, check_limits
+from limits import Limit, Positive, Seed, check_limits
 
+ACTION_SCALE = 0.02  # [m] by which an action of 1 moves the hand, to try out
 BEHIND = 0.04  # [m] from its middle, where the hand pushes a cube
+APPROACH = 0.5  # weight of the hand's distance from there, beside the cube's distance
 
 
 @dataclass
@@ -34,40 +34,31 @@ class Args:
     """episodes to run"""
     seed: Seed = 0
     """of the episodes and of the plans"""
-    num_candidates: Positive = 32
+    num_candidates: Annotated[int, Limit("at least 12", lambda x: x >= 12)] = 32
     """action sequences that are tried at once, each in an environment"""
-    top_k: Positive = 5
-    """the best ones, around which the next ones are drawn"""
     optim_steps: Positive = 3
-    """how often they are drawn for a plan"""
+    """how often they are drawn for a plan, around the best sixth"""
     planning_horizon: Positive = 4
     """actions in a sequence"""
     hold: Positive = 4
     """steps for which each action is taken"""
-    action_scale: float = 0.02
-    """by how much an action of 1 moves the hand [m]"""
-    approach: Weight = 0.5
-    """weight of the hand's distance from behind the cube, beside the cube's distance"""
 
 
 def make(args: Args, **options: Any) -> torch_panda.RobotTaskEnv:  # noqa: ANN401
-    """The environments of an id, with actions that are small enough to be tried out."""
-    robot_options = {"action_scale": args.action_scale}
-    return torch_panda.make(args.env_id, robot_options=robot_options, **options)
+    """Environments of the id, with small actions."""
+    options["robot_options"] = {"action_scale": ACTION_SCALE}
+    return torch_panda.make(args.env_id, **options)
 
 
 class Fork(EnvBase):
-    """What a planner takes for a model: environments that go on from an exact state.
-
-    A rollout begins with the ``state`` of one environment and ``index`` 0.
-    """
+    """A planner's model: rollouts that go on from ``state`` where ``index`` is 0."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> "Fork":  # noqa: ANN401, D102
         return super().__new__(cls, *args, _batch_locked=False, **kwargs)
 
     def __init__(self, args: Args) -> None:
         super().__init__(batch_size=[])
-        self.hold, self.approach = args.hold, args.approach
+        self.hold = args.hold
         self.model = make(args, num_envs=args.num_candidates)
         self.action_spec = Bounded(-1.0, 1.0, self.model.action_spec.shape[-1:])
         self.observation_spec = Composite(index=Unbounded((1,), dtype=torch.int64))
@@ -76,21 +67,17 @@ class Fork(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not tensordict["index"].any():
             self.now = self.model.reset(tensordict["state"], set_state=True)
-        rewards = []
+        reward = torch.zeros(*tensordict.batch_size, 1)
         for _ in range(self.hold):
             self.now["action"] = tensordict["action"]
             self.now = self.model.step(self.now)["next"]
             goal, achieved = self.now["desired_goal"], self.now["achieved_goal"]
-            behind = achieved - BEHIND * normalize(goal - achieved, dim=1)
+            behind = achieved - BEHIND * torch.nn.functional.normalize(goal - achieved)
             far = (behind - self.now["observation"][:, :3]).norm(dim=1, keepdim=True)
-            left = self.model.task.distance(achieved, goal)
-            rewards.append(-left - self.approach * far)
-        reward = torch.stack(rewards).sum(0)
-        # The end of an episode is no end of a plan.
-        done = torch.zeros_like(reward, dtype=torch.bool)
-        ends = {"done": done, "terminated": done.clone()}
-        index = tensordict["index"] + 1
-        return TensorDict({"index": index, "reward": reward, **ends}, reward.shape[:1])
+            reward -= self.model.task.distance(achieved, goal) + APPROACH * far
+        index, done = tensordict["index"] + 1, torch.zeros_like(reward) > 0
+        td = {"index": index, "reward": reward, "done": done}  # a plan has no end
+        return TensorDict(td, reward.shape[:1])
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
         raise NotImplementedError("a fork starts from a state")
@@ -101,8 +88,8 @@ class Fork(EnvBase):
 
 def solve(env: torch_panda.RobotTaskEnv, fork: Fork, args: Args) -> TensorDictBase:
     """Plan and act for an episode of one environment; return its last step."""
-    sizes = args.planning_horizon, args.optim_steps, args.num_candidates, args.top_k
-    planner = CEMPlanner(fork, *sizes)
+    sizes = args.planning_horizon, args.optim_steps, args.num_candidates
+    planner = CEMPlanner(fork, *sizes, top_k=args.num_candidates // 6)
     td = env.reset()
     while not td["done"]:
         start = {"state": env.get_state(exact=True), "index": torch.tensor([0])}

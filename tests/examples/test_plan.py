@@ -12,8 +12,7 @@ from plan import Args
 def args():
     return Args(
         env_id="PandaPush-v1",
-        num_candidates=6,
-        top_k=3,
+        num_candidates=12,
         optim_steps=2,
         planning_horizon=2,
         hold=3,
