@@ -111,7 +111,7 @@ def test_window_without_a_display_is_one_line():
 def test_gallery(tmp_path):
     gallery.main(gallery.Args(step=1, size=(60, 80), out=tmp_path / "gallery.png"))
     picture = iio.imread(tmp_path / "gallery.png")
-    assert picture.shape == (120, 240, 3)
+    assert picture.shape == (180, 240, 3)  # 3 rows of 3
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
