@@ -167,7 +167,7 @@ def test_options():
         assert env.task.distance_threshold == 0.01
     with pytest.raises(TypeError, match=r"robot_options of .*colour"):
         torch_panda.make("PandaPush-v1", robot_options={"colour": 1})
-    with pytest.raises(ValueError, match=f"registered: {ID}"):
+    with pytest.raises(ValueError, match=f"registered: .*{ID}"):
         torch_panda.make("Shov")
     with pytest.raises(ValueError, match="ships"):
         torch_panda.register("PandaPush-v1", robot=Panda, task=Shove)
