@@ -63,7 +63,8 @@ RECIPES: dict[str, dict[str, Any]] = {
         "eval_interval": 20_000,
     },
     "Flip": {**OBJECT, "total_steps": 1_000_000},
-    "Drawer": {**OBJECT, "total_steps": 50_000},
+    "Drawer": {**OBJECT, "total_steps": 20_000},
+    # Not yet known to work.
     "PegInsertion": {
         **OBJECT,
         "relative_inputs": "fine",
