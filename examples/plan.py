@@ -21,6 +21,7 @@ from limits import Limit, Positive, Seed, check_limits
 
 ACTION_SCALE = 0.02  # [m] by which an action of 1 moves the hand, to try out
 BEHIND = 0.04  # [m] from its middle, where the hand pushes a cube
+NEAR = 0.1  # [m] from its goal, where the hand need not stay at the cube
 APPROACH = 0.5  # weight of the hand's distance from there, beside the cube's distance
 
 
@@ -74,10 +75,10 @@ class Fork(EnvBase):
             goal, achieved = self.now["desired_goal"], self.now["achieved_goal"]
             behind = achieved - BEHIND * torch.nn.functional.normalize(goal - achieved)
             far = (behind - self.now["observation"][:, :3]).norm(dim=1, keepdim=True)
-            reward -= self.model.task.distance(achieved, goal) + APPROACH * far
-        index, done = tensordict["index"] + 1, torch.zeros_like(reward) > 0
-        td = {"index": index, "reward": reward, "done": done}  # a plan has no end
-        return TensorDict(td, reward.shape[:1])
+            left = self.model.task.distance(achieved, goal)
+            reward -= left + APPROACH * far * (left / NEAR).clamp(max=1.0)
+        td = {"index": tensordict["index"] + 1, "reward": reward, "done": reward > 0}
+        return TensorDict(td, reward.shape[:1])  # never done: rewards are negative
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
         raise NotImplementedError("a fork starts from a state")
