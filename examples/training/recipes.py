@@ -64,7 +64,7 @@ RECIPES: dict[str, dict[str, Any]] = {
     },
     "Flip": {**OBJECT, "total_steps": 1_000_000},
     "Drawer": {**OBJECT, "total_steps": 20_000},
-    # Not yet known to work.
+    # By imitation; not yet known to work without demonstrations.
     "PegInsertion": {
         **OBJECT,
         "relative_inputs": "fine",
