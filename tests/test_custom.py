@@ -6,8 +6,8 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torch_panda import Panda, Reach, Robot, RobotTaskEnv, Task
+from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Bodies, create_table, object_observation
-from torch_panda.tasks.rotations import NO_ROTATION
 
 RADIUS = 0.03  # [m]
 

@@ -5,13 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-
-def compose(first: Tensor, second: Tensor) -> Tensor:
-    """The quaternion of turning by ``second``, then by ``first``, (..., 4)."""
-    first, second = torch.broadcast_tensors(first, second)
-    a, a_w, b, b_w = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    scalar = a_w * b_w - (a * b).sum(-1, keepdim=True)
-    return torch.cat((a_w * b + b_w * a + torch.linalg.cross(a, b), scalar), -1)
+from torch_panda.rotations import quaternion_product as compose
 
 
 def inverse(quaternion: Tensor) -> Tensor:

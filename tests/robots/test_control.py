@@ -13,7 +13,7 @@ import torch_panda
 from torch_panda import Gripper, Panda, Reach, RobotTaskEnv
 from torch_panda.bullet import native
 from torch_panda.robots import ControlType
-from torch_panda.robots.rotations import (
+from torch_panda.rotations import (
     quaternion_product,
     rotation_vector_to_quaternion,
 )

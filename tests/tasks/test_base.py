@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torch_panda import Flip, Push, Stack
-from torch_panda.tasks.rotations import rotate
+from torch_panda.rotations import rotate
 
 angle = st.floats(-math.pi, math.pi)
 

@@ -20,7 +20,7 @@ from torch_panda.bullet.checks import check_quaternion
 from torch_panda.bullet.control import ArmMode
 from torch_panda.bullet.urdf import Tool
 from torch_panda.robots.gripper import Gripper
-from torch_panda.robots.rotations import (
+from torch_panda.rotations import (
     quaternion_product,
     rotation_vector_to_quaternion,
 )

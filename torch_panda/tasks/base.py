@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.tasks.rotations import NO_ROTATION
+from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
 
 # What tasks of users are made of is found here.

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.bullet.shapes import Box
+from torch_panda.rotations import NO_ROTATION, rotate
 from torch_panda.tasks.base import Bodies, RewardType, Start, Task
-from torch_panda.tasks.rotations import NO_ROTATION, rotate
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
 URDF = Path(__file__).with_name("drawer.urdf")

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
+from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import (
     Bodies,
     RewardType,
     Task,
 )
-from torch_panda.tasks.rotations import NO_ROTATION
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,

@@ -6,13 +6,13 @@ import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import (
     Bodies,
     RewardType,
     Task,
     object_observation,
 )
-from torch_panda.tasks.rotations import NO_ROTATION
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,

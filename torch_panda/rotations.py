@@ -1,9 +1,18 @@
-"""Rotations of the hand."""
+"""Rotations: quaternions are xyzw."""
 
 import math
 
 import torch
 from torch import Tensor
+
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+
+def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
+    """Rotate vectors by unit quaternions xyzw: (..., 4), (..., 3) -> (..., 3)."""
+    axis, vector = torch.broadcast_tensors(quaternion[..., :3], vector)
+    w, turn = quaternion[..., 3:], 2 * torch.linalg.cross(axis, vector)
+    return vector + w * turn + torch.linalg.cross(axis, turn)
 
 
 def rotation_vector_to_quaternion(vector: Tensor) -> Tensor:
@@ -16,6 +25,7 @@ def rotation_vector_to_quaternion(vector: Tensor) -> Tensor:
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     """First after second, in the frame that the first turns: xyzw (..., 4) each."""
+    first, second = torch.broadcast_tensors(first, second)
     a, w = first[..., :3], first[..., 3:]
     b, v = second[..., :3], second[..., 3:]
     vector = w * b + v * a + torch.linalg.cross(a, b)
