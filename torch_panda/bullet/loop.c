@@ -1,107 +1,27 @@
 /* A vector step of many clients, in threads of its own and without Python.
 
-   A step of one client sets the motors of its robot, advances time by some substeps,
-   and copies the state of its world into the caller's memory. Clients are drawn by
-   whichever thread is free; the caller's takes part, and returns when all are done.
-   The last clients are drawn in pieces of a few substeps each, in turns, so that all
-   threads end at about the same time: steps last 0.8 ms give or take 0.2, and so four
-   clients drawn whole take two threads 8 % longer than half their work, in pieces 4 %.
-
-   Nothing is linked: Bullet's functions are given by address. native.py declares these
-   structs once more, in the same order, and capi.py the functions by their full names.
-   simulation.py does the same in Python where this file was not compiled, and both
-   give the same numbers. */
+   Clients, each as in client.c, are drawn by whichever thread is free; the caller's
+   takes part, and returns when all are done. The last clients are drawn in pieces of a
+   few substeps each, in turns, so that all threads end at about the same time: steps
+   last 0.8 ms give or take 0.2, and so four clients drawn whole take two threads 8 %
+   longer than half their work, in pieces 4 %. */
 
 #define _POSIX_C_SOURCE 200809L
 
+#include "client.h"
+
 #include <fenv.h>
-#include <math.h>
 #include <pthread.h>
 #include <signal.h>
-#include <stdint.h>
 #include <stdlib.h>
-#include <string.h>
 
 enum {
-    /* enum EnumSharedMemoryServerStatus */
-    ACTUAL_STATE_UPDATE_COMPLETED = 21,
-    DESIRED_STATE_RECEIVED_COMPLETED = 25,
-    STEP_FORWARD_SIMULATION_COMPLETED = 26,
-    CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43,
-
-    TORQUE = 1,                   /* enum for b3JointControlCommandInit2 */
-    POSITION_VELOCITY_PD = 2,
-    MAX_DEGREES_OF_FREEDOM = 128, /* of a body */
-    Q_OFFSET = 7,                 /* joints follow the base: 7 of its pose, */
-    U_OFFSET = 6,                 /* 6 of its velocity */
-    STACK_SIZE = 8 << 20,         /* of a thread: as on Linux; macOS gives less */
-    PIECE = 5                     /* substeps; other threads begin with a cold cache */
-};
-
-typedef void *handle;          /* of a client, a command or a status */
-typedef const double *doubles; /* to be read */
-
-struct functions {
-    handle (*submit)(handle client, handle command);
-    int (*status_type)(handle status);
-    handle (*ik_init)(handle client, int body);
-    void (*ik_set_target)(handle command, int link, doubles position,
-                          doubles orientation);
-    int (*ik_result)(handle status, int *body, int *count, double *positions);
-    handle (*motor_init)(handle client, int body, int mode);
-    int (*motor_set_position)(handle command, int q_index, double position);
-    int (*motor_set_velocity)(handle command, int u_index, double velocity);
-    int (*motor_set_torque)(handle command, int u_index, double torque);
-    int (*motor_set_kp)(handle command, int u_index, double gain);
-    int (*motor_set_kd)(handle command, int u_index, double gain);
-    int (*motor_set_force)(handle command, int u_index, double force);
-    handle (*step_init)(handle client);
-    handle (*state_init)(handle client, int body);
-    int (*state_want_link_velocity)(handle command, int wanted);
-    int (*state_result)(handle status, int *body, int *num_links, int *num_q,
-                        int *num_u, doubles *root_frame, doubles *q, doubles *u,
-                        doubles *joint_forces, doubles *link_frames,
-                        doubles *motor_forces, doubles *link_poses,
-                        doubles *link_velocities);
-};
-
-struct client {
-    handle handle;          /* NULL when it is closed */
-    int64_t num_detections; /* how often collisions have been detected */
-    int num_substeps;       /* in the present step, so far */
-};
-
-struct scene { /* the same in every client */
-    int robot, ee_link, num_joints, num_objects, num_object_joints, num_substeps;
-    const int *objects;       /* body ids */
-    const int *object_joints; /* how many each object has */
-};
-
-enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
-struct control { /* MotorControl of control.py */
-    int ik_link; /* whose position setpoints give; -1: they are of all joints */
-    int num_arm_joints, setpoint_size;
-    int turns;    /* whether they give its orientation, too */
-    int arm_mode; /* of the arm's joints */
-    double orientation[4], position_gain, velocity_gain;
-    doubles forces; /* one a joint */
-};
-
-enum { NO_ANSWER = -1, CLIENT_CLOSED = -2 };
-struct failure {
-    int expected; /* status code, or CLIENT_CLOSED; 0 where nothing has failed */
-    int answer;   /* status code, or NO_ANSWER */
+    STACK_SIZE = 8 << 20, /* of a thread: as on Linux; macOS gives less */
+    PIECE = 5             /* substeps; other threads begin with a cold cache */
 };
 
 struct loop {
-    const struct functions *bullet;
-    const struct scene *scene;
-    struct client *const *clients;
-    double *state;            /* a row a client; read_state has the order */
-    struct failure *failures; /* one a client */
-
-    const struct control *control; /* of the present step, as what follows */
-    doubles setpoint;              /* a row a client */
+    struct batch *batch;
     int num_envs, num_done, num_failed;
     int *queue; /* a ring of num_envs clients that wait to be drawn */
     int first, num_waiting, num_whole; /* of them the first ones are not cut up */
@@ -113,191 +33,22 @@ struct loop {
     pthread_t threads[];
 };
 
-/* ---- one client; parts of its step answer whether they have gone well ------------ */
-
-static handle submit(struct loop *loop, int env, handle command, int expected) {
-    handle status = loop->bullet->submit(loop->clients[env]->handle, command);
-    int answer = status ? loop->bullet->status_type(status) : NO_ANSWER;
-    if (answer == expected) return status;
-    loop->failures[env] = (struct failure){expected, answer};
-    return NULL;
-}
-
-static int find_joints(struct loop *loop, int env, double *joints) {
-    const struct functions *bullet = loop->bullet;
-    const struct control *control = loop->control;
-    doubles setpoint = loop->setpoint + (size_t)env * control->setpoint_size;
-    int num_joints = loop->scene->num_joints, arm = control->num_arm_joints;
-    if (control->ik_link < 0) {
-        memcpy(joints, setpoint, num_joints * sizeof *joints);
-        return 1;
-    }
-    handle command = bullet->ik_init(loop->clients[env]->handle, loop->scene->robot);
-    bullet->ik_set_target(command, control->ik_link, setpoint,
-                          control->turns ? setpoint + 3 : control->orientation);
-    handle status = submit(loop, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED);
-    if (!status) return 0;
-    int body, count;
-    bullet->ik_result(status, &body, &count, joints);
-    setpoint += control->turns ? 7 : 3;
-    memcpy(joints + arm, setpoint, (num_joints - arm) * sizeof *joints);
-    return 1;
-}
-
-static int set_motors(struct loop *loop, int env, doubles joints) {
-    const struct functions *bullet = loop->bullet;
-    const struct control *control = loop->control;
-    handle client = loop->clients[env]->handle;
-    int robot = loop->scene->robot, num_joints = loop->scene->num_joints;
-    handle command = bullet->motor_init(client, robot, POSITION_VELOCITY_PD);
-    int arm = control->num_arm_joints, mode = control->arm_mode;
-    for (int k = 0; k < num_joints; k++) {
-        int joint_mode = k < arm ? mode : POSITIONS, has_torque = joint_mode == TORQUES;
-        if (joint_mode == POSITIONS) {
-            bullet->motor_set_position(command, Q_OFFSET + k, joints[k]);
-            bullet->motor_set_kp(command, U_OFFSET + k, control->position_gain);
-        } else {
-            double velocity = has_torque ? 0 : joints[k];
-            bullet->motor_set_velocity(command, U_OFFSET + k, velocity);
-            bullet->motor_set_kp(command, U_OFFSET + k, 0);
-        }
-        bullet->motor_set_kd(command, U_OFFSET + k, control->velocity_gain);
-        /* Where torques are applied, motors must not brake. */
-        bullet->motor_set_force(command, U_OFFSET + k,
-                                has_torque ? 0 : control->forces[k]);
-    }
-    return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
-}
-
-static int apply_torques(struct loop *loop, int env) {
-    const struct functions *bullet = loop->bullet;
-    doubles torques = loop->setpoint + (size_t)env * loop->control->setpoint_size;
-    handle client = loop->clients[env]->handle;
-    handle command = bullet->motor_init(client, loop->scene->robot, TORQUE);
-    for (int k = 0; k < loop->control->num_arm_joints; k++)
-        bullet->motor_set_torque(command, U_OFFSET + k, torques[k]);
-    return submit(loop, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
-}
-
-static int advance(struct loop *loop, int env, int num_substeps) {
-    struct client *client = loop->clients[env];
-    int has_torques = loop->control->arm_mode == TORQUES;
-    /* A client has one command buffer, and stepping leaves it as it was. */
-    handle command = loop->bullet->step_init(client->handle);
-    for (; client->num_substeps < num_substeps; client->num_substeps++) {
-        client->num_detections++;
-        if (has_torques) { /* which Bullet forgets when it has stepped */
-            if (!apply_torques(loop, env)) return 0;
-            command = loop->bullet->step_init(client->handle);
-        }
-        if (!submit(loop, env, command, STEP_FORWARD_SIMULATION_COMPLETED)) return 0;
-    }
-    return 1;
-}
-
-struct body_state { /* views of Bullet's memory, until the client's next command */
-    doubles q, u, link_poses, link_velocities;
-};
-
-static int ask_state(struct loop *loop, int env, int body, struct body_state *state) {
-    const struct functions *bullet = loop->bullet;
-    handle command = bullet->state_init(loop->clients[env]->handle, body);
-    if (body == loop->scene->robot) bullet->state_want_link_velocity(command, 1);
-    handle status = submit(loop, env, command, ACTUAL_STATE_UPDATE_COMPLETED);
-    if (!status) return 0;
-    bullet->state_result(status, NULL, NULL, NULL, NULL, NULL, &state->q, &state->u,
-                         NULL, NULL, NULL, &state->link_poses, &state->link_velocities);
-    return 1;
-}
-
-static double *copy(double *to, doubles from, int count) {
-    memcpy(to, from, count * sizeof *to);
-    return to + count;
-}
-
-/* Roll, pitch and yaw of a quaternion xyzw; euler.py says more. */
-void euler_angles(doubles quaternion, double *angles) {
-    double x = quaternion[0], y = quaternion[1], z = quaternion[2], w = quaternion[3];
-    double sine = -2 * (x * z - w * y);
-    if (fabs(sine) >= 0.99999) {
-        double side = copysign(1, sine);
-        angles[0] = 0;
-        angles[1] = side * (3.14159265358979323846 / 2);
-        angles[2] = 2 * atan2(-side * x, side * y);
-        return;
-    }
-    double xx = x * x, yy = y * y, zz = z * z, ww = w * w;
-    angles[0] = atan2(2 * (y * z + w * x), ww - xx - yy + zz);
-    angles[1] = asin(sine);
-    angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
-}
-
-/* Fill a client's row: joint positions and velocities, position, velocity and
-   orientation of the end-effector; poses (7 each), then velocities (6 each) of the
-   objects, then positions and velocities of their joints, and the objects' Euler
-   angles (3 each). */
-static int read_state(struct loop *loop, int env) {
-    const struct scene *scene = loop->scene;
-    int n = scene->num_joints, num_objects = scene->num_objects;
-    int num_object_joints = scene->num_object_joints;
-    int size = 2 * n + 10 + 16 * num_objects + 2 * num_object_joints;
-    double *row = loop->state + (size_t)env * size;
-    struct body_state body;
-    if (!ask_state(loop, env, scene->robot, &body)) return 0;
-    row = copy(row, body.q + Q_OFFSET, n);
-    row = copy(row, body.u + U_OFFSET, n);
-    row = copy(row, body.link_poses + 7 * scene->ee_link, 3);
-    row = copy(row, body.link_velocities + 6 * scene->ee_link, 3);
-    row = copy(row, body.link_poses + 7 * scene->ee_link + 3, 4);
-    double *joints = row + 13 * num_objects;
-    double *angles = joints + 2 * num_object_joints;
-    for (int k = 0; k < num_objects; k++) {
-        if (!ask_state(loop, env, scene->objects[k], &body)) return 0;
-        copy(row + 7 * k, body.q, 7);
-        copy(row + 7 * num_objects + 6 * k, body.u, 6);
-        copy(joints + num_object_joints, body.u + U_OFFSET, scene->object_joints[k]);
-        joints = copy(joints, body.q + Q_OFFSET, scene->object_joints[k]);
-        euler_angles(body.q + 3, angles + 3 * k);
-    }
-    return 1;
-}
-
-static int begin_step(struct loop *loop, int env) {
-    double joints[MAX_DEGREES_OF_FREEDOM];
-    int is_closed = loop->clients[env]->handle == NULL;
-    loop->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0};
-    return !is_closed && find_joints(loop, env, joints) && set_motors(loop, env, joints);
-}
-
-/* Take so many substeps of a step; answer whether more of them are to be taken. */
-static int take_piece(struct loop *loop, int env, int piece) {
-    int begin = loop->clients[env]->num_substeps, all = loop->scene->num_substeps;
-    int end = piece < all - begin ? begin + piece : all;
-    if (begin == 0 && !begin_step(loop, env)) return 0;
-    if (!advance(loop, env, end)) return 0;
-    if (end < all) return 1;
-    read_state(loop, env);
-    return 0;
-}
-
-/* ---- threads --------------------------------------------------------------------- */
-
 /* Step clients until none is left to be drawn; the mutex is held before and after. */
 static void take_part(struct loop *loop) {
     while (loop->num_waiting) {
         int env = loop->queue[loop->first];
-        int piece = loop->num_whole-- > 0 ? loop->scene->num_substeps : PIECE;
+        int piece = loop->num_whole-- > 0 ? loop->batch->scene->num_substeps : PIECE;
         loop->first = (loop->first + 1) % loop->num_envs;
         loop->num_waiting--;
         pthread_mutex_unlock(&loop->mutex);
-        int goes_on = take_piece(loop, env, piece);
+        int goes_on = take_piece(loop->batch, env, piece);
         pthread_mutex_lock(&loop->mutex);
         if (goes_on) {
             int last = (loop->first + loop->num_waiting++) % loop->num_envs;
             loop->queue[last] = env;
             continue;
         }
-        loop->num_failed += loop->failures[env].expected != 0;
+        loop->num_failed += loop->batch->failures[env].expected != 0;
         if (++loop->num_done == loop->num_envs) pthread_cond_signal(&loop->done);
     }
 }
@@ -314,15 +65,12 @@ static void *serve(void *argument) {
     return NULL;
 }
 
-/* Start the threads, or as many as the system grants; NULL: there is no memory. What
-   the pointers point to must outlive the loop. */
-struct loop *loop_create(const struct functions *bullet, const struct scene *scene,
-                         struct client *const *clients, double *state,
-                         struct failure *failures, int num_threads) {
+/* Start the threads, or as many as the system grants; NULL: there is no memory. The
+   batch, and what it points to, must outlive the loop. */
+struct loop *loop_create(struct batch *batch, int num_threads) {
     struct loop *loop = calloc(1, sizeof *loop + num_threads * sizeof(pthread_t));
     if (!loop) return NULL;
-    loop->bullet = bullet, loop->scene = scene, loop->clients = clients;
-    loop->state = state, loop->failures = failures;
+    loop->batch = batch;
     pthread_mutex_init(&loop->mutex, NULL);
     pthread_cond_init(&loop->begun, NULL);
     pthread_cond_init(&loop->done, NULL);
@@ -349,12 +97,12 @@ int loop_step(struct loop *loop, const struct control *control, doubles setpoint
     fegetenv(&before);
     fesetenv(FE_DFL_ENV);
     pthread_mutex_lock(&loop->mutex);
-    loop->control = control, loop->setpoint = setpoint;
+    loop->batch->control = control, loop->batch->setpoint = setpoint;
     loop->queue = envs, loop->num_envs = loop->num_waiting = num_envs;
     /* More than the last two of each thread would gain less than it costs. */
     loop->num_whole = num_envs - (loop->num_threads ? 2 * (loop->num_threads + 1) : 0);
     loop->first = loop->num_done = loop->num_failed = 0;
-    for (int k = 0; k < num_envs; k++) loop->clients[envs[k]]->num_substeps = 0;
+    for (int k = 0; k < num_envs; k++) loop->batch->clients[envs[k]]->num_substeps = 0;
     pthread_cond_broadcast(&loop->begun);
     take_part(loop);
     while (loop->num_done < num_envs) pthread_cond_wait(&loop->done, &loop->mutex);

@@ -1,6 +1,7 @@
-"""``loop.c`` as the package's installation compiled it: found, loaded and declared.
+"""``loop.c`` and ``client.c`` as the package's installation compiled them.
 
-It is an optional part: without it, `VectorSimulation` steps its clients in Python.
+They are found, loaded and declared here. They are an optional part: without them,
+`VectorSimulation` steps its clients in Python.
 """
 
 import ctypes
@@ -92,8 +93,22 @@ class Failure(Structure):
     _fields_ = (("expected", c_int), ("answer", c_int))
 
 
+class Batch(Structure):
+    """``struct batch``."""
+
+    _fields_ = (
+        ("bullet", POINTER(Functions)),
+        ("scene", POINTER(Scene)),
+        ("clients", POINTER(POINTER(Client))),
+        ("state", c_void_p),
+        ("failures", POINTER(Failure)),
+        ("control", POINTER(Control)),
+        ("setpoint", c_void_p),
+    )
+
+
 class Library:
-    """The functions of ``loop.c``. Calls release the GIL.
+    """The functions of both. Calls release the GIL.
 
     Args:
         path: of the compiled file.
@@ -103,14 +118,7 @@ class Library:
         library = ctypes.CDLL(path)
         self.create = library.loop_create
         self.create.restype = c_void_p
-        self.create.argtypes = (
-            Functions,
-            POINTER(Scene),
-            POINTER(POINTER(Client)),
-            c_void_p,
-            POINTER(Failure),
-            c_int,
-        )
+        self.create.argtypes = (POINTER(Batch), c_int)
         self.step = library.loop_step
         self.step.argtypes = (
             c_void_p,

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from ctypes import POINTER, c_double, c_int, pointer
+from ctypes import POINTER, byref, c_double, c_int, pointer
 
 from torch import Tensor
 
@@ -50,23 +50,28 @@ class NativeLoop:
         self._library = native.LIBRARY
         self._physics = physics
         self._num_threads = num_threads
-        self._bullet = native.bullet_functions()
-        self._objects = (c_int * len(scene.objects))(*scene.objects)
         counts = [len(joints) for joints in scene.object_joints]
-        self._object_joints = (c_int * len(counts))(*counts)
-        self._scene = native.Scene(
+        native_scene = native.Scene(
             scene.robot,
             scene.ee_link,
             len(scene.joints),
             len(scene.objects),
             sum(counts),
             physics.n_substeps,
-            self._objects,
-            self._object_joints,
+            (c_int * len(scene.objects))(*scene.objects),
+            (c_int * len(counts))(*counts),
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
         self._failures = (native.Failure * n)()
+        # It keeps alive what it points to, but for the tensors.
+        self._batch = native.Batch(
+            pointer(native.bullet_functions()),
+            pointer(native_scene),
+            self._clients,
+            state.data_ptr(),
+            self._failures,
+        )
         self._described: MotorControl | None = None  # by _control
         self._control = native.Control()
         self._loop: int | None = None
@@ -120,14 +125,7 @@ class NativeLoop:
         if self._loop is not None and self._process == os.getpid():
             return
         self._process = os.getpid()
-        self._loop = self._library.create(
-            self._bullet,
-            self._scene,
-            self._clients,
-            self._state.data_ptr(),
-            self._failures,
-            self._num_threads,
-        )
+        self._loop = self._library.create(byref(self._batch), self._num_threads)
         if self._loop is None:
             raise MemoryError
 

@@ -1,0 +1,190 @@
+/* One client: it sets the motors of its robot, advances time by some substeps, and
+   copies the state of its world into the caller's memory.
+
+   client.py and simulation.py do the same in Python where this file was not compiled,
+   and both give the same numbers. */
+
+#include "client.h"
+
+#include <math.h>
+#include <string.h>
+
+enum {
+    /* enum EnumSharedMemoryServerStatus */
+    ACTUAL_STATE_UPDATE_COMPLETED = 21,
+    DESIRED_STATE_RECEIVED_COMPLETED = 25,
+    STEP_FORWARD_SIMULATION_COMPLETED = 26,
+    CALCULATE_INVERSE_KINEMATICS_COMPLETED = 43,
+
+    TORQUE = 1,                   /* enum for b3JointControlCommandInit2 */
+    POSITION_VELOCITY_PD = 2,
+    MAX_DEGREES_OF_FREEDOM = 128, /* of a body */
+    Q_OFFSET = 7,                 /* joints follow the base: 7 of its pose, */
+    U_OFFSET = 6                  /* 6 of its velocity */
+};
+
+/* Parts of a step answer whether they have gone well. */
+
+static handle submit(struct batch *batch, int env, handle command, int expected) {
+    handle status = batch->bullet->submit(batch->clients[env]->handle, command);
+    int answer = status ? batch->bullet->status_type(status) : NO_ANSWER;
+    if (answer == expected) return status;
+    batch->failures[env] = (struct failure){expected, answer};
+    return NULL;
+}
+
+static int find_joints(struct batch *batch, int env, double *joints) {
+    const struct functions *bullet = batch->bullet;
+    const struct control *control = batch->control;
+    doubles setpoint = batch->setpoint + (size_t)env * control->setpoint_size;
+    int num_joints = batch->scene->num_joints, arm = control->num_arm_joints;
+    if (control->ik_link < 0) {
+        memcpy(joints, setpoint, num_joints * sizeof *joints);
+        return 1;
+    }
+    handle command = bullet->ik_init(batch->clients[env]->handle, batch->scene->robot);
+    bullet->ik_set_target(command, control->ik_link, setpoint,
+                          control->turns ? setpoint + 3 : control->orientation);
+    handle status = submit(batch, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED);
+    if (!status) return 0;
+    int body, count;
+    bullet->ik_result(status, &body, &count, joints);
+    setpoint += control->turns ? 7 : 3;
+    memcpy(joints + arm, setpoint, (num_joints - arm) * sizeof *joints);
+    return 1;
+}
+
+static int set_motors(struct batch *batch, int env, doubles joints) {
+    const struct functions *bullet = batch->bullet;
+    const struct control *control = batch->control;
+    handle client = batch->clients[env]->handle;
+    int robot = batch->scene->robot, num_joints = batch->scene->num_joints;
+    handle command = bullet->motor_init(client, robot, POSITION_VELOCITY_PD);
+    int arm = control->num_arm_joints, mode = control->arm_mode;
+    for (int k = 0; k < num_joints; k++) {
+        int joint_mode = k < arm ? mode : POSITIONS, has_torque = joint_mode == TORQUES;
+        if (joint_mode == POSITIONS) {
+            bullet->motor_set_position(command, Q_OFFSET + k, joints[k]);
+            bullet->motor_set_kp(command, U_OFFSET + k, control->position_gain);
+        } else {
+            double velocity = has_torque ? 0 : joints[k];
+            bullet->motor_set_velocity(command, U_OFFSET + k, velocity);
+            bullet->motor_set_kp(command, U_OFFSET + k, 0);
+        }
+        bullet->motor_set_kd(command, U_OFFSET + k, control->velocity_gain);
+        /* Where torques are applied, motors must not brake. */
+        bullet->motor_set_force(command, U_OFFSET + k,
+                                has_torque ? 0 : control->forces[k]);
+    }
+    return submit(batch, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
+}
+
+static int apply_torques(struct batch *batch, int env) {
+    const struct functions *bullet = batch->bullet;
+    doubles torques = batch->setpoint + (size_t)env * batch->control->setpoint_size;
+    handle client = batch->clients[env]->handle;
+    handle command = bullet->motor_init(client, batch->scene->robot, TORQUE);
+    for (int k = 0; k < batch->control->num_arm_joints; k++)
+        bullet->motor_set_torque(command, U_OFFSET + k, torques[k]);
+    return submit(batch, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
+}
+
+static int advance(struct batch *batch, int env, int num_substeps) {
+    struct client *client = batch->clients[env];
+    int has_torques = batch->control->arm_mode == TORQUES;
+    /* A client has one command buffer, and stepping leaves it as it was. */
+    handle command = batch->bullet->step_init(client->handle);
+    for (; client->num_substeps < num_substeps; client->num_substeps++) {
+        client->num_detections++;
+        if (has_torques) { /* which Bullet forgets when it has stepped */
+            if (!apply_torques(batch, env)) return 0;
+            command = batch->bullet->step_init(client->handle);
+        }
+        if (!submit(batch, env, command, STEP_FORWARD_SIMULATION_COMPLETED)) return 0;
+    }
+    return 1;
+}
+
+struct body_state { /* views of Bullet's memory, until the client's next command */
+    doubles q, u, link_poses, link_velocities;
+};
+
+static int ask_state(struct batch *batch, int env, int body, struct body_state *state) {
+    const struct functions *bullet = batch->bullet;
+    handle command = bullet->state_init(batch->clients[env]->handle, body);
+    if (body == batch->scene->robot) bullet->state_want_link_velocity(command, 1);
+    handle status = submit(batch, env, command, ACTUAL_STATE_UPDATE_COMPLETED);
+    if (!status) return 0;
+    bullet->state_result(status, NULL, NULL, NULL, NULL, NULL, &state->q, &state->u,
+                         NULL, NULL, NULL, &state->link_poses, &state->link_velocities);
+    return 1;
+}
+
+static double *copy(double *to, doubles from, int count) {
+    memcpy(to, from, count * sizeof *to);
+    return to + count;
+}
+
+void euler_angles(doubles quaternion, double *angles) {
+    double x = quaternion[0], y = quaternion[1], z = quaternion[2], w = quaternion[3];
+    double sine = -2 * (x * z - w * y);
+    if (fabs(sine) >= 0.99999) {
+        double side = copysign(1, sine);
+        angles[0] = 0;
+        angles[1] = side * (3.14159265358979323846 / 2);
+        angles[2] = 2 * atan2(-side * x, side * y);
+        return;
+    }
+    double xx = x * x, yy = y * y, zz = z * z, ww = w * w;
+    angles[0] = atan2(2 * (y * z + w * x), ww - xx - yy + zz);
+    angles[1] = asin(sine);
+    angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
+}
+
+/* Fill a client's row: joint positions and velocities, position, velocity and
+   orientation of the end-effector; poses (7 each), then velocities (6 each) of the
+   objects, then positions and velocities of their joints, and the objects' Euler
+   angles (3 each). */
+static int read_state(struct batch *batch, int env) {
+    const struct scene *scene = batch->scene;
+    int n = scene->num_joints, num_objects = scene->num_objects;
+    int num_object_joints = scene->num_object_joints;
+    int size = 2 * n + 10 + 16 * num_objects + 2 * num_object_joints;
+    double *row = batch->state + (size_t)env * size;
+    struct body_state body;
+    if (!ask_state(batch, env, scene->robot, &body)) return 0;
+    row = copy(row, body.q + Q_OFFSET, n);
+    row = copy(row, body.u + U_OFFSET, n);
+    row = copy(row, body.link_poses + 7 * scene->ee_link, 3);
+    row = copy(row, body.link_velocities + 6 * scene->ee_link, 3);
+    row = copy(row, body.link_poses + 7 * scene->ee_link + 3, 4);
+    double *joints = row + 13 * num_objects;
+    double *angles = joints + 2 * num_object_joints;
+    for (int k = 0; k < num_objects; k++) {
+        if (!ask_state(batch, env, scene->objects[k], &body)) return 0;
+        copy(row + 7 * k, body.q, 7);
+        copy(row + 7 * num_objects + 6 * k, body.u, 6);
+        copy(joints + num_object_joints, body.u + U_OFFSET, scene->object_joints[k]);
+        joints = copy(joints, body.q + Q_OFFSET, scene->object_joints[k]);
+        euler_angles(body.q + 3, angles + 3 * k);
+    }
+    return 1;
+}
+
+static int begin_step(struct batch *batch, int env) {
+    double joints[MAX_DEGREES_OF_FREEDOM];
+    int is_closed = batch->clients[env]->handle == NULL;
+    batch->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0};
+    return !is_closed && find_joints(batch, env, joints) &&
+           set_motors(batch, env, joints);
+}
+
+int take_piece(struct batch *batch, int env, int piece) {
+    int begin = batch->clients[env]->num_substeps, all = batch->scene->num_substeps;
+    int end = piece < all - begin ? begin + piece : all;
+    if (begin == 0 && !begin_step(batch, env)) return 0;
+    if (!advance(batch, env, end)) return 0;
+    if (end < all) return 1;
+    read_state(batch, env);
+    return 0;
+}
