@@ -4,22 +4,19 @@ import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.broad_phase import BroadPhase
-from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
-from torch_panda.bullet.euler import euler_angles
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool
 from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.scene_client import Blueprint, SceneClient
+from torch_panda.bullet.scene_state import SceneState
 
 
 class VectorSimulation:
@@ -79,18 +76,30 @@ class VectorSimulation:
             for _ in range(num_envs):
                 self._clients.append(PhysicsClient(physics=physics))
                 self._broad_phases.append(self._build_in(self._clients[-1]))
-            self._allocate()
+            self._check_joints()
+            self._state = SceneState(self.scene, num_envs)
             if is_native:
                 self._native = NativeLoop(
                     self._clients,
                     self.scene,
-                    self._state,
+                    self._state.rows,
                     physics=physics,
                     num_threads=self.num_threads,
                 )
         except BaseException:
             self.close()
             raise
+        self.joint_position = self._state.joint_position
+        self.joint_velocity = self._state.joint_velocity
+        self.ee_position = self._state.ee_position
+        self.ee_velocity = self._state.ee_velocity
+        self.ee_orientation = self._state.ee_orientation
+        self.object_pose = self._state.object_pose
+        self.object_velocity = self._state.object_velocity
+        self.object_joint_position = self._state.object_joint_position
+        self.object_joint_velocity = self._state.object_joint_velocity
+        self.object_euler = self._state.object_euler
+        self.marker_pose = self._state.marker_pose
 
     @property
     def num_envs(self) -> int:
@@ -165,7 +174,7 @@ class VectorSimulation:
                 )
             else:
                 client.step(self.n_substeps)
-            self._read(env)
+            self._state.read(env, client)
 
         self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
 
@@ -195,15 +204,16 @@ class VectorSimulation:
         def reset_one(env: int) -> None:
             if vary is not None:
                 vary(env)
-            self._reset_one(env)
+            client = self._clients[env]
+            self._broad_phases[env].restore()
+            self._state.place(env, client)
+            self._state.read(env, client)
 
         self._pool.run(reset_one, envs)
 
     def diverged(self) -> list[int]:
         """The clients whose state is not finite."""
-        if all_finite(self._state):
-            return []
-        return (~self._state.isfinite()).any(dim=1).nonzero().flatten().tolist()
+        return self._state.diverged()
 
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""
@@ -230,93 +240,12 @@ class VectorSimulation:
         client.finish_building()
         return BroadPhase(client)
 
-    def _allocate(self) -> None:
-        n, scene = self.num_envs, self.scene
-        n_joints, n_objects = len(scene.joints), len(scene.objects)
+    def _check_joints(self) -> None:
+        """Make sure that a robot's state is that of its joints, and of no others."""
+        scene = self.scene
         found = len(self._clients[0].state(scene.robot).joint_positions)
-        if found != n_joints:
+        if found != len(scene.joints):
             raise BulletError(
                 f"a scene must name the robot's {found} joints of one degree of "
-                f"freedom, got {n_joints}"
+                f"freedom, got {len(scene.joints)}"
             )
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(n, *shape, dtype=torch.float64, device="cpu")
-
-        # Objects that have joints: their ids, joints, and where in the tensors.
-        self._jointed_objects: list[tuple[int, tuple[int, ...], slice]] = []
-        n_more = 0
-        for body, joints in zip(scene.objects, scene.object_joints, strict=True):
-            if joints:
-                own = slice(n_more, n_more + len(joints))
-                self._jointed_objects.append((body, joints, own))
-                n_more += len(joints)
-        arm = (n_joints, n_joints, 3, 3, 4)
-        sizes = (*arm, 7 * n_objects, 6 * n_objects, n_more, n_more, 3 * n_objects)
-        # In one tensor, which one check finds finite or not.
-        self._state = zeros(sum(sizes))
-        (
-            self.joint_position,
-            self.joint_velocity,
-            self.ee_position,
-            self.ee_velocity,
-            self.ee_orientation,
-            object_pose,
-            object_velocity,
-            self.object_joint_position,
-            self.object_joint_velocity,
-            object_euler,
-        ) = self._state.split(sizes, dim=1)
-        self.object_pose = object_pose.unflatten(1, (n_objects, 7))
-        self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
-        self.object_euler = object_euler.unflatten(1, (n_objects, 3))
-        self.marker_pose = zeros(len(scene.markers), 7)
-        # The same memory, part by part, for `_read`: rows of tensors take longer.
-        ends = np.cumsum(sizes)[:-1]
-        self._rows = [np.split(row, ends) for row in self._state.numpy()]
-
-    def _reset_one(self, env: int) -> None:
-        client, scene = self._clients[env], self.scene
-        self._broad_phases[env].restore()
-        positions = self.joint_position[env].tolist()
-        velocities = self.joint_velocity[env].tolist()
-        # One by one and in panda-gym's order: Bullet's broad phase remembers the way.
-        for joint, position, velocity in zip(
-            scene.joints, positions, velocities, strict=True
-        ):
-            client.set_joint(scene.robot, joint, position, velocity)
-        markers = self.marker_pose[env].tolist()
-        for body, pose in zip(scene.markers, markers, strict=True):
-            client.set_base(body, pose[:3], pose[3:])
-        poses = self.object_pose[env].tolist()
-        velocities = self.object_velocity[env].tolist()
-        for body, pose, velocity in zip(scene.objects, poses, velocities, strict=True):
-            client.set_base(body, pose[:3], pose[3:], velocity[:3], velocity[3:])
-        positions = self.object_joint_position[env].tolist()
-        velocities = self.object_joint_velocity[env].tolist()
-        for body, joints, own in self._jointed_objects:
-            client.set_joints(body, joints, positions[own], velocities[own])
-        self._read(env)
-
-    def _read(self, env: int) -> None:
-        """Copy the state of one client into the tensors."""
-        client, scene = self._clients[env], self.scene
-        joints, speeds, ee_position, ee_velocity, ee_orientation, *objects = self._rows[
-            env
-        ]
-        poses, velocities, object_joints, object_speeds, angles = objects
-        state = client.state(scene.robot, link_velocities=True)
-        joints[:] = state.joint_positions
-        speeds[:] = state.joint_velocities
-        pose = state.link_pose(scene.ee_link)
-        ee_position[:], ee_orientation[:] = pose[:3], pose[3:]
-        ee_velocity[:] = state.link_velocity(scene.ee_link)[:3]
-        for k, body in enumerate(scene.objects):
-            state = client.state(body)
-            poses[7 * k : 7 * k + 7] = state.base_pose
-            velocities[6 * k : 6 * k + 6] = state.base_velocity
-            angles[3 * k : 3 * k + 3] = euler_angles(*state.base_pose[3:].tolist())
-        for body, _, own in self._jointed_objects:
-            state = client.state(body)
-            object_joints[own] = state.joint_positions
-            object_speeds[own] = state.joint_velocities
