@@ -179,7 +179,7 @@ static int begin_step(struct batch *batch, int env) {
            set_motors(batch, env, joints);
 }
 
-int take_piece(struct batch *batch, int env, int piece) {
+int client_take_piece(struct batch *batch, int env, int piece) {
     int begin = batch->clients[env]->num_substeps, all = batch->scene->num_substeps;
     int end = piece < all - begin ? begin + piece : all;
     if (begin == 0 && !begin_step(batch, env)) return 0;

@@ -75,7 +75,7 @@ struct batch { /* many clients of one scene */
 };
 
 /* Take so many substeps of a step; answer whether more of them are to be taken. */
-int take_piece(struct batch *batch, int env, int piece);
+int client_take_piece(struct batch *batch, int env, int piece);
 
 /* Roll, pitch and yaw of a quaternion xyzw; euler.py says more. */
 void euler_angles(doubles quaternion, double *angles);

@@ -41,7 +41,7 @@ static void take_part(struct loop *loop) {
         loop->first = (loop->first + 1) % loop->num_envs;
         loop->num_waiting--;
         pthread_mutex_unlock(&loop->mutex);
-        int goes_on = take_piece(loop->batch, env, piece);
+        int goes_on = client_take_piece(loop->batch, env, piece);
         pthread_mutex_lock(&loop->mutex);
         if (goes_on) {
             int last = (loop->first + loop->num_waiting++) % loop->num_envs;
