@@ -18,8 +18,23 @@ import torch
 from tensordict import TensorDict
 
 import torch_panda
-from torch_panda import Panda, PhysicsParams, Push, RobotTaskEnv, WorkerError
-from torch_panda.bullet import BulletError, MotorControl, capi, library, native
+from torch_panda import (
+    Panda,
+    PhysicsParams,
+    Push,
+    Randomization,
+    RobotTaskEnv,
+    WorkerError,
+)
+from torch_panda.bullet import (
+    BulletError,
+    MotorControl,
+    Scene,
+    VectorSimulation,
+    capi,
+    library,
+    native,
+)
 
 IDS = (
     "PandaReachJoints-v3",
@@ -28,6 +43,7 @@ IDS = (
     "PandaStackJoints-v1",
 )
 N = 3
+RANDOMIZATION = Randomization(object_mass=(0.5, 2.0), joint_position=0.1)
 SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
 
 remove_body = library.bind(
@@ -60,7 +76,7 @@ def detections(env):
 
 
 def play(env, steps=12, masks=False):
-    """All that is observed in two episodes, towards the first object or down."""
+    """All that is observed in two episodes; with masks, of some at a time."""
     generator, seen = torch.Generator().manual_seed(0), []
     for _episode in range(2):
         td = env.reset()
@@ -71,6 +87,10 @@ def play(env, steps=12, masks=False):
                 td["_step"] = torch.rand(N, 1, generator=generator) < 0.6
             td = env.step(td)["next"].exclude("_step")
             seen.append(td)
+            mask = torch.rand(N, 1, generator=generator) < 0.1
+            if masks and mask.any():
+                td = env.reset(td.set("_reset", mask)).exclude("_reset")
+                seen.append(td)
         seen.append(env.get_state())
     return seen, detections(env)
 
@@ -82,6 +102,8 @@ def play(env, steps=12, masks=False):
         *((env_id, {}, False) for env_id in IDS),
         ("PandaPickAndPlace-v1", {"sensors": SENSORS}, False),
         ("PandaPush-v1", {"physics": "fast", "num_threads": 1}, False),
+        ("PandaPush-v1", {"randomize": RANDOMIZATION}, True),
+        ("PandaDrawer-v1", {}, True),  # an object with a joint
         ("PandaStack-v1", {}, True),
     ],
 )
@@ -119,6 +141,29 @@ def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
     (one, one_detected), (two, two_detected) = rollout(1), rollout(2)
     assert torch.equal(one["next", "observation"], two["next", "observation"])
     assert one_detected == two_detected
+
+
+@needs_native
+def test_an_arm_alone(monkeypatch):
+    """Where there is no second body, none makes a pair with the first."""
+
+    def build(client):
+        arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        joints = [joint.index for joint in client.joints(arm) if joint.is_movable]
+        return Scene(arm, tuple(joints), ee_link=11)
+
+    found = []
+    for name in ("native", "ctypes"):
+        monkeypatch.setenv(native.LOOP_VARIABLE, name)
+        simulation = VectorSimulation(build, N)
+        for _episode in range(2):
+            simulation.joint_position[:] = torch.linspace(-1, 0, N * 9).view(N, 9)
+            simulation.joint_velocity[:] = 0.0
+            simulation.reset(range(N))
+            simulation.step(MotorControl((50.0,) * 9), np.zeros((N, 9)))
+        found.append((simulation.ee_position.clone(), simulation.ee_velocity.clone()))
+        simulation.close()
+    assert all(map(torch.equal, *found))
 
 
 # ---- errors --------------------------------------------------------------------------
@@ -165,6 +210,45 @@ def test_a_closed_client(env):
     env.episodes.simulation.clients[1].close()
     with pytest.raises(WorkerError, match=r"environment 1: BulletError: .* is closed"):
         step(env)
+
+
+def test_a_reset_that_fails(env):
+    with make() as other:
+        env.reset()
+        other.reset()
+        break_client(env, 2)
+        env.episodes.simulation.clients[1].close()
+        with pytest.raises(WorkerError, match=r"environment 1: .* client is closed"):
+            env.reset()
+        env.episodes.simulation.rebuild(1)
+        message = (
+            r"environment 2: BulletError: Bullet could not load a state: it "
+            r"answered with status 94, expected 95$"
+        )
+        with pytest.raises(WorkerError, match=message) as caught:
+            env.reset()
+        assert caught.value.index == 2
+        for _ in range(2):
+            other.reset()
+        ours, theirs = env.get_state()[:2], other.get_state()[:2]
+        assert (ours == theirs).all()
+
+
+def test_a_reset_whose_randomisation_fails(env):
+    simulation = env.episodes.simulation
+    env.reset()
+    simulation.joint_position[:, 0] = 0.1
+
+    def vary(env):
+        if env == 1:
+            raise ValueError("no")
+
+    with pytest.raises(WorkerError, match="environment 1: ValueError: no"):
+        simulation.reset(range(N), vary)
+    step(env)
+    # The others have been reset.
+    moved = simulation.joint_position[:, 0] > 0.05
+    assert moved.tolist() == [True, False, True]
 
 
 def test_a_closed_simulation(env):
@@ -221,8 +305,12 @@ def test_a_forked_child_has_threads_of_its_own(env):
     step(env)
     receiver, sender = multiprocessing.Pipe(duplex=False)
 
+    def observe():
+        seen = [step(env)["observation"].tolist() for _ in range(3)]
+        return [*seen, env.reset()["observation"].tolist()]
+
     def child():
-        sender.send([step(env)["observation"].tolist() for _ in range(3)])
+        sender.send(observe())
         env.close()
 
     process = multiprocessing.get_context("fork").Process(target=child)
@@ -234,7 +322,7 @@ def test_a_forked_child_has_threads_of_its_own(env):
         assert process.exitcode == 0
     finally:
         process.kill()
-    assert [step(env)["observation"].tolist() for _ in range(3)] == theirs
+    assert observe() == theirs
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")

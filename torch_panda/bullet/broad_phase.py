@@ -11,12 +11,14 @@ happened before. The broad phase holds
 * a mark in the order of pairs, from which each detection looks for pairs that overlap
   no longer.
 
-No command resets them, so each is led back to where it was.
+No command resets them, so each is led back to where it was: by ``reset.c``, and where
+that was not compiled by `BroadPhase.restore`, with the same commands.
 """
 
+from ctypes import pointer
 from typing import NamedTuple
 
-from torch_panda.bullet import capi
+from torch_panda.bullet import capi, native
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.rotations import rotate
 
@@ -65,6 +67,8 @@ class BroadPhase:
         for body in bodies:
             client.set_base(body, _FAR_AWAY)
         self._away = client.save()
+        self._pair = client.bodies[:2]
+        client.native.broad_phase = pointer(self._describe())
         self.restore()
 
     def restore(self) -> None:
@@ -81,11 +85,10 @@ class BroadPhase:
         for body, link, _, _ in self._links:
             client.set_collision_filter(body, link, *_NOTHING)
         # A detection that finds a single pair puts the mark at the first one.
-        pair = client.bodies[:2]
-        for body in pair:
+        for body in self._pair:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
-        for body in pair:
+        for body in self._pair:
             client.set_collision_filter(body, -1, *_NOTHING)
         # Cheap here, where nothing overlaps: about 1 us each.
         past = client.num_detections - self._num_detections
@@ -94,6 +97,19 @@ class BroadPhase:
             client.load(snapshot)
             client.set_collision_filter(body, link, *group_mask)
         client.load(self._built)
+
+    def _describe(self) -> native.BroadPhase:
+        links = [native.Link(b, k, *filters, s) for b, k, filters, s in self._links]
+        return native.BroadPhase(
+            self._num_detections,
+            _DETECTION_CYCLE,
+            self._away,
+            self._built,
+            len(links),
+            len(self._pair),
+            self._pair,
+            (native.Link * len(links))(*links),
+        )
 
     def _read_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
         """Find how the loader added a body's base and links to the broad phase.

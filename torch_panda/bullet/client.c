@@ -23,13 +23,12 @@ enum {
     U_OFFSET = 6                  /* 6 of its velocity */
 };
 
-/* Parts of a step answer whether they have gone well. */
-
-static handle submit(struct batch *batch, int env, handle command, int expected) {
+handle client_submit(struct batch *batch, int env, handle command, int expected,
+                     const char *action) {
     handle status = batch->bullet->submit(batch->clients[env]->handle, command);
     int answer = status ? batch->bullet->status_type(status) : NO_ANSWER;
     if (answer == expected) return status;
-    batch->failures[env] = (struct failure){expected, answer};
+    batch->failures[env] = (struct failure){expected, answer, action};
     return NULL;
 }
 
@@ -45,7 +44,9 @@ static int find_joints(struct batch *batch, int env, double *joints) {
     handle command = bullet->ik_init(batch->clients[env]->handle, batch->scene->robot);
     bullet->ik_set_target(command, control->ik_link, setpoint,
                           control->turns ? setpoint + 3 : control->orientation);
-    handle status = submit(batch, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED);
+    handle status =
+        client_submit(batch, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED,
+                      "solve the inverse kinematics");
     if (!status) return 0;
     int body, count;
     bullet->ik_result(status, &body, &count, joints);
@@ -76,7 +77,8 @@ static int set_motors(struct batch *batch, int env, doubles joints) {
         bullet->motor_set_force(command, U_OFFSET + k,
                                 has_torque ? 0 : control->forces[k]);
     }
-    return submit(batch, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
+    return client_submit(batch, env, command, DESIRED_STATE_RECEIVED_COMPLETED,
+                         "control joints") != NULL;
 }
 
 static int apply_torques(struct batch *batch, int env) {
@@ -86,7 +88,8 @@ static int apply_torques(struct batch *batch, int env) {
     handle command = bullet->motor_init(client, batch->scene->robot, TORQUE);
     for (int k = 0; k < batch->control->num_arm_joints; k++)
         bullet->motor_set_torque(command, U_OFFSET + k, torques[k]);
-    return submit(batch, env, command, DESIRED_STATE_RECEIVED_COMPLETED) != NULL;
+    return client_submit(batch, env, command, DESIRED_STATE_RECEIVED_COMPLETED,
+                         "apply torques") != NULL;
 }
 
 static int advance(struct batch *batch, int env, int num_substeps) {
@@ -100,7 +103,9 @@ static int advance(struct batch *batch, int env, int num_substeps) {
             if (!apply_torques(batch, env)) return 0;
             command = batch->bullet->step_init(client->handle);
         }
-        if (!submit(batch, env, command, STEP_FORWARD_SIMULATION_COMPLETED)) return 0;
+        if (!client_submit(batch, env, command, STEP_FORWARD_SIMULATION_COMPLETED,
+                           "step"))
+            return 0;
     }
     return 1;
 }
@@ -113,16 +118,16 @@ static int ask_state(struct batch *batch, int env, int body, struct body_state *
     const struct functions *bullet = batch->bullet;
     handle command = bullet->state_init(batch->clients[env]->handle, body);
     if (body == batch->scene->robot) bullet->state_want_link_velocity(command, 1);
-    handle status = submit(batch, env, command, ACTUAL_STATE_UPDATE_COMPLETED);
+    handle status = client_submit(batch, env, command, ACTUAL_STATE_UPDATE_COMPLETED,
+                                  "report a state");
     if (!status) return 0;
     bullet->state_result(status, NULL, NULL, NULL, NULL, NULL, &state->q, &state->u,
                          NULL, NULL, NULL, &state->link_poses, &state->link_velocities);
     return 1;
 }
 
-static double *copy(double *to, doubles from, int count) {
+static void copy(double *to, doubles from, int count) {
     memcpy(to, from, count * sizeof *to);
-    return to + count;
 }
 
 void euler_angles(doubles quaternion, double *angles) {
@@ -141,41 +146,58 @@ void euler_angles(doubles quaternion, double *angles) {
     angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
 }
 
-/* Fill a client's row: joint positions and velocities, position, velocity and
-   orientation of the end-effector; poses (7 each), then velocities (6 each) of the
-   objects, then positions and velocities of their joints, and the objects' Euler
-   angles (3 each). */
-static int read_state(struct batch *batch, int env) {
+struct row client_row(const struct batch *batch, int env) {
     const struct scene *scene = batch->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
     int num_object_joints = scene->num_object_joints;
-    int size = 2 * n + 10 + 16 * num_objects + 2 * num_object_joints;
-    double *row = batch->state + (size_t)env * size;
+    size_t size = 2 * n + 10 + 16 * num_objects + 2 * num_object_joints;
+    struct row row;
+    row.joint_position = batch->state + env * size;
+    row.joint_velocity = row.joint_position + n;
+    row.ee_position = row.joint_velocity + n;
+    row.ee_velocity = row.ee_position + 3;
+    row.ee_orientation = row.ee_velocity + 3;
+    row.object_pose = row.ee_orientation + 4;
+    row.object_velocity = row.object_pose + 7 * num_objects;
+    row.object_joint_position = row.object_velocity + 6 * num_objects;
+    row.object_joint_velocity = row.object_joint_position + num_object_joints;
+    row.object_euler = row.object_joint_velocity + num_object_joints;
+    return row;
+}
+
+int client_read_state(struct batch *batch, int env) {
+    const struct scene *scene = batch->scene;
+    struct row row = client_row(batch, env);
     struct body_state body;
     if (!ask_state(batch, env, scene->robot, &body)) return 0;
-    row = copy(row, body.q + Q_OFFSET, n);
-    row = copy(row, body.u + U_OFFSET, n);
-    row = copy(row, body.link_poses + 7 * scene->ee_link, 3);
-    row = copy(row, body.link_velocities + 6 * scene->ee_link, 3);
-    row = copy(row, body.link_poses + 7 * scene->ee_link + 3, 4);
-    double *joints = row + 13 * num_objects;
-    double *angles = joints + 2 * num_object_joints;
-    for (int k = 0; k < num_objects; k++) {
+    doubles ee_pose = body.link_poses + 7 * scene->ee_link;
+    copy(row.joint_position, body.q + Q_OFFSET, scene->num_joints);
+    copy(row.joint_velocity, body.u + U_OFFSET, scene->num_joints);
+    copy(row.ee_position, ee_pose, 3);
+    copy(row.ee_velocity, body.link_velocities + 6 * scene->ee_link, 3);
+    copy(row.ee_orientation, ee_pose + 3, 4);
+    for (int k = 0, first = 0; k < scene->num_objects; k++) {
         if (!ask_state(batch, env, scene->objects[k], &body)) return 0;
-        copy(row + 7 * k, body.q, 7);
-        copy(row + 7 * num_objects + 6 * k, body.u, 6);
-        copy(joints + num_object_joints, body.u + U_OFFSET, scene->object_joints[k]);
-        joints = copy(joints, body.q + Q_OFFSET, scene->object_joints[k]);
-        euler_angles(body.q + 3, angles + 3 * k);
+        int count = scene->object_joint_counts[k];
+        copy(row.object_pose + 7 * k, body.q, 7);
+        copy(row.object_velocity + 6 * k, body.u, 6);
+        copy(row.object_joint_position + first, body.q + Q_OFFSET, count);
+        copy(row.object_joint_velocity + first, body.u + U_OFFSET, count);
+        euler_angles(body.q + 3, row.object_euler + 3 * k);
+        first += count;
     }
     return 1;
 }
 
+int client_is_open(struct batch *batch, int env) {
+    int is_closed = batch->clients[env]->handle == NULL;
+    batch->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0, NULL};
+    return !is_closed;
+}
+
 static int begin_step(struct batch *batch, int env) {
     double joints[MAX_DEGREES_OF_FREEDOM];
-    int is_closed = batch->clients[env]->handle == NULL;
-    batch->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0};
-    return !is_closed && find_joints(batch, env, joints) &&
+    return client_is_open(batch, env) && find_joints(batch, env, joints) &&
            set_motors(batch, env, joints);
 }
 
@@ -185,6 +207,6 @@ int client_take_piece(struct batch *batch, int env, int piece) {
     if (begin == 0 && !begin_step(batch, env)) return 0;
     if (!advance(batch, env, end)) return 0;
     if (end < all) return 1;
-    read_state(batch, env);
+    client_read_state(batch, env);
     return 0;
 }

@@ -1,4 +1,4 @@
-/* What client.c and loop.c are told, and what one client does.
+/* What client.c, reset.c and loop.c are told, and what one client does.
 
    Nothing is linked: Bullet's functions are given by address. native.py declares these
    structs once more, in the same order, and capi.py the functions by full names. */
@@ -6,6 +6,7 @@
 #ifndef TORCH_PANDA_CLIENT_H
 #define TORCH_PANDA_CLIENT_H
 
+#include <stddef.h>
 #include <stdint.h>
 
 typedef void *handle;          /* of a client, a command or a status */
@@ -33,18 +34,48 @@ struct functions {
                         doubles *joint_forces, doubles *link_frames,
                         doubles *motor_forces, doubles *link_poses,
                         doubles *link_velocities);
+    handle (*load_init)(handle client);
+    int (*load_set_snapshot)(handle command, int snapshot);
+    handle (*filter_init)(handle client);
+    void (*filter_set_group_mask)(handle command, int body, int link, int group,
+                                  int mask);
+    handle (*detect_init)(handle client);
+    handle (*pose_init)(handle client, int body);
+    int (*pose_set_position)(handle command, double x, double y, double z);
+    int (*pose_set_orientation)(handle command, double x, double y, double z, double w);
+    int (*pose_set_linear_velocity)(handle command, doubles velocity);
+    int (*pose_set_angular_velocity)(handle command, doubles velocity);
+    int (*pose_set_joint_position)(handle client, handle command, int joint,
+                                   double position);
+    int (*pose_set_joint_velocity)(handle client, handle command, int joint,
+                                   double velocity);
+};
+
+struct link { /* as its body was built */
+    int body, link, group, mask, snapshot;
+};
+
+struct broad_phase { /* BroadPhase of broad_phase.py: snapshots, and what it counts */
+    int64_t num_detections;
+    int cycle, away, built, num_links, pair_size, pair[2];
+    const struct link *links;
 };
 
 struct client {
     handle handle;          /* NULL when it is closed */
     int64_t num_detections; /* how often collisions have been detected */
     int num_substeps;       /* in the present step, so far */
+    const struct broad_phase *broad_phase;
 };
 
 struct scene { /* the same in every client */
-    int robot, ee_link, num_joints, num_objects, num_object_joints, num_substeps;
-    const int *objects;       /* body ids */
-    const int *object_joints; /* how many each object has */
+    int robot, ee_link, num_joints, num_objects, num_object_joints, num_markers;
+    int num_substeps;
+    const int *joints;              /* indices of the robot's */
+    const int *objects;             /* body ids */
+    const int *object_joint_counts; /* how many each object has */
+    const int *object_joints;       /* indices, of the first object, then of the next */
+    const int *markers;             /* body ids */
 };
 
 enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
@@ -61,18 +92,41 @@ enum { NO_ANSWER = -1, CLIENT_CLOSED = -2 };
 struct failure {
     int expected; /* status code, or CLIENT_CLOSED; 0 where nothing has failed */
     int answer;   /* status code, or NO_ANSWER */
+    const char *action; /* what Bullet could not do */
 };
 
 struct batch { /* many clients of one scene */
     const struct functions *bullet;
     const struct scene *scene;
     struct client *const *clients;
-    double *state;            /* a row a client; read_state has the order */
+    double *state;            /* a row a client; client_row has the order */
+    doubles marker_pose;      /* a row a client, 7 a marker */
     struct failure *failures; /* one a client */
 
     const struct control *control; /* of the present step, as what follows */
     doubles setpoint;              /* a row a client */
 };
+
+struct row { /* a client's */
+    double *joint_position, *joint_velocity, *ee_position, *ee_velocity;
+    double *ee_orientation, *object_pose, *object_velocity, *object_joint_position;
+    double *object_joint_velocity, *object_euler;
+};
+
+struct row client_row(const struct batch *batch, int env);
+
+/* The following answer whether all has gone well; if not, they note the failure. */
+
+int client_is_open(struct batch *batch, int env);
+
+/* The status; NULL: Bullet could not do it. */
+handle client_submit(struct batch *batch, int env, handle command, int expected,
+                     const char *action);
+
+/* Copy the state of a client's world into its row. */
+int client_read_state(struct batch *batch, int env);
+
+int client_reset(struct batch *batch, int env);
 
 /* Take so many substeps of a step; answer whether more of them are to be taken. */
 int client_take_piece(struct batch *batch, int env, int piece);

@@ -1,4 +1,4 @@
-"""``loop.c`` and ``client.c`` as the package's installation compiled them.
+"""``client.c``, ``reset.c`` and ``loop.c`` as the package's installation compiled them.
 
 They are found, loaded and declared here. They are an optional part: without them,
 `VectorSimulation` steps its clients in Python.
@@ -7,7 +7,15 @@ They are found, loaded and declared here. They are an optional part: without the
 import ctypes
 import importlib.util
 import os
-from ctypes import POINTER, Structure, c_double, c_int, c_int64, c_void_p
+from ctypes import (
+    POINTER,
+    Structure,
+    c_char_p,
+    c_double,
+    c_int,
+    c_int64,
+    c_void_p,
+)
 from typing import Any, Literal, get_args
 
 from torch_panda.bullet import capi
@@ -42,8 +50,47 @@ _BULLET = (
     capi.state_init,
     capi.state_want_link_velocity,
     capi.state_result,
+    capi.load_init,
+    capi.load_set_snapshot,
+    capi.filter_init,
+    capi.filter_set_group_mask,
+    capi.detect_init,
+    capi.pose_init,
+    capi.pose_set_position,
+    capi.pose_set_orientation,
+    capi.pose_set_linear_velocity,
+    capi.pose_set_angular_velocity,
+    capi.pose_set_joint_position,
+    capi.pose_set_joint_velocity,
 )
 Functions = c_void_p * len(_BULLET)
+
+
+class Link(Structure):
+    """``struct link``."""
+
+    _fields_ = (
+        ("body", c_int),
+        ("link", c_int),
+        ("group", c_int),
+        ("mask", c_int),
+        ("snapshot", c_int),
+    )
+
+
+class BroadPhase(Structure):
+    """``struct broad_phase``."""
+
+    _fields_ = (
+        ("num_detections", c_int64),
+        ("cycle", c_int),
+        ("away", c_int),
+        ("built", c_int),
+        ("num_links", c_int),
+        ("pair_size", c_int),
+        ("pair", c_int * 2),
+        ("links", POINTER(Link)),
+    )
 
 
 class Client(Structure):
@@ -53,6 +100,7 @@ class Client(Structure):
         ("handle", c_void_p),
         ("num_detections", c_int64),
         ("num_substeps", c_int),
+        ("broad_phase", POINTER(BroadPhase)),
     )
 
 
@@ -65,9 +113,13 @@ class Scene(Structure):
         ("num_joints", c_int),
         ("num_objects", c_int),
         ("num_object_joints", c_int),
+        ("num_markers", c_int),
         ("num_substeps", c_int),
+        ("joints", POINTER(c_int)),
         ("objects", POINTER(c_int)),
+        ("object_joint_counts", POINTER(c_int)),
         ("object_joints", POINTER(c_int)),
+        ("markers", POINTER(c_int)),
     )
 
 
@@ -90,7 +142,7 @@ class Control(Structure):
 class Failure(Structure):
     """``struct failure``."""
 
-    _fields_ = (("expected", c_int), ("answer", c_int))
+    _fields_ = (("expected", c_int), ("answer", c_int), ("action", c_char_p))
 
 
 class Batch(Structure):
@@ -101,6 +153,7 @@ class Batch(Structure):
         ("scene", POINTER(Scene)),
         ("clients", POINTER(POINTER(Client))),
         ("state", c_void_p),
+        ("marker_pose", c_void_p),
         ("failures", POINTER(Failure)),
         ("control", POINTER(Control)),
         ("setpoint", c_void_p),
@@ -108,7 +161,7 @@ class Batch(Structure):
 
 
 class Library:
-    """The functions of both. Calls release the GIL.
+    """The functions of all three. Calls release the GIL.
 
     Args:
         path: of the compiled file.
@@ -127,6 +180,8 @@ class Library:
             POINTER(c_int),
             c_int,
         )
+        self.reset = library.client_reset
+        self.reset.argtypes = (POINTER(Batch), c_int)
         self.euler_angles = library.euler_angles
         self.euler_angles.restype = None
         self.euler_angles.argtypes = (POINTER(c_double), POINTER(c_double))

@@ -1,12 +1,10 @@
-"""A vector step of all clients in threads of C, without Python."""
+"""A vector step of all clients in threads of C, without Python, and their reset."""
 
 import os
-from collections.abc import Sequence
-from ctypes import POINTER, byref, c_double, c_int, pointer
+from collections.abc import Iterable, Sequence
+from ctypes import POINTER, Array, c_double, c_int, pointer
 
-from torch import Tensor
-
-from torch_panda.bullet import capi, native
+from torch_panda.bullet import native
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
 from torch_panda.bullet.connection import BulletError, client_closed, refusal
@@ -14,24 +12,16 @@ from torch_panda.bullet.control import MotorControl
 from torch_panda.bullet.physics import PhysicsParams
 from torch_panda.bullet.pool import WorkerError
 from torch_panda.bullet.scene import Scene
-
-# What Bullet could not do, by the status code that it should have answered with.
-_ACTIONS = {
-    capi.CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED: "solve the inverse kinematics",
-    capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED: "control joints",
-    capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED: "step",
-    capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED: "report a state",
-}
+from torch_panda.bullet.scene_state import SceneState
 
 
 class NativeLoop:
-    """Steps clients as ``loop.c`` does, and owns its threads.
+    """Steps clients as ``loop.c`` does, resets them, and owns its threads.
 
     Args:
         clients: the clients, which `replace` may replace.
         scene: what they hold.
-        state: (num_envs, k) float64 and contiguous, which every step overwrites: of
-            each client what `VectorSimulation` names, in that order.
+        state: what every step overwrites, and resets start from.
         physics: how they integrate.
         num_threads: threads that step them, the caller's among them.
     """
@@ -40,7 +30,7 @@ class NativeLoop:
         self,
         clients: Sequence[PhysicsClient],
         scene: Scene,
-        state: Tensor,
+        state: SceneState,
         *,
         physics: PhysicsParams,
         num_threads: int,
@@ -50,16 +40,20 @@ class NativeLoop:
         self._library = native.LIBRARY
         self._physics = physics
         self._num_threads = num_threads
-        counts = [len(joints) for joints in scene.object_joints]
+        object_joints = [k for joints in scene.object_joints for k in joints]
         native_scene = native.Scene(
             scene.robot,
             scene.ee_link,
             len(scene.joints),
             len(scene.objects),
-            sum(counts),
+            len(object_joints),
+            len(scene.markers),
             physics.n_substeps,
-            (c_int * len(scene.objects))(*scene.objects),
-            (c_int * len(counts))(*counts),
+            _ints(scene.joints),
+            _ints(scene.objects),
+            _ints(map(len, scene.object_joints)),
+            _ints(object_joints),
+            _ints(scene.markers),
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
@@ -69,7 +63,8 @@ class NativeLoop:
             pointer(native.bullet_functions()),
             pointer(native_scene),
             self._clients,
-            state.data_ptr(),
+            state.rows.data_ptr(),
+            state.marker_pose.data_ptr(),
             self._failures,
         )
         self._described: MotorControl | None = None  # by _control
@@ -80,7 +75,7 @@ class NativeLoop:
             self.replace(env, client)
 
     def replace(self, env: int, client: PhysicsClient) -> None:
-        """Step another client from now on."""
+        """Step and reset another client from now on."""
         self._clients[env] = pointer(client.native)
 
     def step(
@@ -114,6 +109,16 @@ class NativeLoop:
             env, error = next((env, e) for env, e in errors.items() if e)
             raise WorkerError(env, error) from error
 
+    def reset(self, env: int) -> None:
+        """Put a client where the state says, with no past, in the calling thread.
+
+        Raises:
+            BulletError: Bullet failed, or the client is closed.
+        """
+        self._library.reset(self._batch, env)
+        if error := self._error(env):
+            raise error
+
     def close(self) -> None:
         """End the threads. Closing again does nothing."""
         # A forked child has none of them.
@@ -125,7 +130,7 @@ class NativeLoop:
         if self._loop is not None and self._process == os.getpid():
             return
         self._process = os.getpid()
-        self._loop = self._library.create(byref(self._batch), self._num_threads)
+        self._loop = self._library.create(self._batch, self._num_threads)
         if self._loop is None:
             raise MemoryError
 
@@ -144,11 +149,16 @@ class NativeLoop:
         self._described = control
 
     def _error(self, env: int) -> BulletError | None:
-        """Why a client has failed in this step, if it has."""
-        expected, answer = self._failures[env].expected, self._failures[env].answer
-        if expected == native.CLIENT_CLOSED:
+        """Why a client has failed in this step or reset, if it has."""
+        failure = self._failures[env]
+        if failure.expected == native.CLIENT_CLOSED:
             return client_closed()
-        if not expected:
+        if not failure.expected:
             return None
-        code = None if answer == native.NO_ANSWER else answer
-        return refusal(_ACTIONS[expected], code, expected)
+        code = None if failure.answer == native.NO_ANSWER else failure.answer
+        return refusal(failure.action.decode(), code, failure.expected)
+
+
+def _ints(values: Iterable[int]) -> "Array[c_int]":
+    values = tuple(values)
+    return (c_int * len(values))(*values)

@@ -82,7 +82,7 @@ class VectorSimulation:
                 self._native = NativeLoop(
                     self._clients,
                     self.scene,
-                    self._state.rows,
+                    self._state,
                     physics=physics,
                     num_threads=self.num_threads,
                 )
@@ -190,7 +190,8 @@ class VectorSimulation:
         """Start an episode from what the state tensors hold for these clients.
 
         Bullet remembers more than the state. `BroadPhase` makes it forget, so that what
-        follows depends on the start state and the actions alone.
+        follows depends on the start state and the actions alone. In C where that was
+        compiled, else in Python: the numbers are the same.
 
         Args:
             envs: which clients.
@@ -204,6 +205,9 @@ class VectorSimulation:
         def reset_one(env: int) -> None:
             if vary is not None:
                 vary(env)
+            if self._native is not None:
+                self._native.reset(env)
+                return
             client = self._clients[env]
             self._broad_phases[env].restore()
             self._state.place(env, client)
