@@ -3,7 +3,7 @@
 python examples/evaluate.py runs/PandaPush-v1-ddpg-relabel-0 --episodes 200
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -86,6 +86,8 @@ class Args:
     """threads that step them; None means one per core"""
     seed: Seed = 1_000
     """of the environments"""
+    task_options: dict[str, float] = field(default_factory=dict)
+    """numbers of the task that are others than in training, such as `play 0.0005`"""
     physics: PhysicsName = "exact"
     """how Bullet integrates: as panda-gym, or faster and coarser"""
 
@@ -102,12 +104,14 @@ def main(args: Args) -> None:
             num_threads=args.num_threads,
             seed=args.seed,
             physics=args.physics,
+            task_options=args.task_options,
         ) as env:
             policy = load_policy(checkpoint, env)
             result = evaluate(env, policy, args.episodes)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise SystemExit(str(error)) from None
-    print(f"{env_id}, {args.episodes} episodes, {args.physics} physics")
+    changes = "".join(f", {key} {value}" for key, value in args.task_options.items())
+    print(f"{env_id}{changes}, {args.episodes} episodes, {args.physics} physics")
     for name, flags in (
         ("success at the end", result.success),
         ("success at any time", result.ever),

@@ -5,7 +5,7 @@ python examples/record_demos.py --format minari --out panda/push-expert-v0
 python examples/record_demos.py --format lerobot --out push_lerobot
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,6 +44,8 @@ class Args:
     """the standard deviation of Gaussian noise on the actions that are executed; saved
     are the actions without it, so that who imitates them learns to correct himself
     (DART, arXiv 1703.09327)"""
+    task_options: dict[str, float] = field(default_factory=dict)
+    """numbers of the task that are others than the id's, such as `play 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
     """a file of a nested dict of tensors of shape (steps, ...), or a data set"""
     out: Path | None = None
@@ -154,6 +156,8 @@ def main(args: Args) -> None:
         expert: TensorDictModuleBase = make_expert(args.env_id)
         if args.noise_eps and args.format == "minari":
             raise ValueError("minari's episodes hold what was executed: no noise_eps")
+        if args.task_options and args.format != "tensors":
+            raise ValueError(f"{args.format}'s data sets name an id: no task_options")
         pictures: dict[str, Any] = {}
         if args.format == "lerobot":
             pictures = {"from_pixels": True, "render_size": args.image_size}
@@ -162,10 +166,11 @@ def main(args: Args) -> None:
             num_envs=min(args.num_envs, args.episodes),
             num_threads=args.num_threads,
             seed=args.seed,
+            task_options=args.task_options,
             **pictures,
         )
         writer = open_writer(args, env)
-    except (ValueError, OSError) as error:
+    except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None
     expert = disturb(expert, env, args.noise_eps)
     success: list[Tensor] = []

@@ -3,9 +3,6 @@
 import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from itertools import product
 from typing import Any
 
 import gymnasium
@@ -13,115 +10,13 @@ import torch
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.checks import check_positive
+from torch_panda.ids import ENV_IDS, SHIPPED_ENVS, Registration, describe_ids
 from torch_panda.rendering import Camera
-from torch_panda.robots import (
-    ControlType,
-    Kuka,
-    Panda,
-    Robot,
-    XArm6,
-    XArm6Gripper,
-)
+from torch_panda.robots import Robot
 from torch_panda.sensors import Sensor, read_keywords
-from torch_panda.tasks import (
-    Drawer,
-    Flip,
-    PegInsertion,
-    PickAndPlace,
-    Push,
-    Reach,
-    RewardType,
-    Slide,
-    Stack,
-    Task,
-)
-from torch_panda.tasks.peg_insertion import GRASP_WIDTH
-from torch_panda.versions import (
-    NO_PAIRS,
-    ROBOT_ARGUMENTS,
-    TASK_ARGUMENTS,
-    VERSIONS,
-    arguments_of,
-)
+from torch_panda.tasks import Task
 
-_TASKS: dict[str, type[Task]] = {
-    "Reach": Reach,
-    "Push": Push,
-    "Slide": Slide,
-    "PickAndPlace": PickAndPlace,
-    "Stack": Stack,
-    "Flip": Flip,
-    "Drawer": Drawer,
-    "PegInsertion": PegInsertion,
-}
-# Tasks that are done with the gripper blocked, so without an action for it.
-_BLOCKED_GRIPPER = ("Reach", "Push", "Slide", "Drawer", "PegInsertion")
-# Those that panda-gym does not have, and what their robots are made with.
-_OWN_TASKS: dict[str, dict[str, Any]] = {
-    "Drawer": {},
-    "PegInsertion": {"fingers_width": GRASP_WIDTH, "finger_friction": 5.0},
-}
-_CONTROL: dict[str, ControlType] = {"": "ee", "Joints": "joints"}
-_REWARD: dict[str, RewardType] = {"": "sparse", "Dense": "dense"}
-
-
-@dataclass(frozen=True)
-class _Registration:
-    """What an id is made of."""
-
-    robot: Callable[..., Robot]
-    task: Callable[..., Task]
-    max_episode_steps: int
-    terminate_on_success: bool
-
-
-_ENVS = {
-    f"Panda{task}{control}{reward}-{version}": _Registration(
-        robot=partial(
-            Panda,
-            control_type=_CONTROL[control],
-            block_gripper=task in _BLOCKED_GRIPPER,
-            **arguments_of(ROBOT_ARGUMENTS.get(task, NO_PAIRS), version),
-            **_OWN_TASKS.get(task, {}),
-        ),
-        task=partial(
-            _TASKS[task],
-            reward_type=_REWARD[reward],
-            **arguments_of(TASK_ARGUMENTS.get(task, NO_PAIRS), version),
-        ),
-        max_episode_steps=_TASKS[task].max_episode_steps,
-        terminate_on_success=version == "v3",
-    )
-    for task, control, reward, version in product(_TASKS, _CONTROL, _REWARD, VERSIONS)
-    if task not in _OWN_TASKS or version == "v1"
-}
-
-# Other robots at the tasks -v1; ``robot_options`` has their control types.
-_ROBOTS: tuple[tuple[type[Robot], str, dict[str, Any]], ...] = (
-    (Kuka, "Reach", {}),
-    (XArm6, "Reach", {}),
-    (XArm6Gripper, "Reach", {"block_gripper": True}),
-    (XArm6Gripper, "PickAndPlace", {"finger_friction": 5.0}),
-)
-_ENVS |= {
-    f"{robot.__name__}{task}{reward}-v1": _Registration(
-        robot=partial(robot, **robot_arguments),
-        task=partial(
-            _TASKS[task],
-            reward_type=_REWARD[reward],
-            **arguments_of(TASK_ARGUMENTS.get(task, NO_PAIRS), "v1"),
-        ),
-        max_episode_steps=_TASKS[task].max_episode_steps,
-        terminate_on_success=False,
-    )
-    for (robot, task, robot_arguments), reward in product(_ROBOTS, _REWARD)
-}
-
-ENV_IDS: tuple[str, ...] = tuple(_ENVS)
-"""The ids that torch_panda ships: ``Panda{task}{,Joints}{,Dense}-v{1,3}`` for the tasks
-of panda-gym, -v1 only for Drawer and PegInsertion,
-``{Kuka,XArm6,XArm6Gripper}Reach{,Dense}-v1`` and
-``XArm6GripperPickAndPlace{,Dense}-v1``."""
+_ENVS = dict(SHIPPED_ENVS)
 
 
 def register(
@@ -159,7 +54,7 @@ def register(
             )
     check_positive(max_episode_steps=max_episode_steps)
     steps = max_episode_steps or task().max_episode_steps
-    registration = _Registration(robot, task, steps, terminate_on_success)
+    registration = Registration(robot, task, steps, terminate_on_success)
     try:
         _register_with_gymnasium(env_id, registration)
     except gymnasium.error.Error as error:
@@ -260,7 +155,7 @@ def register_with_gymnasium() -> None:
         _register_with_gymnasium(env_id, _ENVS[env_id])
 
 
-def _register_with_gymnasium(env_id: str, registration: _Registration) -> None:
+def _register_with_gymnasium(env_id: str, registration: Registration) -> None:
     name = f"torch_panda/{env_id}"
     gymnasium.registry.pop(name, None)  # or it would warn that it replaces it
     gymnasium.register(
@@ -272,17 +167,13 @@ def _register_with_gymnasium(env_id: str, registration: _Registration) -> None:
     )
 
 
-def _find(env_id: str) -> _Registration:
+def _find(env_id: str) -> Registration:
     if not isinstance(env_id, str) or env_id not in _ENVS:
         close = difflib.get_close_matches(str(env_id), _ENVS, n=3)
         hint = f"did you mean {' or '.join(close)}? " if close else ""
-        own = ", ".join(sorted(_ENVS.keys() - set(ENV_IDS)))
-        both = ",".join(task for task in _TASKS if task not in _OWN_TASKS)
+        own = ", ".join(sorted(_ENVS.keys() - SHIPPED_ENVS.keys()))
         raise ValueError(
-            f"unknown environment id {env_id!r}; {hint}accepted are "
-            f"Panda{{{both}}}{{,Joints}}{{,Dense}}-v{{1,3}}, "
-            f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1, "
-            + ", ".join(sorted({f"{r.__name__}{task}-v1" for r, task, _ in _ROBOTS}))
+            f"unknown environment id {env_id!r}; {hint}accepted are {describe_ids()}"
             + (f" and what was registered: {own}" if own else "")
         )
     return _ENVS[env_id]

@@ -23,6 +23,11 @@ def rotation_vector_to_quaternion(vector: Tensor) -> Tensor:
     return torch.cat((vector * factor, (angle / 2).cos()), dim=-1)
 
 
+def rotation_distance(first: Tensor, second: Tensor) -> Tensor:
+    """1 - <q, q'>^2 of unit quaternions, 0 to 1: (..., 4) each to (..., 1)."""
+    return 1 - (first * second).sum(-1, keepdim=True).square()
+
+
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     """First after second, in the frame that the first turns: xyzw (..., 4) each."""
     first, second = torch.broadcast_tensors(first, second)

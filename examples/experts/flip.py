@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from experts.moves import GAIN, norm, open_to
-from experts.rotations import best_pitch, compose, distance, straighten, turn
+from experts.rotations import best_pitch, compose, straighten, turn
+from torch_panda.rotations import rotation_distance as distance
 
 # Widths of the fingers [m]: around the cube, closing on it, holding it as firmly as it
 # takes, and where it begins to slip; by what action they loosen and then stay so.

@@ -36,11 +36,6 @@ def turn(axis: int, angle: Tensor) -> Tensor:
     return torch.cat((*parts, (angle / 2).cos()), -1)
 
 
-def distance(first: Tensor, second: Tensor) -> Tensor:
-    """1 - <q, q'>^2, as the task Flip has it, (..., 1)."""
-    return 1 - (first * second).sum(-1, keepdim=True).square()
-
-
 def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
     """The distance left after the best turn about y, and that turn [rad], (..., 1)."""
     half_turn = compose(start.new_tensor((0.0, 1.0, 0.0, 0.0)), start)

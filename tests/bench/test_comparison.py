@@ -3,9 +3,9 @@
 import pytest
 
 from torch_panda.bench import comparison
-from torch_panda.bench.contenders import Setting
 from torch_panda.bench.processes import available_memory
 from torch_panda.bench.runner import ContenderError
+from torch_panda.bench.stepping import Setting
 
 SETTING = Setting("PandaPush-v3", num_envs=2, num_threads=1)
 

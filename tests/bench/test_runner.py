@@ -8,8 +8,8 @@ import time
 import pytest
 
 from torch_panda.bench import processes
-from torch_panda.bench.contenders import Setting
 from torch_panda.bench.runner import ContenderError, Runner
+from torch_panda.bench.stepping import Setting
 
 
 def test_an_error_names_the_contender():

@@ -9,7 +9,7 @@ import experts
 import record_demos
 import torch_panda
 from torch_panda.bench.comparison import compare
-from torch_panda.bench.contenders import Setting
+from torch_panda.bench.stepping import Setting
 
 pytestmark = pytest.mark.slow
 

@@ -11,11 +11,10 @@ from experts.rotations import (
     STRAIGHT,
     best_pitch,
     compose,
-    distance,
     straighten,
     turn,
 )
-from torch_panda import Flip
+from torch_panda.rotations import rotation_distance as distance
 
 
 def orientations(number, seed=0):
@@ -46,11 +45,6 @@ def test_compose_turns_by_the_second_first():
     torch.testing.assert_close(
         rotate(compose(a, b), vector), rotate(a, rotate(b, vector))
     )
-
-
-def test_the_distance_is_the_task_s():
-    a, b = orientations(50).split(25)
-    torch.testing.assert_close(distance(a, b), Flip().distance(a, b))
 
 
 def test_straight_orientations_are_the_24_that_map_axes_to_axes():

@@ -45,6 +45,20 @@ def test_what_is_saved_is_the_action_without_noise(tmp_path):
     assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
 
 
+def test_numbers_of_the_task_can_be_others(tmp_path, capsys):
+    args = record_demos.Args("PandaReach-v1", 4, num_envs=4, out=tmp_path / "demos.pt")
+    for threshold, success in ((0.5, "4/4"), (1e-9, "0/4")):
+        args.task_options = {"distance_threshold": threshold}
+        record_demos.main(args)
+        assert f"at the end {success}" in capsys.readouterr().out
+    args.task_options = {"threshold": 1.0}
+    with pytest.raises(SystemExit, match=r"accepted are .*distance_threshold"):
+        record_demos.main(args)
+    args.task_options, args.format = {"distance_threshold": 0.5}, "minari"
+    with pytest.raises(SystemExit, match="no task_options"):
+        record_demos.main(args)
+
+
 def stop(*arguments):
     raise KeyboardInterrupt
 

@@ -68,6 +68,9 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
     assert content["policy"]["module.0.module.count"] == 400
     assert (out / "checkpoint.pt").stat().st_size < 2 * 2**20
 
+    options = {"distance_threshold": 10.0}
+    evaluate.main(evaluate.Args(run=out, episodes=8, task_options=options))
+    assert "success at the end   100.0%" in capsys.readouterr().out
     evaluate.main(evaluate.Args(run=out, episodes=8))
     report = capsys.readouterr().out
     assert "PandaReach-v1, 8 episodes" in report

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import torch_panda
 from torch_panda.bench.comparison import Absence, Result, compare, work_of
-from torch_panda.bench.contenders import CONTENDERS, OURS, Setting
+from torch_panda.bench.contenders import CONTENDERS, OURS
 from torch_panda.bench.plot import plot
 from torch_panda.bench.report import notes, table, write_json
 from torch_panda.bench.runner import ContenderError
+from torch_panda.bench.stepping import Setting
 from torch_panda.info import num_cores
 
 

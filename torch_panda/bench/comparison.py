@@ -5,9 +5,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from torch_panda.bench.bare_bullet import Speed
-from torch_panda.bench.contenders import CONTENDERS, OURS, Setting
+from torch_panda.bench.contenders import CONTENDERS, OURS
 from torch_panda.bench.processes import available_memory
 from torch_panda.bench.runner import ContenderError, Footprint, Runner
+from torch_panda.bench.stepping import Setting
 
 # Called with what is being done, whenever a piece of the work begins.
 Progress = Callable[[str], None]

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from torch_panda.bench.bare_bullet import Speed
-from torch_panda.bench.contenders import CONTENDERS, Setting
+from torch_panda.bench.contenders import CONTENDERS
 from torch_panda.bench.processes import memory
+from torch_panda.bench.stepping import Setting
 from torch_panda.closing import Closing
 
 _RESETS = 5

@@ -10,12 +10,12 @@ from torch_panda.bullet.broad_phase import BroadPhase
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
+from torch_panda.bullet.link_client import Blueprint, LinkClient
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool
 from torch_panda.bullet.scene import Scene
-from torch_panda.bullet.scene_client import Blueprint, SceneClient
 from torch_panda.bullet.scene_state import SceneState
 
 
@@ -116,7 +116,7 @@ class VectorSimulation:
         """The clients, by environment."""
         return self._clients
 
-    def check_same(self, client: SceneClient, scene: Scene) -> None:
+    def check_same(self, client: LinkClient, scene: Scene) -> None:
         """Make sure that another client holds the scene that these hold.
 
         Raises:

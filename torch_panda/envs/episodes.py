@@ -1,8 +1,8 @@
 """Episodes of a robot at a task: start, act, observe. Plain torch, without torchrl."""
 
-from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -20,30 +20,19 @@ from torch_panda.envs.action import read_action
 from torch_panda.envs.checks import check_functions, check_kinds, check_positive
 from torch_panda.envs.history import History
 from torch_panda.envs.hooks import TaskHooks
+from torch_panda.envs.observer import EpisodeObserver, Observed
 from torch_panda.envs.scene import TaskScene
 from torch_panda.envs.seeds import EpisodeSeeds, integer
-from torch_panda.envs.start import draw_start
-from torch_panda.envs.state import GivenState, check_rotations, read_state
+from torch_panda.envs.start import EpisodeStarts
+from torch_panda.envs.state import GivenState, read_state
 from torch_panda.envs.variation import Variation
 from torch_panda.randomization import Randomization
-from torch_panda.rendering import (
-    Camera,
-    RendererName,
-    VectorRenderer,
-    Window,
-    check_renderer,
-    segmentation_ids,
-)
+from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
-from torch_panda.sensors import Observer, Sensor, join_entries, read_sensors
+from torch_panda.sensors import Sensor, read_sensors
 from torch_panda.tasks import Task
 
-if TYPE_CHECKING:  # needs an extra
-    from torch_panda.rendering.web_viewer import WebViewer
-
 OnDivergence = Literal["raise", "reset"]
-
-Observed = dict[str, Tensor]  # by entry, (n, ...), in new tensors
 
 
 class Episodes(Closing):
@@ -53,6 +42,13 @@ class Episodes(Closing):
     and only actions and states that are given have the batch shape ().
 
     A call while another thread is in it raises `BulletError`.
+
+    Attributes:
+        simulation: the clients and their state.
+        build_scene: builds a scene as they hold it.
+        renderer: draws them.
+        seeds: of the episodes.
+        entries: what is observed beyond state and goals, by key.
     """
 
     @torch.inference_mode(False)  # or its tensors could only be changed in that mode
@@ -98,35 +94,42 @@ class Episodes(Closing):
         self.is_closed = False
         self._guard = ThreadGuard()
         self._never_reset = set(range(n))
-        self._step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
-        self._goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
+        goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
         sensors = read_sensors(sensors, robot)
-        self._build_scene = TaskScene(robot, task, sensors)
+        self.build_scene = TaskScene(robot, task, sensors)
         self.simulation = VectorSimulation(
-            self._build_scene, n, num_threads=num_threads, physics=self.physics
+            self.build_scene, n, num_threads=num_threads, physics=self.physics
         )
         try:
-            check_functions(robot, task, self.simulation, self._goal)
-            self._renderer = VectorRenderer(
-                self.simulation, self._build_scene, renderer=renderer
+            check_functions(robot, task, self.simulation, goal)
+            self.renderer = VectorRenderer(
+                self.simulation, self.build_scene, renderer=renderer
             )
-            self._readings = [
-                sensor.attach(self.simulation, self._renderer, robot)
-                for sensor in sensors
-            ]
-            self._hooks = TaskHooks(task, self.simulation, robot.action_dim)
-            self._variation = Variation(
+            hooks = TaskHooks(task, self.simulation, robot.action_dim)
+            variation = Variation(
                 randomize,
                 robot,
                 task,
                 self.simulation,
                 self.physics,
-                has_hook=self._hooks.randomizes,
+                has_hook=hooks.randomizes,
             )
-            observers: list[Observer] = [*self._readings, self._hooks, self._variation]
-            self.entries = join_entries(observers)
-            self._observers = [each for each in observers if each.entries]
-            self._history = History(self._state(), robot.action_dim)
+            self._starts = EpisodeStarts(
+                robot, task, self.simulation, variation, self.seeds, goal
+            )
+            self._observer = EpisodeObserver(
+                robot,
+                task,
+                self.simulation,
+                self.renderer,
+                sensors=sensors,
+                hooks=hooks,
+                variation=variation,
+                max_episode_steps=self.max_episode_steps,
+                terminate_on_success=terminate_on_success,
+            )
+            self.entries = self._observer.entries
+            self._history = History(self._starts.state(), robot.action_dim)
         except BaseException:
             self.simulation.close()
             raise
@@ -135,11 +138,6 @@ class Episodes(Closing):
     def num_envs(self) -> int:
         """Number of environments, n."""
         return self.simulation.num_envs
-
-    @property
-    def segmentation_ids(self) -> dict[str, int]:
-        """What the numbers in segmentations stand for; see `RobotTaskEnv`."""
-        return segmentation_ids(self._build_scene)
 
     # ---- start, act, observe -----------------------------------------------------
 
@@ -172,14 +170,15 @@ class Episodes(Closing):
                 given = read_state(
                     state,
                     batch_shape=self.batch_shape,
-                    like=self._state(),
+                    like=self._starts.state(),
                     envs=envs,
                     action_dim=self.robot.action_dim,
                 )
-                self._check_goal(given.values, envs)
+                if self.simulation.scene.markers and "desired_goal" in given.values:
+                    self._starts.check_goal(given.values["desired_goal"], envs)
             for env in envs:
                 self._draw_start(env)
-            tensors = self._state()
+            tensors = self._starts.state()
             for key, value in (given.start or given.values).items():
                 tensors[key][envs] = value
             self._place(envs)
@@ -212,19 +211,14 @@ class Episodes(Closing):
             self._check_was_reset()
             action = read_action(action, (*self.batch_shape, self.robot.action_dim))
             envs = None if stepped is None else indices(stepped)
-            self._step_count += 1 if stepped is None else stepped
+            self._starts.step_count += 1 if stepped is None else stepped
             self._history.append(action, stepped)
             self._act(action, envs)
             if diverged := self.simulation.diverged():
                 self._recover(diverged)
-            for reading in self._readings:
-                reading.after_step(range(self.num_envs) if envs is None else envs)
+            self._observer.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe()
-            goals = observed["achieved_goal"], observed["desired_goal"]
-            if self._hooks.reward is None:
-                reward = self.task.compute_reward(*goals).float()
-            else:
-                reward = self._hooks.reward(action, *goals).float()
+            reward = self._observer.reward(action, observed)
             observed["reward"] = reward if stepped is None else reward * stepped
             return observed
 
@@ -232,109 +226,64 @@ class Episodes(Closing):
         """The physical state; see `RobotTaskEnv.get_state`."""
         with self._guard:
             self._check_was_reset()
-            state = {key: value.clone() for key, value in self._state().items()}
+            state = {key: value.clone() for key, value in self._starts.state().items()}
             return {**state, **self._history.export()} if exact else state
 
-    def render(self, envs: Sequence[int], camera: Camera) -> Tensor:
-        """Draw environments as they are: (len(envs), height, width, 3) uint8.
+    def watch(self) -> Observed:
+        """What a viewer says of the environments as they are: goals and success.
+
+        Raises:
+            BulletError: the environment is closed or was never reset.
+        """
+        self._check_was_reset()
+        return self._observer.watch(self._starts.goal, self._starts.step_count)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other threads out, as from `reset` and `step`.
 
         Raises:
             BulletError: the environment is closed, or another thread is in it.
-            ValueError: an index is out of range, or its environment was never reset.
-            TypeError: an index is no integer.
         """
         with self._guard:
             self._check_open()
-            for env in envs:
-                known = integer("an index", env) in range(self.num_envs)
-                if not known or env in self._never_reset:
-                    raise ValueError(f"there is no environment {env} that was reset")
-            return self._renderer.picture(envs, camera)
+            yield
 
-    def open_window(self, camera: Camera) -> Window:
-        """Open pybullet's GUI; see `RobotTaskEnv.open_window`."""
-        with self._guard:
-            self._check_open()
-            return Window(self.simulation, self._build_scene, camera)
+    def check_picture(self, env: int) -> None:
+        """Make sure that there is an environment to be drawn.
 
-    def open_viewer(self, camera: Camera, host: str, port: int) -> "WebViewer":
-        """Serve the scene to browsers; see `RobotTaskEnv.open_viewer`."""
-        if find_spec("viser") is None:
-            raise ImportError("viewers need viser: pip install -e '.[viewer]'")
-        from torch_panda.rendering.web_viewer import WebViewer
-
-        with self._guard:
-            self._check_open()
-            return WebViewer(
-                self.simulation,
-                self._watched,
-                max_episode_steps=self.max_episode_steps,
-                title=type(self.task).__name__,
-                camera=camera,
-                host=host,
-                port=port,
-            )
+        Raises:
+            ValueError: an index is out of range, or its environment was never reset.
+            TypeError: it is no integer.
+        """
+        known = integer("an index", env) in range(self.num_envs)
+        if not known or env in self._never_reset:
+            raise ValueError(f"there is no environment {env} that was reset")
 
     def close(self) -> None:
         """Free all clients and threads. Closing again does nothing."""
         with self._guard:
             if not self.is_closed:
                 self.is_closed = True
-                self._renderer.close()
+                self.renderer.close()
                 self.simulation.close()
 
     # ---- parts -------------------------------------------------------------------
 
-    def _state(self) -> dict[str, Tensor]:
-        """The tensors that hold the physical state, (n, ...); not copies."""
-        simulation = self.simulation
-        state = {
-            "joint_position": simulation.joint_position,
-            "joint_velocity": simulation.joint_velocity,
-            "object_pose": simulation.object_pose,
-            "object_velocity": simulation.object_velocity,
-            "desired_goal": self._goal,
-            "step_count": self._step_count,
-            **self._variation.state,
-        }
-        if any(simulation.scene.object_joints):
-            state["object_joint_position"] = simulation.object_joint_position
-            state["object_joint_velocity"] = simulation.object_joint_velocity
-        return state
-
-    def _watched(self) -> Observed:
-        """What a viewer says of the environments as they are, (n, ...)."""
-        self._check_was_reset()
-        achieved_goal = self.task.achieved_goal(self.simulation).float()
-        desired_goal = self._goal.float()
-        return {
-            "step_count": self._step_count,
-            "achieved_goal": achieved_goal,
-            "desired_goal": desired_goal,
-            "success": self.task.is_success(achieved_goal, desired_goal),
-        }
-
     def _draw_start(self, env: int) -> None:
         """Put the start of an environment's next episode into the state tensors."""
         self._never_reset.discard(env)
-        self._step_count[env] = 0
-        rng = self.seeds.next_generator(env)
-        draw_start(env, rng, self.robot, self.task, self.simulation, self._goal)
-        if self._variation.is_on:
-            self._variation.draw(env, self.seeds.physics_seed(env))
+        self._starts.draw(env)
 
     def _place(self, envs: list[int]) -> None:
-        """Put robots, objects and markers where the state tensors say."""
-        simulation = self.simulation
-        if simulation.scene.markers:
-            pose = self.task.marker_pose(self._goal[envs])
-            check_rotations("desired_goal", pose, envs)
-            simulation.marker_pose[envs] = pose
-        self._history.begin(envs, self._state())
-        varies = self._variation.changes_physics
-        simulation.reset(envs, self._variation.apply if varies else None)
-        for reading in self._readings:
-            reading.after_reset(envs)
+        """Put environments where the state tensors say."""
+        self._starts.mark(envs)
+        self._history.begin(envs, self._starts.state())
+        self._starts.place(envs)
+        self._observer.after_reset(envs)
+
+    def _observe(self) -> Observed:
+        return self._observer.observe(self._starts.goal, self._starts.step_count)
 
     def _act(self, action: Tensor, envs: Sequence[int] | None) -> None:
         """Advance physics by a step."""
@@ -348,10 +297,9 @@ class Episodes(Closing):
             stepped[acting] = True
             self._history.append(action, stepped)
             self._act(action, acting)
-            for reading in self._readings:
-                reading.after_step(last)
-        self._step_count[envs] = given.values["step_count"]
-        given.check_arrival(envs, self._state())
+            self._observer.after_step(last)
+        self._starts.step_count[envs] = given.values["step_count"]
+        given.check_arrival(envs, self._starts.state())
 
     def _recover(self, envs: list[int]) -> None:
         """Start the next episode of environments whose physics has diverged."""
@@ -364,44 +312,9 @@ class Episodes(Closing):
                 f"the physics of environments {envs} diverged: their state was not "
                 f"finite; they are at the start of their next episode"
             )
-        self._step_count[envs] = self.max_episode_steps
-
-    def _observe(self) -> Observed:
-        """Observation, goals, success and ends, (n, ...), in new tensors."""
-        simulation, task = self.simulation, self.task
-        observation = torch.cat(
-            (self.robot.observation(simulation), task.observation(simulation)), dim=1
-        )
-        achieved_goal = task.achieved_goal(simulation).float()
-        desired_goal = self._goal.float()
-        success = task.is_success(achieved_goal, desired_goal)
-        truncated = self._step_count >= self.max_episode_steps
-        terminated = torch.zeros_like(success)
-        if self.terminate_on_success:
-            terminated = success & (self._step_count > 0)
-        if self._hooks.failure is not None:
-            terminated = terminated | self._hooks.failure() & (self._step_count > 0)
-        observed: Observed = {}
-        for observer in self._observers:
-            observed |= observer.observe()
-        return {
-            **observed,
-            "observation": observation.float(),
-            "achieved_goal": achieved_goal,
-            "desired_goal": desired_goal,
-            "success": success,
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-        }
+        self._starts.step_count[envs] = self.max_episode_steps
 
     # ---- checks ------------------------------------------------------------------
-
-    def _check_goal(self, given: Mapping[str, Tensor], envs: list[int]) -> None:
-        """Make sure that a given goal, (k, goal_dim), is one that markers can show."""
-        if self.simulation.scene.markers and "desired_goal" in given:
-            pose = self.task.marker_pose(given["desired_goal"])
-            check_rotations("desired_goal", pose, envs)
 
     def _check_open(self) -> None:
         if self.is_closed:

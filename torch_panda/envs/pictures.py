@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.envs.episodes import Episodes
-from torch_panda.rendering import Camera, Window
+from torch_panda.rendering import Camera, Window, segmentation_ids
 from torch_panda.rendering.camera import resized
 
 if TYPE_CHECKING:  # needs an extra
@@ -36,7 +37,7 @@ class PicturedEnv:
         ``nothing`` (-1), ``robot``, ``ground``, ``table``, and ``object``, or
         ``object1`` and ``object2``, unless the task's visuals name bodies otherwise.
         """
-        return self.episodes.segmentation_ids
+        return segmentation_ids(self.episodes.build_scene)
 
     def render(
         self,
@@ -58,16 +59,19 @@ class PicturedEnv:
             (height, width, 3) for one index or an environment of batch size [].
 
         Raises:
-            BulletError: the environment is closed.
+            BulletError: the environment is closed, or another thread is in it.
             ValueError: an index is out of range, or its environment was never reset.
             TypeError: an index is no integer.
         """
-        camera = resized(camera or Camera(), size)
+        camera, episodes = resized(camera or Camera(), size), self.episodes
         if envs is None:
-            chosen, single = range(self.episodes.num_envs), self.num_envs is None
+            chosen, single = range(episodes.num_envs), self.num_envs is None
         else:
             chosen, single = np.atleast_1d(envs).tolist(), np.ndim(envs) == 0
-        pixels = self.episodes.render(chosen, camera).to(self.device)
+        with episodes.held():
+            for env in chosen:
+                episodes.check_picture(env)
+            pixels = episodes.renderer.picture(chosen, camera).to(self.device)
         return pixels[0] if single else pixels
 
     def open_window(self, camera: Camera | None = None) -> Window:
@@ -81,7 +85,9 @@ class PicturedEnv:
         Raises:
             BulletError: there is no display, or the environment is closed.
         """
-        return self.episodes.open_window(camera or Camera())
+        episodes = self.episodes
+        with episodes.held():
+            return Window(episodes.simulation, episodes.build_scene, camera or Camera())
 
     def open_viewer(
         self,
@@ -105,4 +111,18 @@ class PicturedEnv:
             ImportError: viser is not installed.
             BulletError: the environment is closed.
         """
-        return self.episodes.open_viewer(camera or Camera(), host, port)
+        if find_spec("viser") is None:
+            raise ImportError("viewers need viser: pip install -e '.[viewer]'")
+        from torch_panda.rendering.web_viewer import WebViewer
+
+        episodes = self.episodes
+        with episodes.held():
+            return WebViewer(
+                episodes.simulation,
+                episodes.watch,
+                max_episode_steps=episodes.max_episode_steps,
+                title=type(episodes.task).__name__,
+                camera=camera or Camera(),
+                host=host,
+                port=port,
+            )

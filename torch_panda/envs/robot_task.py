@@ -10,7 +10,8 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.closing import Closing
 from torch_panda.envs.checks import check_device
-from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
+from torch_panda.envs.episodes import Episodes, OnDivergence, indices
+from torch_panda.envs.observer import Observed
 from torch_panda.envs.persistence import PersistentEnv
 from torch_panda.envs.pictures import PicturedEnv
 from torch_panda.envs.specs import Specs

@@ -1,59 +1,120 @@
-"""Drawing the start of an episode."""
+"""The starts of episodes, and the tensors of the state that they are put into."""
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
-from torch_panda.envs.state import QUATERNION_TOLERANCE
+from torch_panda.envs.seeds import EpisodeSeeds
+from torch_panda.envs.state import QUATERNION_TOLERANCE, check_rotations
+from torch_panda.envs.variation import Variation
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 
 
-def draw_start(
-    env: int,
-    rng: np.random.Generator,
-    robot: Robot,
-    task: Task,
-    simulation: VectorSimulation,
-    goal: Tensor,
-) -> None:
-    """Put the start of an environment's next episode into the state tensors.
+class EpisodeStarts:
+    """Draws the starts of n environments' episodes, and puts these there.
 
     Args:
-        env: which environment.
-        rng: of this episode.
         robot: starts neutral.
         task: draws goal, objects and their joints.
-        simulation: receives the state.
-        goal: (n, goal_dim), receives the goal.
+        simulation: the environments.
+        variation: draws their physics.
+        seeds: of the episodes.
+        goal: (n, goal_dim) float64, the desired goals of the present episodes.
 
-    Raises:
-        ValueError: the task draws a wrong shape, or what is not finite or no rotation.
+    Attributes:
+        goal: the same.
+        step_count: (n, 1) int64, steps of the present episodes.
     """
-    own = type(task).sample_start is not Task.sample_start
-    start = task.sample_start(rng)
-    _fill(goal[env], start.goal, "sample_start" if own else "sample_goal")
-    simulation.joint_position[env] = _double(robot.neutral_joint_position)
-    simulation.joint_velocity[env] = 0.0
-    if simulation.scene.objects:
-        function = "sample_start" if own else "sample_objects"
-        pose = simulation.object_pose
-        _fill(pose[env], start.object_pose, function)
-        for *_, x, y, z, w in pose[env].tolist():
-            if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
-                raise ValueError(
-                    f"{function} must return unit quaternions, got {[x, y, z, w]}"
-                )
-        simulation.object_velocity[env] = 0.0
-    if any(simulation.scene.object_joints):
-        joints = simulation.object_joint_position[env]
-        drawn = _double(start.object_joint_position)
-        drawn = drawn.expand_as(joints) if drawn.shape == (1,) else drawn
-        _fill(joints, drawn, "sample_start" if own else "sample_object_joints")
-        simulation.object_joint_velocity[env] = 0.0
+
+    def __init__(
+        self,
+        robot: Robot,
+        task: Task,
+        simulation: VectorSimulation,
+        variation: Variation,
+        seeds: EpisodeSeeds,
+        goal: Tensor,
+    ) -> None:
+        self._robot, self._task, self._simulation = robot, task, simulation
+        self._variation = variation
+        self._seeds = seeds
+        self._own = type(task).sample_start is not Task.sample_start
+        self.goal = goal
+        self.step_count = torch.zeros(len(goal), 1, dtype=torch.int64, device="cpu")
+
+    def state(self) -> dict[str, Tensor]:
+        """The tensors that hold the physical state, (n, ...); not copies."""
+        simulation = self._simulation
+        state = {
+            "joint_position": simulation.joint_position,
+            "joint_velocity": simulation.joint_velocity,
+            "object_pose": simulation.object_pose,
+            "object_velocity": simulation.object_velocity,
+            "desired_goal": self.goal,
+            "step_count": self.step_count,
+            **self._variation.state,
+        }
+        if any(simulation.scene.object_joints):
+            state["object_joint_position"] = simulation.object_joint_position
+            state["object_joint_velocity"] = simulation.object_joint_velocity
+        return state
+
+    def draw(self, env: int) -> None:
+        """Put the start of an environment's next episode into the state tensors.
+
+        Raises:
+            ValueError: the task draws a wrong shape, or what is not finite or no
+                rotation.
+        """
+        self.step_count[env] = 0
+        start = self._task.sample_start(self._seeds.next_generator(env))
+        simulation = self._simulation
+        _fill(self.goal[env], start.goal, self._drawn_by("sample_goal"))
+        simulation.joint_position[env] = _double(self._robot.neutral_joint_position)
+        simulation.joint_velocity[env] = 0.0
+        if simulation.scene.objects:
+            function, pose = self._drawn_by("sample_objects"), simulation.object_pose
+            _fill(pose[env], start.object_pose, function)
+            for *_, x, y, z, w in pose[env].tolist():
+                if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
+                    raise ValueError(
+                        f"{function} must return unit quaternions, got {[x, y, z, w]}"
+                    )
+            simulation.object_velocity[env] = 0.0
+        if any(simulation.scene.object_joints):
+            joints = simulation.object_joint_position[env]
+            drawn = _double(start.object_joint_position)
+            drawn = drawn.expand_as(joints) if drawn.shape == (1,) else drawn
+            _fill(joints, drawn, self._drawn_by("sample_object_joints"))
+            simulation.object_joint_velocity[env] = 0.0
+        if self._variation.is_on:
+            self._variation.draw(env, self._seeds.physics_seed(env))
+
+    def check_goal(self, goal: Tensor, envs: list[int]) -> Tensor:
+        """Where markers show goals (k, goal_dim) of these environments, (k, m, 7).
+
+        Raises:
+            ValueError: a goal turns its marker by what is no rotation.
+        """
+        pose = self._task.marker_pose(goal)
+        check_rotations("desired_goal", pose, envs)
+        return pose
+
+    def mark(self, envs: list[int]) -> None:
+        """Say where markers are to be put: where the goals are; see `check_goal`."""
+        if self._simulation.scene.markers:
+            self._simulation.marker_pose[envs] = self.check_goal(self.goal[envs], envs)
+
+    def place(self, envs: list[int]) -> None:
+        """Put robots, objects and markers where the state tensors say."""
+        varies = self._variation.changes_physics
+        self._simulation.reset(envs, self._variation.apply if varies else None)
+
+    def _drawn_by(self, function: str) -> str:
+        return "sample_start" if self._own else function
 
 
 def _double(values: object) -> Tensor:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -17,30 +17,13 @@ from torch_panda.bullet import (
     VectorSimulation,
 )
 from torch_panda.bullet.checks import check_quaternion
-from torch_panda.bullet.control import ArmMode
 from torch_panda.bullet.urdf import Tool
+from torch_panda.robots.control_type import ACTION_SCALES, ARM_MODES, ControlType
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
     quaternion_product,
     rotation_vector_to_quaternion,
 )
-
-ControlType = Literal["ee", "ee_pose", "joints", "joint_velocity", "joint_torque"]
-
-# What an action of 1 is: the end-effector's or a joint's displacement [m] or [rad], or
-# a joint's velocity, so that it moves as far in a step of 40 ms [rad/s], or a part of
-# the force that its motor may exert.
-ACTION_SCALES: dict[ControlType, float] = {
-    "ee": 0.05,
-    "ee_pose": 0.05,
-    "joints": 0.05,
-    "joint_velocity": 1.25,
-    "joint_torque": 1.0,
-}
-_ARM_MODES: dict[ControlType, ArmMode] = {
-    "joint_velocity": "velocity",
-    "joint_torque": "torque",
-}
 
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
@@ -279,7 +262,7 @@ class Robot:
             return MotorControl(forces, self.ee_link, self.ee_orientation, arm)
         if self.control_type == "ee_pose":
             return MotorControl(forces, self.ee_link, num_arm_joints=arm)
-        mode = _ARM_MODES.get(self.control_type, "position")
+        mode = ARM_MODES.get(self.control_type, "position")
         return MotorControl(forces, num_arm_joints=arm, arm_mode=mode)
 
     @property

@@ -3,13 +3,8 @@
 from collections.abc import Sequence
 
 from torch_panda.bullet import PhysicsClient
-from torch_panda.robots.base import (
-    ABOVE_THE_TABLE,
-    NO_ROTATION,
-    ControlType,
-    Robot,
-    Workspace,
-)
+from torch_panda.robots.base import ABOVE_THE_TABLE, NO_ROTATION, Robot, Workspace
+from torch_panda.robots.control_type import ControlType
 from torch_panda.robots.gripper import Gripper
 
 # The same in panda-gym 1.1.0 and 3.0.7.

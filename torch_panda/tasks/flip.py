@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
-from torch_panda.rotations import NO_ROTATION
+from torch_panda.rotations import NO_ROTATION, rotation_distance
 from torch_panda.tasks.base import (
     Bodies,
     RewardType,
@@ -100,4 +100,4 @@ class Flip(Task):
 
     def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """1 - <q, q'>^2, in [0, 1]: (..., 1)."""
-        return 1 - (achieved_goal * desired_goal).sum(-1, keepdim=True).square()
+        return rotation_distance(achieved_goal, desired_goal)
