@@ -19,6 +19,7 @@ ROOMS = (
     ("envs",),
     ("noise",),
     ("versions",),
+    ("ids",),
     ("registry",),
     ("gymnasium_envs",),
 )
