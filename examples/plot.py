@@ -1,10 +1,10 @@
-"""Draw success curves: a column a task, a row an algorithm, a line a way to train it.
+"""Draw success curves: a panel a task, a line an algorithm and a way to train it.
 
     python examples/plot.py runs --out curves.png
 
 Reads every folder below the given ones that holds a run (args.json and curve.csv).
 Draws the median and the interquartile range over the seeds, as the panda-gym paper. A
-panel has four lines at most: what is more goes on in another row.
+panel has four lines at most: a task with more has a panel for each algorithm.
 """
 
 import csv
@@ -24,12 +24,14 @@ import tyro
 Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
 LINES = 4  # of a panel, at most
+COLUMNS = 3  # of panels, at most
 # Okabe and Ito's, which can be told apart by everybody; then with other dashes.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 DASHES = ("-", "--", ":", "-.")
 
-# Of the seeds: by line, within an algorithm, within a task.
-Runs = dict[str, dict[str, dict[str, list[Curve]]]]
+Lines = dict[str, list[Curve]]  # of the seeds, by name
+# By way to train, within an algorithm, within a task.
+Runs = dict[str, dict[str, Lines]]
 
 
 def plot_curve(curve: Curve, title: str, path: Path) -> None:
@@ -49,35 +51,46 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
         metric: the column to draw.
         path: where to write the picture.
     """
-    lines = sorted(
-        {x for task in runs.values() for algo in task.values() for x in algo}
-    )
-    looks = {x: next_look(i) for i, x in enumerate(lines)}
-    columns = []  # of tasks, each a list of panels
-    for task, algorithms in sorted(runs.items()):
-        panels = []
-        for algo, curves in sorted(algorithms.items()):
-            names = sorted(curves)
-            for first in range(0, len(names), LINES):
-                some = {name: curves[name] for name in names[first : first + LINES]}
-                panels.append((f"{task}, {algo}", some))
-        columns.append(panels)
-    height = max(map(len, columns))
+    panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
+    names = sorted({name for _, lines in panels for name in lines})
+    looks = {name: next_look(i) for i, name in enumerate(names)}
+    width = min(COLUMNS, len(panels))
+    height = -(-len(panels) // width)
     figure, grid = plt.subplots(
         height,
-        len(columns),
-        figsize=(4.2 * len(columns), 4.0 * height),  # legends are below
+        width,
+        figsize=(4.2 * width, 4.0 * height),  # legends are below
         squeeze=False,
         layout="constrained",
     )
-    for column, panels in enumerate(columns):
-        for axes in grid[len(panels) :, column]:
-            axes.remove()
-        for axes, (title, curves) in zip(grid[:, column], panels, strict=False):
-            draw_panel(axes, curves, metric, looks)
-            _label(axes, title, metric)
+    for axes in grid.flat[len(panels) :]:
+        axes.remove()
+    for axes, (title, lines) in zip(grid.flat, panels, strict=False):
+        draw_panel(axes, lines, metric, looks)
+        _label(axes, title, metric)
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
+    """The panels of a task: titles, and at most `LINES` lines in each.
+
+    All algorithms share one where they fit, else each has its own.
+    """
+    together = {
+        f"{algo}, {way}": curves
+        for algo, ways in sorted(algorithms.items())
+        for way, curves in sorted(ways.items())
+    }
+    if len(together) <= LINES:
+        return [(task, together)]
+    panels = []
+    for algo in sorted(algorithms):
+        own = {name: together[name] for name in together if name.startswith(f"{algo},")}
+        for first in range(0, len(own), LINES):
+            some = dict(list(own.items())[first : first + LINES])
+            panels.append((f"{task}, {algo}", some))
+    return panels
 
 
 def next_look(number: int) -> dict[str, str]:
@@ -88,7 +101,7 @@ def next_look(number: int) -> dict[str, str]:
 
 def draw_panel(
     axes: plt.Axes,
-    lines: dict[str, list[Curve]],
+    lines: Lines,
     metric: Metric,
     looks: dict[str, dict[str, str]],
 ) -> None:

@@ -83,7 +83,7 @@ def test_a_panel_has_four_lines_that_can_be_told_apart(tmp_path, figures):
         panels.setdefault(axes.get_title(), []).append(axes)
     assert {name: list(map(lines_of, some)) for name, some in panels.items()} == {
         f"Panda{task}-v1, {algo}": [
-            [f"{line} (2 seeds)" for line in lines] for lines in expected
+            [f"{algo}, {line} (2 seeds)" for line in lines] for lines in expected
         ]
         for task in ("Push", "Slide")
         for algo, expected in {
@@ -99,7 +99,32 @@ def test_a_panel_has_four_lines_that_can_be_told_apart(tmp_path, figures):
         for line in axes.lines:
             look = (line.get_color(), line.get_linestyle())
             assert looks.setdefault(line.get_label(), look) == look
-    assert len(set(looks.values())) == len(looks) == 6
+    assert len(set(looks.values())) == len(looks) == 9
+
+
+def test_algorithms_share_a_panel_where_they_fit(tmp_path, figures):
+    for env_id, algo in (("PandaPush-v1", "sac"), ("PandaPush-v1", "td3")):
+        for her in ("relabel", "none"):
+            args = Args(env_id=env_id, algo=algo, her=her)
+            write_run(tmp_path / f"{env_id}-{algo}-{her}", args)
+    for task in ("Reach", "Slide", "Stack"):
+        write_run(tmp_path / task, Args(env_id=f"Panda{task}-v1"))
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    first, *others = figures[0].axes
+    assert first.get_title() == "PandaPush-v1"
+    assert lines_of(first) == [
+        f"{line} (1 seed)"
+        for line in (
+            "SAC, paper",
+            "SAC, paper, no her",
+            "TD3, paper",
+            "TD3, paper, no her",
+        )
+    ]
+    titles = [axes.get_title() for axes in others]
+    assert titles == ["PandaReach-v1", "PandaSlide-v1", "PandaStack-v1"]
+    rows = {round(axes.get_position().y0, 2) for axes in figures[0].axes}
+    assert len(rows) == 2  # three panels are side by side
 
 
 def test_band_over_the_steps_that_all_seeds_have(tmp_path, figures):
