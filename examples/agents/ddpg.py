@@ -19,6 +19,10 @@ from agents.networks import make_mlp
 from agents.transitions import Transitions
 from torch_panda import RobotTaskEnv
 
+# Weight of the squares of what enters the actor's tanh: where tanh is flat no gradient
+# is left, and policies of Slide were lost so (arXiv 1707.01495, appendix A).
+SATURATION_L2 = 0.01
+
 
 class DDPG(Agent):
     """One critic, whose gradient by the action trains a deterministic actor."""
@@ -84,9 +88,12 @@ class DDPG(Agent):
         if self.updates % self.actor_interval:
             return {"critic_loss": critic_loss}
 
-        action = self.actor(state)
+        before_tanh = self.actor[0](state)
+        action = before_tanh.tanh()
         value = self.critics[0](state, action)
-        actor_loss = self.hp.action_l2 * action.square().mean() - value.mean()
+        penalty = self.hp.action_l2 * action.square().mean()
+        penalty = penalty + SATURATION_L2 * before_tanh.square().mean()
+        actor_loss = penalty - value.mean()
         if num_demos:
             demos = slice(-num_demos, None)
             actor_loss = actor_loss + imitation_loss(

@@ -12,6 +12,7 @@ from torchrl.objectives import DDPGLoss, TD3Loss
 import torch_panda
 from agents import AGENTS, Hyperparameters, make_agent
 from agents.base import TAU
+from agents.ddpg import SATURATION_L2
 from agents.td3 import NOISE_CLIP, POLICY_NOISE
 from tests.examples.agents.transitions import make_transitions
 
@@ -57,6 +58,12 @@ def as_modules(agent):
     return actor, [TensorDictModule(copy.deepcopy(c), *keys) for c in agent.critics]
 
 
+def saturation(agent, batch):
+    """What our actor's loss has beside torchrl's, where there is no action L2."""
+    state = agent.normalizer(batch["observation"], batch["desired_goal"])
+    return SATURATION_L2 * agent.actor[0](state).square().mean().detach()
+
+
 def test_ddpg_has_torchrls_losses(env):
     agent = make(env, "ddpg", action_l2=0.0)
     batch = make_transitions(env, 64)
@@ -65,9 +72,10 @@ def test_ddpg_has_torchrls_losses(env):
     loss.make_value_estimator(gamma=agent.gamma)
     agent.lowest = None  # torchrl does not clip targets
     theirs = loss(normalized(agent, batch.clone()))
+    penalty = saturation(agent, batch)
     ours = agent.update(batch)
     torch.testing.assert_close(ours["critic_loss"], theirs["loss_value"])
-    torch.testing.assert_close(ours["actor_loss"], theirs["loss_actor"])
+    torch.testing.assert_close(ours["actor_loss"], theirs["loss_actor"] + penalty)
 
 
 @pytest.mark.parametrize("double_q", [True, False])
@@ -92,10 +100,11 @@ def test_td3_has_torchrls_losses(env, double_q):
     # They draw the targets' noise first, too.
     theirs = loss.value_loss(normalized(agent, batch.clone()))[0]
     policy_loss = loss.actor_loss(normalized(agent, batch.clone()))[0]
+    penalty = saturation(agent, batch)
     torch.manual_seed(1)
     ours = agent.update(batch)
     torch.testing.assert_close(ours["critic_loss"], theirs)
-    torch.testing.assert_close(ours["actor_loss"], policy_loss)
+    torch.testing.assert_close(ours["actor_loss"], policy_loss + penalty)
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])
