@@ -119,7 +119,8 @@ def main(args: Args) -> None:
         if args.policy not in ("random", "expert"):
             if not Path(args.policy).exists():
                 raise ValueError(
-                    f"a policy is random, expert or a run, got {args.policy!r}"
+                    "a policy is random, expert, or the folder or checkpoint of a run, "
+                    f"such as examples/policies/PandaPush-v1.pt, got {args.policy!r}"
                 )
             checkpoint = read_checkpoint(Path(args.policy))
         env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")

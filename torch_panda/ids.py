@@ -118,8 +118,9 @@ of panda-gym, -v1 only for Drawer and PegInsertion,
 def describe_ids() -> str:
     """The patterns of the shipped ids, for errors."""
     both = ",".join(task for task in _TASKS if task not in _OWN_TASKS)
-    others = sorted({f"{robot.__name__}{task}-v1" for robot, task, _ in _ROBOTS})
+    others = sorted({f"{robot.__name__}{task}" for robot, task, _ in _ROBOTS})
     return (
         f"Panda{{{both}}}{{,Joints}}{{,Dense}}-v{{1,3}}, "
-        f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1, " + ", ".join(others)
+        f"Panda{{{','.join(_OWN_TASKS)}}}{{,Joints}}{{,Dense}}-v1, "
+        f"{{{','.join(others)}}}{{,Dense}}-v1"
     )

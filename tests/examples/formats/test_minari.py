@@ -8,7 +8,9 @@ import torch_panda
 from tests.examples.formats.learning import imitate, record
 from training.demonstrations import read_demos
 
-minari = pytest.importorskip("minari", reason="needs the extra minari")
+minari = pytest.importorskip(
+    "minari", reason="needs the extra minari, which takes Python 3.11 or newer"
+)
 
 EPISODES = 3
 
