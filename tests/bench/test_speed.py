@@ -1,4 +1,4 @@
-"""Steps per second, memory and creation: pytest -m slow -s tests/test_speed.py."""
+"""Steps per second, memory and creation: pytest -m slow -s <this file>."""
 
 import statistics
 import subprocess

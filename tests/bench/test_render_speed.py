@@ -1,4 +1,4 @@
-"""Frames per second beside panda-gym: pytest -m slow -s tests/test_render_speed.py."""
+"""Frames per second beside panda-gym: pytest -m slow -s <this file>."""
 
 import statistics
 import time

@@ -1,6 +1,6 @@
 """Collection with Stable-Baselines3, ours and panda-gym's environments in turn.
 
-``OMP_NUM_THREADS=1 pytest -m slow -s tests/gymnasium_envs/test_sb3_speed.py``
+``OMP_NUM_THREADS=1 pytest -m slow -s tests/bench/test_sb3_speed.py``
 """
 
 import os
