@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
-from limits import Positive, Seed, check_limits
+from limits import Finite, Positive, Seed, check_limits
 from torch_panda import PhysicsName
 from training.policies import load_policy, read_checkpoint
 
@@ -86,7 +86,7 @@ class Args:
     """threads that step them; None means one per core"""
     seed: Seed = 1_000
     """of the environments"""
-    task_options: dict[str, float] = field(default_factory=dict)
+    task_options: dict[str, Finite] = field(default_factory=dict)
     """numbers of the task that are others than in training, such as `play 0.0005`"""
     physics: PhysicsName = "exact"
     """how Bullet integrates: as panda-gym, or faster and coarser"""

@@ -5,7 +5,7 @@ A limit is part of an option's type, such as ``batch_size: Positive``.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
 from typing import Annotated, Any, get_args, get_type_hints
 
 import torch
@@ -25,6 +25,7 @@ Seed = Annotated[int, Limit("from 0 to 2**64 - 1", lambda x: 0 <= x < 2**64)]
 Weight = Annotated[float, Limit("at least 0 and finite", lambda x: 0 <= x < inf)]
 Factor = Annotated[float, Limit("at least 1 and finite", lambda x: 1 <= x < inf)]
 Ratio = Annotated[float, Limit("from 0 to 1", lambda x: 0 <= x <= 1)]
+Finite = Annotated[float, Limit("finite", isfinite)]
 Discount = Annotated[float, Limit("above 0 and at most 1", lambda x: 0 < x <= 1)]
 
 
@@ -37,6 +38,8 @@ def check_limits(args: object) -> None:
     for name, hint in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
         numbers = value if isinstance(value, tuple) else (value,)
+        if isinstance(value, dict):
+            numbers = tuple(value.values())
         for limit in find_limits(hint):
             if not all(number is None or limit.holds(number) for number in numbers):
                 raise ValueError(f"{name} must be {limit.description}, got {value}")

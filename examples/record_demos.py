@@ -22,7 +22,7 @@ import torch_panda
 from evaluate import wilson_interval
 from experts import make_expert
 from formats import Writer, load_format
-from limits import Positive, Seed, Weight, check_limits
+from limits import Finite, Positive, Seed, Weight, check_limits
 from training.files import prepare, save
 
 
@@ -44,7 +44,7 @@ class Args:
     """the standard deviation of Gaussian noise on the actions that are executed; saved
     are the actions without it, so that who imitates them learns to correct himself
     (DART, arXiv 1703.09327)"""
-    task_options: dict[str, float] = field(default_factory=dict)
+    task_options: dict[str, Finite] = field(default_factory=dict)
     """numbers of the task that are others than the id's, such as `play 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
     """a file of a nested dict of tensors of shape (steps, ...), or a data set"""

@@ -72,6 +72,7 @@ def test_devices_that_do_not_work(tmp_path, device):
     ("script", "option", "value"),
     [
         *((evaluate, "episodes", 0), (evaluate, "num_envs", 0), (evaluate, "seed", -1)),
+        (evaluate, "task_options", {"play": nan}),
         *((record_demos, "episodes", 0), (record_demos, "num_envs", 0)),
         *((watch, "num_envs", 0), (watch, "seed", 2**64)),
     ],

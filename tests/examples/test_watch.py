@@ -32,7 +32,7 @@ def test_video_shows_every_step(tmp_path, policy):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"policy": "nothing"}, "random, expert or a run, got 'nothing'"),
+        ({"policy": "nothing"}, "random, expert, or .* a run, .* got 'nothing'"),
         ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
         ({"out": "watch.txt"}, "must end in .mp4 or .gif, got 'watch.txt'"),
         ({"env_id": "PandaPushJoints-v1"}, "no expert for 'PandaPushJoints-v1'"),
