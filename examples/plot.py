@@ -77,20 +77,20 @@ def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
 
     All algorithms share one where they fit, else each has its own.
     """
-    together = {
-        f"{algo}, {way}": curves
+    own = {
+        algo: {f"{algo}, {way}": curves for way, curves in sorted(ways.items())}
         for algo, ways in sorted(algorithms.items())
-        for way, curves in sorted(ways.items())
+    }
+    together = {
+        name: curves for lines in own.values() for name, curves in lines.items()
     }
     if len(together) <= LINES:
         return [(task, together)]
-    panels = []
-    for algo in sorted(algorithms):
-        own = {name: together[name] for name in together if name.startswith(f"{algo},")}
-        for first in range(0, len(own), LINES):
-            some = dict(list(own.items())[first : first + LINES])
-            panels.append((f"{task}, {algo}", some))
-    return panels
+    return [
+        (f"{task}, {algo}", dict(list(lines.items())[first : first + LINES]))
+        for algo, lines in own.items()
+        for first in range(0, len(lines), LINES)
+    ]
 
 
 def next_look(number: int) -> dict[str, str]:
