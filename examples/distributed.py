@@ -41,7 +41,9 @@ try:
     import ray
     from ray.exceptions import RayActorError
 except ModuleNotFoundError:
-    raise SystemExit("this needs Ray: pip install -e '.[ray]'") from None
+    raise SystemExit(
+        "this needs Ray: pip install -c .ci/constraints.txt -e '.[ray]'"
+    ) from None
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
 

@@ -36,7 +36,9 @@ def test_says_how_to_get_what_is_missing(monkeypatch):
     monkeypatch.setattr(info, "loop_name", lambda: "ctypes")
     monkeypatch.delenv("DISPLAY", raising=False)
     extras = "\n".join(info.extras())
-    assert "pip install -e '.[viewer]'" in extras
+    assert "pip install -c .ci/constraints.txt -e '.[viewer]'" in extras
+    monkeypatch.setattr(info.sys, "version_info", (3, 10))
+    assert "demonstrations): missing: needs Python 3.11" in "\n".join(info.extras())
     missing = "\n".join(info.missing())
     assert "C compiler" in missing
     assert "egl" in missing

@@ -26,15 +26,18 @@ _PACKAGES = (
 )
 
 # Extras: what they are for, and a module that each brings; see pyproject.toml.
+_INSTALL = "pip install -c .ci/constraints.txt -e"
 _EXTRAS = {
     "examples": ("training, evaluating, videos, plots", "tyro"),
     "viewer": ("env.open_viewer(), watch.py --web", "viser"),
     "minari": ("Minari data sets of demonstrations", "minari"),
-    "lerobot": ("LeRobot data sets; in an environment of its own", "lerobot"),
+    "lerobot": ("LeRobot data sets; see examples/README.md", "lerobot"),
     "ray": ("training on many machines", "ray"),
     "bench": ("python -m torch_panda bench", "tqdm"),
     "fetch": ("bench beside the Fetch robot on MuJoCo", "gymnasium_robotics"),
 }
+# Where their libraries take no older Python.
+_OLDEST_PYTHON = {"minari": (3, 11), "lerobot": (3, 12)}
 
 
 def num_cores() -> int:
@@ -87,8 +90,15 @@ def extras() -> list[str]:
     """A line for each extra: what it is for, and how to get what is missing."""
     lines = []
     for extra, (purpose, module) in _EXTRAS.items():
-        found = find_spec(module) is not None
-        get = "installed" if found else f"missing: pip install -e '.[{extra}]'"
+        oldest = _OLDEST_PYTHON.get(extra, (3, 10))
+        if find_spec(module) is not None:
+            get = "installed"
+        elif sys.version_info < oldest:
+            get = "missing: needs Python {}.{}".format(*oldest)
+        elif extra == "lerobot":  # other releases than our constraints'
+            get = f"missing: pip install -e '.[{extra}]' in an environment of its own"
+        else:
+            get = f"missing: {_INSTALL} '.[{extra}]'"
         lines.append(f"{extra} ({purpose}): {get}")
     return lines
 

@@ -24,6 +24,11 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     Raises:
         ValueError: it holds none, or none of such an environment.
     """
+    if not path.exists():
+        raise ValueError(
+            f"there is no {path}: demonstrations are a file of record_demos.py, or the "
+            "folder of a data set (Minari's is ~/.minari/datasets/ and its id)"
+        )
     if (name := format_of(path)) is not None:
         demos = load_format(name).read(path).select(*STORED_KEYS)
     else:

@@ -252,7 +252,7 @@ def test_at_most_30_options_in_whole_phrases(capsys):
         ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
         ({"resume": True}, "there is no run to resume"),
         ({"total_steps": 0}, "total_steps must be positive"),
-        ({"demos": Path("nofile.pt")}, "there is no file nofile.pt"),
+        ({"demos": Path("nofile.pt")}, "there is no nofile.pt: .* a file of"),
         ({"pretrain_updates": 9}, "pretrain_updates needs demos to imitate"),
         ({"her": "parts"}, "--her parts is for goals of several objects"),
         ({"start_at_object": 0.5}, "starts at objects need"),

@@ -112,7 +112,9 @@ class PicturedEnv:
             BulletError: the environment is closed.
         """
         if find_spec("viser") is None:
-            raise ImportError("viewers need viser: pip install -e '.[viewer]'")
+            raise ImportError(
+                "viewers need viser: pip install -c .ci/constraints.txt -e '.[viewer]'"
+            )
         from torch_panda.rendering.web_viewer import WebViewer
 
         episodes = self.episodes
