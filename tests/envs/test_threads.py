@@ -3,15 +3,19 @@
 Two threads in one Bullet client crash the interpreter, so the tests run in processes.
 """
 
+import gc
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
 import torch_panda
+from torch_panda.bullet import urdf
 
 THREE_THREADS = """
 import threading, torch, torch_panda
@@ -110,6 +114,23 @@ def test_a_collectors_thread_and_a_rollout():
 
 def test_threads_may_build_environments_of_their_own_at_the_same_time():
     run(OWN_ENVIRONMENTS)
+
+
+def test_threads_share_one_scratch_directory(monkeypatch):
+    """However long it takes to make it: what one has written there stays."""
+
+    class Slow(tempfile.TemporaryDirectory):
+        def __init__(self, *args, **kwargs):
+            time.sleep(0.1)
+            super().__init__(*args, **kwargs)
+
+    monkeypatch.setattr(urdf.tempfile, "TemporaryDirectory", Slow)
+    urdf._scratch.cache_clear()
+    with ThreadPoolExecutor(4) as threads:
+        folders = list(threads.map(lambda _: urdf.make_scratch_folder(), range(4)))
+    gc.collect()
+    assert len({folder.parent for folder in folders}) == 1
+    assert all(folder.is_dir() for folder in folders)
 
 
 @pytest.mark.parametrize("call", ["step", "reset", "render", "get_state", "close"])

@@ -3,9 +3,12 @@
 import functools
 import importlib.util
 import tempfile
+import threading
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
+
+_SCRATCH_LOCK = threading.Lock()
 
 
 class Tool(NamedTuple):
@@ -59,8 +62,15 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
 
 @functools.cache
 def _scratch() -> tempfile.TemporaryDirectory[str]:
-    """Where URDFs with tools live until the process ends."""
     return tempfile.TemporaryDirectory(prefix="torch_panda-")
+
+
+def make_scratch_folder() -> Path:
+    """A new folder, for URDFs and what they need, that lives until the process ends."""
+    # Without it each of several threads would make a directory, of which the cache
+    # keeps one: the others are removed at once.
+    with _SCRATCH_LOCK:
+        return Path(tempfile.mkdtemp(dir=_scratch().name))
 
 
 @functools.cache
@@ -87,6 +97,6 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
             f"<child link='tool'/><origin xyz='{x} {y} {z}'/></joint>"
         )
     )
-    path = Path(tempfile.mkdtemp(dir=_scratch().name)) / source.name
+    path = make_scratch_folder() / source.name
     tree.write(path)
     return str(path)

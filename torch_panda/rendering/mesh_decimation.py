@@ -6,7 +6,6 @@ of a picture of 64 x 64 pixels on triangles that are smaller than a pixel.
 
 import functools
 import shutil
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,19 +13,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from torch_panda.bullet.urdf import find_mesh
+from torch_panda.bullet.urdf import find_mesh, make_scratch_folder
 
 # Texture coordinates that differ by less belong to one colour.
 _TEXTURE_CELL = 0.1
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-
-
-@functools.cache
-def _scratch() -> tempfile.TemporaryDirectory[str]:
-    """Where coarse files live until the process ends."""
-    return tempfile.TemporaryDirectory(prefix="torch_panda-")
 
 
 @functools.cache
@@ -40,7 +33,7 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
         urdf: the original file.
         cell: edge length of the cubes [m].
     """
-    folder = Path(tempfile.mkdtemp(dir=_scratch().name))
+    folder = make_scratch_folder()
     source = Path(urdf).absolute()
     tree = ElementTree.parse(source)
     for link in tree.iter("link"):
