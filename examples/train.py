@@ -47,6 +47,7 @@ from training.starts import StartFrom, states_at_objects
 from video import record
 
 DEMO_RATIO = 0.25  # of each batch: what is drawn from the demonstrations, if any
+STARTED_STEPS = 50  # of an episode at most, where some begin in the course of the task
 KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
 
 
@@ -80,7 +81,10 @@ class Run:
             randomize=randomize,
         )
         self.agent = make_agent(self.env, args)
-        iteration = args.num_envs * self.env.max_episode_steps
+        steps = self.env.max_episode_steps
+        if args.start_at_object:
+            steps = min(steps, STARTED_STEPS)
+        iteration = args.num_envs * steps
         self.buffer = make_buffer(
             self.env,
             args.total_steps + iteration,

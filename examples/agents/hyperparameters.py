@@ -7,7 +7,7 @@ from limits import Discount, Positive, Ratio, Weight
 
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
 RelativeInputs = Literal["none", "coarse", "fine"]
-AugmentationKind = Literal["none", "mirror", "mirror-shift"]
+AugmentationKind = Literal["none", "mirror", "mirror-shift", "mirror-shift-swap"]
 
 
 @dataclass
@@ -37,4 +37,4 @@ class Hyperparameters:
     too ("coarse"), and these once more clipped, so that millimetres count ("fine")"""
     augmentation: AugmentationKind = "none"
     """mirror half of each batch in the robot's plane of symmetry, and, if wanted, shift
-    the scene over the table in half of it"""
+    the scene over the table in half of it, and exchange two equal objects in half"""

@@ -55,10 +55,14 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
+    # Both cubes are the same, so whatever is learned of one is learned of the other.
     "Stack": {
         **OBJECT,
+        "gamma": 0.98,
+        "random_eps": (0.0, 0.5),
         "relative_inputs": "fine",
-        "start_at_object": 0.5,
+        "augmentation": "mirror-shift-swap",
+        "start_at_object": 0.75,
         "her": "parts",
         "anneal_lr": True,
         "total_steps": 1_000_000,

@@ -23,14 +23,16 @@ APPROACH = 45  # steps
 GAP = (0.055, 0.08)
 # How high an object is held, of several the last, when the first is placed below [m].
 LIFTED = (0.12, 0.2)
+ROOM = 0.08  # [m] between the centres of two objects
+OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # the action of a hand that waits
 PHYSICAL = ["joint_position", "joint_velocity", "object_pose", "object_velocity"]
 
 
 def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict:
     """States in which the hand holds an object, or is beside one if it cannot grasp.
 
-    Where there are several objects they take turns, and a third turn is of states in
-    which the last one is held up and the first can be put anywhere.
+    Where there are two objects they take turns; in half of the states the first can be
+    put anywhere, and the last one is held up, or lies there yet.
 
     Args:
         env_id: one of torch_panda.ENV_IDS.
@@ -60,10 +62,11 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 "starts at objects need end-effector control and a task with objects "
                 f"on the table, got {env_id}"
             )
-        turns = [*objects, objects[-1]] if len(objects) > 1 else objects
-        turn = torch.arange(number) % len(turns)
-        place = torch.tensor(turns)[turn, None] + torch.arange(3)
-        placed = (turn == len(objects)).unsqueeze(1)
+        last = objects[-1]
+        turns = [*objects, last, last] if len(objects) > 1 else objects
+        turn = (torch.arange(number) % len(turns)).unsqueeze(1)
+        place = torch.tensor(turns)[turn] + torch.arange(3)
+        placed, waits = turn >= len(objects), turn > len(objects)
         angle, gap, lift = uniform(0, 2 * pi), uniform(*GAP), uniform(*LIFTED)
         beside = gap * torch.cat((angle.cos(), angle.sin(), 0 * angle), -1)
         blocked = env.action_spec_unbatched.shape[-1] == 3
@@ -80,6 +83,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 goal = torch.cat((item[:, :2], height), 1)
                 action = carry(hand, width, item, goal)
                 there = is_held(hand, width, item) & (norm(goal - item) < 0.02)
+                there = there | waits
+                action = torch.where(waits, torch.tensor(OPEN_HAND), action)
             td = env.step(td.set("action", action))["next"]
         state = env.get_state().select(*PHYSICAL).set("placed", placed)
     speed = state["object_velocity"].abs().flatten(1).amax(1, keepdim=True)
@@ -114,7 +119,13 @@ class StartFrom(Transform):
         if placed.any():  # the first object is where the episode's goal has it
             goal = tensordict_reset["desired_goal"].to(state["object_pose"])
             rest = goal.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goal), 4)
-            pose = torch.cat((goal[:, :3], rest), 1)
+            pose, last = torch.cat((goal[:, :3], rest), 1), state["object_pose"][:, -1]
+            # There it must not meet the other one.
+            free = (pose - last)[:, :2].norm(dim=1) > ROOM
+            free |= last[:, 2] > LIFTED[0] - ROOM / 2
+            chosen &= (free | ~placed).unsqueeze(-1)
+            if not chosen.any():
+                return tensordict_reset
             state["object_pose"][placed, 0] = pose[placed]
             state["object_velocity"][placed, 0] = 0.0
         # With what was observed: torchrl takes it where nothing is reset again.

@@ -36,3 +36,15 @@ def test_recipes_fit_joint_control(env_id, tmp_path):
 def test_unknown_tasks_and_the_paper_have_none():
     assert find_recipe("PandaFly-v1") == find_recipe("Fly-v1") == {}
     assert default_args("paper", "PandaPush-v1") == Args(env_id="PandaPush-v1")
+
+
+@pytest.mark.parametrize(("ratio", "steps"), [(0.0, 100), (0.5, 50)])
+def test_episodes_that_begin_in_the_course_of_the_task_are_shorter(
+    ratio, steps, tmp_path
+):
+    args = default_args("tuned", "PandaStack-v1")
+    args.num_envs, args.start_at_object = 2, ratio
+    run = Run(args, tmp_path)
+    data = next(iter(run.collector))
+    run.close()
+    assert data.shape == (2, steps)
