@@ -3,6 +3,7 @@
 Two threads in one Bullet client crash the interpreter, so the tests run in processes.
 """
 
+import functools
 import gc
 import subprocess
 import sys
@@ -119,13 +120,12 @@ def test_threads_may_build_environments_of_their_own_at_the_same_time():
 def test_threads_share_one_scratch_directory(monkeypatch):
     """However long it takes to make it: what one has written there stays."""
 
-    class Slow(tempfile.TemporaryDirectory):
-        def __init__(self, *args, **kwargs):
-            time.sleep(0.1)
-            super().__init__(*args, **kwargs)
+    @functools.cache
+    def make_slowly():
+        time.sleep(0.1)
+        return tempfile.TemporaryDirectory()
 
-    monkeypatch.setattr(urdf.tempfile, "TemporaryDirectory", Slow)
-    urdf._scratch.cache_clear()
+    monkeypatch.setattr(urdf, "_scratch", make_slowly)
     with ThreadPoolExecutor(4) as threads:
         folders = list(threads.map(lambda _: urdf.make_scratch_folder(), range(4)))
     gc.collect()
