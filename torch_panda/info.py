@@ -25,8 +25,8 @@ _PACKAGES = (
     "gymnasium-robotics",
 )
 
-# Extras: what they are for, and a module that each brings; see pyproject.toml.
 _INSTALL = "pip install -c .ci/constraints.txt -e"
+# Extras: what they are for, and a module that each brings; see pyproject.toml.
 _EXTRAS = {
     "examples": ("training, evaluating, videos, plots", "tyro"),
     "viewer": ("env.open_viewer(), watch.py --web", "viser"),

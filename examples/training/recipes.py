@@ -55,7 +55,8 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
-    # Both cubes are the same, so whatever is learned of one is learned of the other.
+    # The cubes are the same (but for their mass in -v3): what is learned of one goes for
+    # the other. A stack is many steps, and seldom done by a hand that acts at random.
     "Stack": {
         **OBJECT,
         "gamma": 0.98,
