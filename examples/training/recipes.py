@@ -55,7 +55,7 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
-    # The cubes are the same (but for their mass in -v3): what is learned of one goes for
+    # The cubes are the same (of -v3 in all but mass): what is learned of one goes for
     # the other. A stack is many steps, and seldom done by a hand that acts at random.
     "Stack": {
         **OBJECT,
