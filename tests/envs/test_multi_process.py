@@ -44,11 +44,13 @@ def test_parallel_env():
         assert torch.equal(rollouts[0][key], rollouts[1][key])
     assert len(goals(rollouts[0])) == 2 * NUM_ENVS
 
-    _, start = kill(env._workers[1])
-    with pytest.raises(RuntimeError, match="worker 1 dead"):
-        env.rollout(STEPS)
-    with pytest.raises(RuntimeError, match="worker 1"):
-        env.close()
+    workers = list(env._workers)
+    _, start = kill(workers[1])
+    with pytest.raises(RuntimeError, match="worker 1"), name_dead_workers(workers):
+        try:
+            env.rollout(STEPS)
+        finally:
+            env.close()
     assert time.monotonic() - start < PATIENCE
 
 
