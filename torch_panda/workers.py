@@ -24,7 +24,7 @@ def name_dead_workers(processes: Iterable[BaseProcess]) -> Iterator[None]:
     Raises:
         RuntimeError: a worker has died; it names the worker and its exit code.
     """
-    workers = [(process, process.pid) for process in processes]
+    workers = [(process, _pid(process)) for process in processes]
     try:
         yield
     except (RuntimeError, ValueError) as error:
@@ -34,6 +34,14 @@ def name_dead_workers(processes: Iterable[BaseProcess]) -> Iterator[None]:
                     f"worker {index} (process {pid}) died with exit code {code}"
                 ) from error
         raise
+
+
+def _pid(process: BaseProcess) -> int | None:
+    """None of a process that torchrl has closed."""
+    try:
+        return process.pid
+    except ValueError:
+        return None
 
 
 def _exit_code(process: BaseProcess) -> int | None:
