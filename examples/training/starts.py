@@ -121,8 +121,7 @@ class StartFrom(Transform):
             rest = goal.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goal), 4)
             pose, last = torch.cat((goal[:, :3], rest), 1), state["object_pose"][:, -1]
             # There it must not meet the other one.
-            free = (pose - last)[:, :2].norm(dim=1) > ROOM
-            free |= last[:, 2] > LIFTED[0] - ROOM / 2
+            free = (pose - last)[:, :3].norm(dim=1) > ROOM
             chosen &= (free | ~placed).unsqueeze(-1)
             if not chosen.any():
                 return tensordict_reset
