@@ -46,8 +46,8 @@ def load_format(name: Format) -> FormatModule:
     """
     if find_spec(name) is None:
         raise ValueError(
-            f"{name} is not installed: pip install -e '.[{name}]' "
-            "(examples/README.md says more)"
+            f"{name} is not installed: examples/README.md, under Data sets for other "
+            "tools, says how to"
         )
     module: FormatModule = import_module(f"formats.{name}_format")
     return module
