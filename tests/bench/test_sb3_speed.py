@@ -8,22 +8,17 @@ import statistics
 import sys
 import time
 
-import gymnasium
-import panda_gym
 import pytest
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from tests.bench.panda_gym_push import make_push
 from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
 
 pytestmark = pytest.mark.slow
 NUM_ENVS = 16
 STEPS = 50
 ROUNDS = 5
-
-
-def make_panda_gym():
-    return gymnasium.make(f"PandaPush-v{panda_gym.__version__[0]}")
 
 
 def make_model(env):
@@ -58,7 +53,7 @@ def measure_collection(model, pids):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_cheaper_than_panda_gym_in_processes():
     ours = SB3VecEnv("PandaPush-v3", num_envs=NUM_ENVS)
-    theirs = SubprocVecEnv([make_panda_gym] * NUM_ENVS)
+    theirs = SubprocVecEnv([make_push] * NUM_ENVS)
     workers = [process.pid for process in theirs.processes]
     runs = {
         "SB3VecEnv": (make_model(ours), [os.getpid()]),

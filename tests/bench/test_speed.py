@@ -7,12 +7,12 @@ import time
 
 import gymnasium
 import numpy as np
-import panda_gym
 import pytest
 import torch
 from torchrl.envs import GymEnv, ParallelEnv
 
 import torch_panda
+from tests.bench.panda_gym_push import PUSH, make_push
 from torch_panda.bench.bare_bullet import is_available, load_bare_bullet
 
 pytestmark = pytest.mark.slow
@@ -21,12 +21,8 @@ STEPS = 50
 ROUNDS = 5
 
 
-def make_gym_env():
-    return gymnasium.make(f"PandaPush-v{panda_gym.__version__[0]}")
-
-
 def make_torchrl_env():
-    return GymEnv(f"PandaPush-v{panda_gym.__version__[0]}")
+    return GymEnv(PUSH)
 
 
 def time_steps(step, steps=STEPS):
@@ -39,7 +35,7 @@ def time_steps(step, steps=STEPS):
 def test_faster_than_panda_gym():
     rng = np.random.default_rng(0)
     ours = torch_panda.make("PandaPush-v3", num_envs=NUM_ENVS, seed=0)
-    gym_env = gymnasium.vector.AsyncVectorEnv([make_gym_env] * NUM_ENVS)
+    gym_env = gymnasium.vector.AsyncVectorEnv([make_push] * NUM_ENVS)
     parallel = ParallelEnv(NUM_ENVS, make_torchrl_env, mp_start_method="spawn")
     state = {"ours": ours.reset(), "parallel": parallel.reset()}
     gym_env.reset(seed=0)
