@@ -9,6 +9,7 @@ import threading
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import EnvBase
 
 import torch_panda
 from torch_panda.bullet import PhysicsClient
@@ -182,6 +183,27 @@ def test_partial_step_leaves_the_others_alone(env):
     assert not torch.equal(after["observation"][0], td["observation"][0])
     assert env.get_state()["step_count"].flatten().tolist() == [1, 0, 1]
     assert (env.get_state()[1] == before[1]).all()
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_a_step_is_torchrls_step(num_envs):
+    """Also where it leaves out torchrl's checks of what `_step` returns."""
+    steps = []
+    for step in (torch_panda.RobotTaskEnv.step, EnvBase.step):
+        with torch_panda.make("PandaPush-v1", num_envs=num_envs, seed=0) as env:
+            td = env.reset().set("action", torch.ones(env.action_spec.shape))
+            stepped = step(env, td)
+            assert stepped is td
+            preset = td["next"].select("reward").rename_key_("reward", "mine")
+            again = step(env, td.exclude("next").set("next", preset))
+            steps.append((stepped, again))
+    for ours, theirs in zip(*steps, strict=True):
+        assert ours.batch_size == theirs.batch_size
+        found, expected = ours["next"], theirs["next"]
+        assert set(found.keys()) == set(expected.keys())
+        for key, value in expected.items():
+            assert found[key].dtype == value.dtype
+            assert torch.equal(found[key], value)
 
 
 def test_state_round_trip_keeps_float64(env):

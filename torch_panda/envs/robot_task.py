@@ -208,6 +208,24 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         start = super().reset(tensordict, set_state=set_state, **kwargs)
         return start.exclude(*EXACT_KEYS) if set_state else start
 
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act for one step, as in torchrl.
+
+        Args:
+            tensordict: of the environment's batch size, with ``action``; and, optional,
+                which environments step, under ``_step``, and entries that are to stand
+                under ``next`` beside what they observe.
+
+        Returns:
+            The same tensordict, with ``next``.
+        """
+        keys = tensordict.keys()
+        is_plain = tensordict.batch_size == self.batch_size
+        if not is_plain or "_step" in keys or "next" in keys:
+            return super().step(tensordict)
+        # torchrl would complete and reshape what `_step` returns: it is as it must be.
+        return tensordict.set("next", self._step(tensordict))
+
     # ---- what torchrl calls ------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
