@@ -86,9 +86,10 @@ class EpisodeObserver:
         desired_goal = goal.float()
         success = task.is_success(achieved_goal, desired_goal)
         truncated = step_count >= self._max_episode_steps
-        terminated = torch.zeros_like(success)
         if self._terminate_on_success:
             terminated = success & (step_count > 0)
+        else:
+            terminated = torch.zeros_like(success)
         if failure is not None:
             terminated = terminated | failure() & (step_count > 0)
         observed: Observed = {}

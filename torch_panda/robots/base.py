@@ -123,6 +123,8 @@ class Robot:
                 f"a robot with a gripper must have {self.num_arm_joints} joints of the "
                 f"arm and {num_fingers} of the gripper, got {len(joint_forces)} in all"
             )
+        rest = self.neutral_joint_position[self.num_arm_joints :]
+        self._rest = torch.tensor(rest, dtype=torch.float64, device="cpu")
         self.control_type: ControlType = control_type
         self.action_scale = action_scale
         self.gripper = gripper
@@ -199,13 +201,11 @@ class Robot:
             positions of the other joints [rad] or [m].
         """
         arm = self.arm_setpoint(action[:, : self._arm_action_dim], simulation)
-        count = self.num_arm_joints
-        if self.gripper is None or self.block_gripper:
-            others = arm.new_tensor(self.neutral_joint_position[count:])
-        else:
-            fingers = simulation.joint_position[:, count:]
+        others = self._rest.expand(len(arm), -1)
+        if self.gripper is not None and not self.block_gripper:
+            fingers = simulation.joint_position[:, self.num_arm_joints :]
             others = self.gripper.setpoint(action[:, -1:], fingers)
-        return torch.cat((arm, others.expand(len(arm), -1)), dim=1)
+        return torch.cat((arm, others), dim=1)
 
     def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
         """The part of `setpoint` that is the arm's, by the control type.
