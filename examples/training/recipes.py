@@ -70,7 +70,7 @@ RECIPES: dict[str, dict[str, Any]] = {
         "eval_interval": 20_000,
     },
     "Flip": {**OBJECT, "total_steps": 1_000_000},
-    "Drawer": {**OBJECT, "total_steps": 20_000},
+    "Drawer": {**OBJECT, "anneal_lr": True, "total_steps": 20_000},
     # By imitation; not yet known to work without demonstrations.
     "PegInsertion": {
         **OBJECT,
