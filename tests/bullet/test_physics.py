@@ -64,6 +64,8 @@ def test_timestep_and_gravity_reach_bullet():
         {"solver_iterations": 1},
         {"residual_threshold": 1.0},
         {"position_gain": 0.2},
+        {"ik_iterations": 5},
+        {"ik_damping": 0.1},
     ],
 )
 def test_every_parameter_reaches_bullet(change):
@@ -88,6 +90,8 @@ def test_environments_are_pickled_with_their_physics():
         ({"position_gain": 0.0}, r"position_gain must lie in \(0, 1\], got 0.0"),
         ({"position_gain": 1.5}, r"position_gain must lie in \(0, 1\], got 1.5"),
         ({"gravity": float("inf")}, "gravity must be finite"),
+        ({"ik_iterations": 0}, "ik_iterations must be at least 1, got 0"),
+        ({"ik_damping": 0.0}, "ik_damping must be positive, got 0.0"),
     ],
 )
 def test_bad_parameters(arguments, message):

@@ -373,6 +373,17 @@ ik_set_target = bind(
     _doubles,
     _doubles,
 )
+ik_set_iterations = bind(
+    _cheap, "b3CalculateInverseKinematicsSetMaxNumIterations", None, _command, c_int
+)
+ik_set_damping = bind(
+    _cheap,
+    "b3CalculateInverseKinematicsSetJointDamping",
+    None,
+    _command,
+    c_int,
+    _doubles,
+)
 ik_result = bind(
     _cheap,
     "b3GetStatusInverseKinematicsJointPositions",

@@ -44,6 +44,8 @@ static int find_joints(struct batch *batch, int env, double *joints) {
     handle command = bullet->ik_init(batch->clients[env]->handle, batch->scene->robot);
     bullet->ik_set_target(command, control->ik_link, setpoint,
                           control->turns ? setpoint + 3 : control->orientation);
+    bullet->ik_set_iterations(command, control->ik_iterations);
+    bullet->ik_set_damping(command, num_joints, control->ik_damping);
     handle status =
         client_submit(batch, env, command, CALCULATE_INVERSE_KINEMATICS_COMPLETED,
                       "solve the inverse kinematics");

@@ -18,6 +18,8 @@ struct functions {
     handle (*ik_init)(handle client, int body);
     void (*ik_set_target)(handle command, int link, doubles position,
                           doubles orientation);
+    void (*ik_set_iterations)(handle command, int most);
+    void (*ik_set_damping)(handle command, int num_joints, doubles damping);
     int (*ik_result)(handle status, int *body, int *count, double *positions);
     handle (*motor_init)(handle client, int body, int mode);
     int (*motor_set_position)(handle command, int q_index, double position);
@@ -84,8 +86,9 @@ struct control { /* MotorControl of control.py */
     int num_arm_joints, setpoint_size;
     int turns;    /* whether they give its orientation, too */
     int arm_mode; /* of the arm's joints */
+    int ik_iterations;
     double orientation[4], position_gain, velocity_gain;
-    doubles forces; /* one a joint */
+    doubles forces, ik_damping; /* one a joint */
 };
 
 enum { NO_ANSWER = -1, CLIENT_CLOSED = -2 };

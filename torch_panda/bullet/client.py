@@ -42,7 +42,7 @@ class PhysicsClient(SceneClient):
         capi.physics_set_solver_iterations(command, physics.solver_iterations)
         capi.physics_set_residual_threshold(command, physics.residual_threshold)
         self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
-        self._position_gain = physics.position_gain
+        self._physics = physics
 
     @property
     def num_detections(self) -> int:
@@ -151,7 +151,7 @@ class PhysicsClient(SceneClient):
             capi.motor_set_kp(command, U_OFFSET + k, 0.0)
         for k, position in enumerate(positions, start=len(velocities)):
             capi.motor_set_position(command, Q_OFFSET + k, position)
-            capi.motor_set_kp(command, U_OFFSET + k, self._position_gain)
+            capi.motor_set_kp(command, U_OFFSET + k, self._physics.position_gain)
         for k, force in enumerate(forces):
             capi.motor_set_kd(command, U_OFFSET + k, VELOCITY_GAIN)
             capi.motor_set_force(command, U_OFFSET + k, force)
@@ -216,6 +216,9 @@ class PhysicsClient(SceneClient):
         """
         command = capi.ik_init(self._open(), body)
         capi.ik_set_target(command, link, shared(position), doubles(orientation))
+        damping = [self._physics.ik_damping] * len(joint_positions)
+        capi.ik_set_iterations(command, self._physics.ik_iterations)
+        capi.ik_set_damping(command, len(damping), doubles(damping))
         status = self._submit(
             command,
             capi.CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED,

@@ -38,6 +38,8 @@ _BULLET = (
     capi.status_type,
     capi.ik_init,
     capi.ik_set_target,
+    capi.ik_set_iterations,
+    capi.ik_set_damping,
     capi.ik_result,
     capi.motor_init,
     capi.motor_set_position,
@@ -132,10 +134,12 @@ class Control(Structure):
         ("setpoint_size", c_int),
         ("turns", c_int),
         ("arm_mode", c_int),
+        ("ik_iterations", c_int),
         ("orientation", c_double * 4),
         ("position_gain", c_double),
         ("velocity_gain", c_double),
         ("forces", POINTER(c_double)),
+        ("ik_damping", POINTER(c_double)),
     )
 
 

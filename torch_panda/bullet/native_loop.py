@@ -2,12 +2,17 @@
 
 import os
 from collections.abc import Iterable, Sequence
-from ctypes import POINTER, Array, c_double, c_int, pointer
+from ctypes import POINTER, Array, c_int, pointer
 
 from torch_panda.bullet import native
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
-from torch_panda.bullet.connection import BulletError, client_closed, refusal
+from torch_panda.bullet.connection import (
+    BulletError,
+    client_closed,
+    doubles,
+    refusal,
+)
 from torch_panda.bullet.control import MotorControl
 from torch_panda.bullet.physics import PhysicsParams
 from torch_panda.bullet.pool import WorkerError
@@ -141,10 +146,12 @@ class NativeLoop:
             control.setpoint_dim,
             control.ik_orientation is None,
             native.ARM_MODES[control.arm_mode],
+            self._physics.ik_iterations,
             control.ik_orientation or (),
             self._physics.position_gain,
             VELOCITY_GAIN,
-            (c_double * len(control.forces))(*control.forces),
+            doubles(control.forces),
+            doubles([self._physics.ik_damping] * len(control.forces)),
         )
         self._described = control
 

@@ -23,6 +23,10 @@ class PhysicsParams:
         residual_threshold: the solver stops early at a smaller squared residual.
         position_gain: part of the error that a joint's motor removes in a substep.
         gravity: along the world's z axis [m/s^2].
+        ik_iterations: the most iterations of the inverse kinematics in a step. The
+            default stops short of the pose by about 15 mm of 50; fewer of them that go
+            as far have less damping, in proportion.
+        ik_damping: damping of their least squares, greater than 0.
 
     Raises:
         ValueError: an argument is out of range.
@@ -34,9 +38,11 @@ class PhysicsParams:
     residual_threshold: float = 1e-7
     position_gain: float = 0.1
     gravity: float = -9.81
+    ik_iterations: int = 20
+    ik_damping: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("n_substeps", "solver_iterations"):
+        for name in ("n_substeps", "solver_iterations", "ik_iterations"):
             value = getattr(self, name)
             if operator.index(value) < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
@@ -51,6 +57,8 @@ class PhysicsParams:
             raise ValueError(
                 f"position_gain must lie in (0, 1], got {self.position_gain}"
             )
+        if not 0 < self.ik_damping < math.inf:
+            raise ValueError(f"ik_damping must be positive, got {self.ik_damping}")
         if not math.isfinite(self.gravity):
             raise ValueError(f"gravity must be finite, got {self.gravity}")
 
@@ -66,8 +74,15 @@ EXACT = PhysicsParams()
 # not where they matter. A motor leaves 1 - gain of the error a substep; this gain,
 # somewhat more than 1 - 0.9 ** (20 / 12) = 0.161, makes a puck that the scripted expert
 # strikes slide as far as it does in exact physics, to about 1 %; other strikes, not.
+# 5 iterations of the inverse kinematics with this damping end within 0.003 rad, on
+# average, of the joints that 20 of the default's find.
 FAST = PhysicsParams(
-    timestep=1 / 300, n_substeps=12, residual_threshold=1e-3, position_gain=0.1725
+    timestep=1 / 300,
+    n_substeps=12,
+    residual_threshold=1e-3,
+    position_gain=0.176,
+    ik_iterations=5,
+    ik_damping=0.1125,
 )
 
 _NAMED: dict[str, PhysicsParams] = {"exact": EXACT, "fast": FAST}
