@@ -8,12 +8,11 @@ import re
 from dataclasses import asdict
 from typing import Any
 
-# Every object task: hindsight about what moved, and symmetry. One environment takes no
-# random actions: what hangs on several actions in a row is seldom seen otherwise.
+# Every object task: hindsight about what moved, and symmetry.
 OBJECT: dict[str, Any] = {
     "num_envs": 8,
     "gamma": 0.95,
-    "random_eps": (0.0, 0.5),
+    "random_eps": (0.3, 1.0),
     "relative_inputs": "coarse",
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
@@ -27,10 +26,12 @@ PLAIN_OPTIONS = {
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
 RECIPES: dict[str, dict[str, Any]] = {
     "Reach": {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
-    "Push": {**OBJECT, "total_steps": 100_000},
+    # One environment takes no random actions, and the last one half: learned twice as
+    # soon as with 30 to 100 %.
+    "Push": {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
     # Goals out of reach are seldom achieved: some of the batch get them all the same.
-    # Where the puck stops depends on the whole strike, and no strike of which a third is
-    # random shows where a clean one leads.
+    # One environment takes no random actions: where the puck stops depends on the whole
+    # strike, and no strike of which a third is random shows where a clean one leads.
     "Slide": {
         "num_envs": 8,
         "gamma": 0.98,
@@ -47,18 +48,21 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 1_000_000,
         "eval_interval": 25_000,
     },
+    # Seldom lifted by chance: half of the episodes begin with the cube in the hand.
     "PickAndPlace": {
         **OBJECT,
         "relative_inputs": "fine",
+        "start_at_object": 0.5,
         "anneal_lr": True,
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
     # The cubes are the same (of -v3 in all but mass): what is learned of one goes for
-    # the other. A stack is many steps.
+    # the other. A stack is many steps, and seldom done by a hand that acts at random.
     "Stack": {
         **OBJECT,
         "gamma": 0.98,
+        "random_eps": (0.0, 0.5),
         "relative_inputs": "fine",
         "augmentation": "mirror-shift-swap",
         "start_at_object": 0.75,
@@ -68,13 +72,7 @@ RECIPES: dict[str, dict[str, Any]] = {
         "eval_interval": 20_000,
     },
     "Flip": {**OBJECT, "total_steps": 1_000_000},
-    # A drawer is pulled by chance: more random actions find it sooner.
-    "Drawer": {
-        **OBJECT,
-        "random_eps": (0.3, 1.0),
-        "anneal_lr": True,
-        "total_steps": 20_000,
-    },
+    "Drawer": {**OBJECT, "anneal_lr": True, "total_steps": 20_000},
     # By imitation; not yet known to work without demonstrations.
     "PegInsertion": {
         **OBJECT,
