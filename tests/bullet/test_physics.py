@@ -2,12 +2,15 @@
 
 import pickle
 
+import numpy as np
 import pytest
 import torch
 
 import torch_panda
+from tests.bullet.test_client import JOINTS, NEUTRAL
 from torch_panda import PhysicsParams
 from torch_panda.bullet import EXACT, FAST, PhysicsClient
+from torch_panda.robots.panda import EE_LINK
 
 
 def rollout(physics, env_id="PandaPush-v1", steps=20):
@@ -40,6 +43,39 @@ def test_fast_moves_the_arm_as_exact_does():
 
 def test_the_named_preset_is_the_parameters():
     assert torch.equal(rollout("fast"), rollout(FAST))
+
+
+def reach(physics, poses, offsets):
+    """Joints that inverse kinematics find for the hand at offsets, and what is left.
+
+    Args:
+        physics: of the client.
+        poses: (n, 9), where the joints are [rad] and [m].
+        offsets: (n, 3), from there to the targets [m].
+    """
+    found, left = np.zeros_like(poses), []
+    with PhysicsClient(physics=physics) as client:
+        arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        for pose, offset, joints in zip(poses, offsets, found, strict=True):
+            client.set_joints(arm, JOINTS, pose, np.zeros(9))
+            target = client.state(arm).link_poses[EE_LINK][:3] + offset
+            client.inverse_kinematics(arm, EE_LINK, target, (1, 0, 0, 0), joints)
+            client.set_joints(arm, JOINTS, joints, np.zeros(9))
+            hand = client.state(arm).link_poses[EE_LINK][:3]
+            left.append(np.linalg.norm(hand - target))
+    return found, np.mean(left)
+
+
+def test_few_iterations_of_the_inverse_kinematics_go_as_far():
+    rng = np.random.default_rng(0)
+    poses = np.tile(NEUTRAL, (200, 1))
+    poses[:, :7] += rng.normal(0, 0.1, (200, 7))
+    offsets = rng.uniform(-0.05, 0.05, (200, 3))
+    exact, exact_left = reach(EXACT, poses, offsets)
+    fast, fast_left = reach(FAST, poses, offsets)
+    assert np.abs(exact - fast).max(1).mean() < 3e-3  # [rad]
+    assert exact_left == pytest.approx(12.6e-3, abs=0.1e-3)  # [m], of 48 on average
+    assert fast_left == pytest.approx(exact_left, abs=0.1e-3)
 
 
 def fall(physics, seconds=0.2):
