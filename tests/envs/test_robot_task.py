@@ -206,6 +206,25 @@ def test_a_step_is_torchrls_step(num_envs):
             assert torch.equal(found[key], value)
 
 
+def test_a_rollout_is_torchrls_rollout(env):
+    def roll(method, **options):
+        env.set_seed(3)
+        torch.manual_seed(0)
+        return method(env, 7, **options)
+
+    rollout = torch_panda.RobotTaskEnv.rollout
+    ours, theirs = roll(rollout), roll(EnvBase.rollout)
+    assert (ours == theirs).all()
+    assert ours.names == theirs.names
+    assert (ours["action"][:, 1:] != ours["action"][:, :-1]).all()
+    actions = [*ours["action"].unbind(1)]
+    for played in (
+        roll(rollout, actions=actions),
+        roll(rollout, policy=lambda td: td.set("action", actions.pop(0))),
+    ):
+        assert (played == ours).all()
+
+
 def test_state_round_trip_keeps_float64(env):
     run(env, 20)
     state = env.get_state()
