@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import Hyperparameters, make_agent
-from limits import Positive, Ratio, Seed, Weight, check_limits
+from limits import Positive, Seed, Weight, check_limits
 from training.buffers import STORED_KEYS, make_buffer
 from training.checkpoint import Progress, StopSignal, crossed
 from training.curve import Curve
@@ -71,8 +71,6 @@ class Args(Hyperparameters):
     """gradient steps per environment step"""
     batch_size: Positive = 256
     """transitions per gradient step"""
-    her_ratio: Ratio = 0.8
-    """the ratio of relabelled transitions"""
     eval_interval: Positive = 1_000
     """environment steps between evaluations"""
     seed: Seed = 0
@@ -103,12 +101,8 @@ class Learner:
         # As many environments as a worker has: exploration noise has their shape.
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
         self.agent = make_agent(self.env, args)
-        self.buffer = make_buffer(
-            self.env,
-            args.total_steps + args.batch_frames,
-            her_ratio=args.her_ratio,
-            seed=args.seed,
-        )
+        capacity = args.total_steps + args.batch_frames
+        self.buffer = make_buffer(self.env, capacity, seed=args.seed)
         self.progress = Progress()
         self.curve = Curve(args.env_id, self.agent, out, device="cpu")
         self.collector = make_collector(args, self.agent.explore)
@@ -257,6 +251,8 @@ def main(args: Args) -> None:
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
+        if args.algo == "dagger":
+            raise ValueError("workers ask no expert: use train.py for algo dagger")
         connect(args)
         out.mkdir(parents=True, exist_ok=True)
         learner = Learner(args, out)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agents.augmentation import Augmentation
+from agents.fingers import check_fingers, from_fine, to_fine
 from agents.geometry import read_geometry
 from agents.hyperparameters import Hyperparameters
 from agents.normalizer import Normalizer
@@ -44,6 +45,8 @@ class Agent(nn.Module, ABC):
     def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
         super().__init__()
         self.hp = hp
+        if hp.fine_fingers:
+            check_fingers(env)
         geometry = read_geometry(env)
         size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
         self.normalizer = Normalizer(size, geometry, hp.relative_inputs)
@@ -67,8 +70,11 @@ class Agent(nn.Module, ABC):
             trained: the parameters of the optimizer.
         """
         normalize = TensorDictModule(self.normalizer, STATE_KEYS, ["normalized"])
-        self.policy = TensorDictSequential(normalize, actor)
-        self.explore = TensorDictSequential(normalize, actor, *noise)
+        last: list[TensorDictModuleBase] = []
+        if self.hp.fine_fingers:
+            last = [TensorDictModule(from_fine, ["action"], ["action"])]
+        self.policy = TensorDictSequential(normalize, actor, *last)
+        self.explore = TensorDictSequential(normalize, actor, *noise, *last)
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
     def update(
@@ -85,7 +91,7 @@ class Agent(nn.Module, ABC):
             num_demos = len(demos)
             pairs = zip(rows, Transitions.from_tensordict(demos), strict=True)
             rows = Transitions(*map(torch.cat, pairs))
-        rows = self.augmentation(rows)
+        rows = self._prepare(rows)
         state = self.normalizer(rows.observation, rows.goal)
         next_state = self.normalizer(rows.next_observation, rows.goal)
         self.optimizer.zero_grad()
@@ -122,16 +128,24 @@ class Agent(nn.Module, ABC):
         Returns:
             the mean squared difference, a scalar.
         """
-        rows = self.augmentation(Transitions.from_tensordict(demos))
+        rows = self._prepare(Transitions.from_tensordict(demos))
         states = dict(zip(STATE_KEYS, (rows.observation, rows.goal), strict=True))
+        normalize, actor = self.policy.module[:2]
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            action = self.policy(demos.empty().update(states))["action"]
-        loss = nn.functional.mse_loss(action, rows.action)
+            td = normalize(demos.empty().update(states))
+            loss = nn.functional.mse_loss(actor(td)["action"], rows.action)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
         self.move_targets()
         return loss.detach()
+
+    def _prepare(self, rows: Transitions) -> Transitions:
+        """Augment a batch, and scale its actions as networks see them."""
+        rows = self.augmentation(rows)
+        if self.hp.fine_fingers:
+            rows = rows._replace(action=to_fine(rows.action))
+        return rows
 
     def set_learning_rate(self, factor: float) -> None:
         """Let the next gradient steps have so much of the learning rate."""

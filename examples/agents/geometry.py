@@ -5,7 +5,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from experts.rotations import compose, inverse, same_half, straighten, to_matrix
+from experts.rotations import (
+    STRAIGHT,
+    compose,
+    inverse,
+    same_half,
+    straighten,
+    to_matrix,
+)
 from torch_panda import Drawer, PegInsertion, RobotTaskEnv, Slide, Task
 
 # Factors that mirror a quantity in the plane y = 0, in which robot and table are
@@ -61,20 +68,24 @@ class Geometry:
         inputs = torch.cat((observation, goal), -1)
         return inputs[..., self.later] - inputs[..., self.earlier]
 
-    def turns(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def turns(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """Orientations as they are for a cube without colours, which has 24 equal ones.
 
         Returns:
-            the observation with the smallest of the 24, the turn from the cube's
-            orientation to the goal's, a quaternion (..., 4), and its matrix (..., 9).
+            the observation with the smallest of the 24; the turn from the cube's
+            orientation to the goal's, a quaternion (..., 4), and its matrix (..., 9);
+            how like the 24 turns that lay a cube straight that from the nearest
+            straight orientation to the goal's is, from 0 to 1, (..., 24).
         """
         assert self.orientation is not None
         place = slice(self.orientation, self.orientation + 4)
         cube = observation[..., place]
         observation = observation.clone()
-        observation[..., place] = same_half(compose(cube, inverse(straighten(cube))))
+        back = inverse(straighten(cube))
+        observation[..., place] = same_half(compose(cube, back))
         turn = same_half(compose(goal, inverse(cube)))
-        return observation, turn, to_matrix(turn).flatten(-2)
+        likeness = (compose(goal, back) @ STRAIGHT.to(goal).T).square()
+        return observation, turn, to_matrix(turn).flatten(-2), likeness
 
 
 def read_geometry(env: RobotTaskEnv) -> Geometry:

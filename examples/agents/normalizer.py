@@ -34,7 +34,8 @@ class Normalizer(nn.Module):
         self.heights = [start + 2 for start in geometry.goal_positions]
         kinds = ("none", "coarse", "fine").index(relative_inputs)
         size += len(geometry.later) * kinds
-        size += 9 if kinds and geometry.orientation is not None else 0
+        # The turn's matrix and likenesses.
+        size += 9 + 24 if kinds and geometry.orientation is not None else 0
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))

@@ -57,6 +57,11 @@ def make_expert(env_id: str) -> TensorDictModule:
             f"no expert for {env_id!r}; there are experts for the ids of "
             f"{', '.join(EXPERTS)} with end-effector control"
         )
+    expert = (EXPERTS if match[3] == "1" else V3_EXPERTS)[match[1]]
+
+    def act(*observed: Tensor) -> Tensor:
+        # The environment clips what is beyond; who imitates it must see what it does.
+        return expert(*observed).clamp(-1.0, 1.0)
+
     keys = ["observation", "achieved_goal", "desired_goal"]
-    experts = EXPERTS if match[3] == "1" else V3_EXPERTS
-    return TensorDictModule(experts[match[1]], keys, ["action"])
+    return TensorDictModule(act, keys, ["action"])

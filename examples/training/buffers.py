@@ -12,6 +12,7 @@ from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "augment", "none"]
 
+K = 4  # hindsight goals to each goal of one's own, as in the panda-gym paper
 BUFFER_SIZE = 1_000_000  # transitions of one's own, as in the panda-gym paper
 SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
 MOVED = 0.01  # [m], or of a quaternion's component
@@ -35,7 +36,6 @@ def make_buffer(
     capacity: int,
     *,
     her: Hindsight = "relabel",
-    her_ratio: float = 0.8,
     desired_ratio: float = 0.0,
     seed: int | None = None,
 ) -> TensorDictReplayBuffer:
@@ -44,9 +44,9 @@ def make_buffer(
     Args:
         env: whose transitions will be stored.
         capacity: how many of them, at most BUFFER_SIZE.
-        her: relabel sampled transitions ("relabel"), every object's part of their goals
-            on its own ("parts"), store relabelled copies ("augment"), or none.
-        her_ratio: of the transitions that are relabelled, k / (k + 1).
+        her: relabel K of K + 1 sampled transitions ("relabel"), every object's part of
+            their goals on its own ("parts"), store K relabelled copies ("augment"), or
+            none.
         desired_ratio: of those, the ratio that get the desired goal of another
             transition; the others get one that their episode reached later.
         seed: of the goals.
@@ -59,15 +59,9 @@ def make_buffer(
     strategy = {name: weight for name, weight in weights.items() if weight}
     transform: HindsightRelabel | HindsightAugment | None = None
     if her == "augment":
-        if not 1 / 3 < her_ratio < 1:
-            raise ValueError(
-                "with --her augment, which stores her_ratio / (1 - her_ratio) copies, "
-                f"her_ratio must be above 1/3 and below 1, got {her_ratio}"
-            )
-        k = round(her_ratio / (1 - her_ratio))
-        capacity *= k + 1
+        capacity *= K + 1
         transform = HindsightAugment.from_env(
-            env, success_fn=None, k=k, strategy=strategy, seed=seed
+            env, success_fn=None, k=K, strategy=strategy, seed=seed
         )
     elif her != "none":
         objects, rest = divmod(env.task.goal_dim, POSITION)
@@ -78,7 +72,7 @@ def make_buffer(
         transform = HindsightRelabel.from_env(
             env,
             success_fn=None,
-            her_ratio=her_ratio,
+            her_ratio=K / (K + 1),
             strategy=strategy,
             goal_parts=(POSITION,) * objects if her == "parts" else None,
             seed=seed,

@@ -46,6 +46,8 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             raise ValueError(
                 f"{path}: {key} has size {demos[key].shape[-1]}, the task's has {size}"
             )
+    # What is beyond the environment clips, too.
+    demos["action"] = demos["action"].clamp(-1.0, 1.0)
     return demos.to(env.device)
 
 

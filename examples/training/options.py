@@ -32,12 +32,11 @@ class Args(Hyperparameters):
     """the task, one of torch_panda.ENV_IDS"""
     her: Hindsight = "relabel"
     """give sampled transitions hindsight goals ("relabel"), each object's part of a
-    goal on its own ("parts"), store relabelled copies ("augment"), or do without"""
-    her_ratio: Ratio = 0.8
-    """the ratio of relabelled transitions, k / (k + 1): k = 4 goals per transition"""
+    goal on its own ("parts"), store relabelled copies ("augment"), or do without: four
+    for each goal of one's own"""
     desired_ratio: Ratio = 0.0
-    """of these, the ratio that get the desired goal of another transition instead of
-    one that their episode reached later"""
+    """of hindsight goals, the ratio that are the desired goal of another transition
+    instead of one that the episode reached later"""
     seed: Seed = 0
     """the seed of the environments, the networks and the sampling"""
     num_envs: Positive = 4
@@ -81,6 +80,17 @@ def check(args: Args) -> None:
         ValueError: says which, and what is accepted.
     """
     check_limits(args)
+    if args.algo == "dagger" and args.her != "none":
+        raise ValueError(
+            "algo dagger needs her none: with other goals the expert would have done "
+            f"something else, got {args.her}"
+        )
+    explores = args.noise_eps or any(args.random_eps)
+    if args.algo in ("ddpg", "td3") and not explores:
+        raise ValueError(
+            f"algo {args.algo} explores by noise_eps and random_eps: one of them must "
+            "be above 0"
+        )
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demos to imitate")
     if not args.total_steps and not args.pretrain_updates:

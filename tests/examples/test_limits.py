@@ -48,7 +48,7 @@ def refused(script, message, **options):
         *(("num_envs", 0), ("batch_size", 0), ("target_interval", 0)),
         *(("updates_per_step", -0.5), ("updates_per_step", inf), ("action_l2", nan)),
         *(("noise_eps", -0.1), ("pretrain_updates", -1), ("start_at_object", 2.0)),
-        *(("her_ratio", -0.1), ("her_ratio", 1.1), ("desired_ratio", nan)),
+        *(("desired_ratio", -0.1), ("desired_ratio", 1.1), ("desired_ratio", nan)),
         *(("random_eps", (1.5, 0.0)), ("random_eps", (0.0, nan))),
         *(("gamma", 0.0), ("gamma", 1.01)),
     ],
@@ -84,8 +84,8 @@ def test_others_refuse(tmp_path, script, option, value):
 
 
 def test_accepts_ends_of_ranges():
-    lowest = {"seed": 0, "her_ratio": 0.0, "random_eps": (0.0, 0.0)}
+    lowest = {"seed": 0, "desired_ratio": 0.0, "random_eps": (0.0, 0.0)}
     check_limits(train.Args(**lowest, updates_per_step=0.0, total_steps=0))
-    highest = {"seed": 2**64 - 1, "her_ratio": 1.0, "random_eps": (1.0, 1.0)}
+    highest = {"seed": 2**64 - 1, "desired_ratio": 1.0, "random_eps": (1.0, 1.0)}
     check_limits(train.Args(**highest, gamma=1.0))
     check_limits(train.Args(gamma=None))

@@ -16,7 +16,7 @@ from agents.ddpg import SATURATION_L2
 from agents.td3 import NOISE_CLIP, POLICY_NOISE
 from tests.examples.agents.transitions import make_transitions
 
-ALGOS = list(AGENTS)
+ALGOS = [algo for algo in AGENTS if algo != "dagger"]  # with critics
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +198,7 @@ def test_environments_explore_differently(env):
     assert 0.1 < share[1] < share[2] < 0.9
 
 
-@pytest.mark.parametrize("algo", ALGOS)
+@pytest.mark.parametrize("algo", AGENTS)
 def test_policies_are_deterministic_in_evaluations(env, algo):
     agent = make(env, algo)
     td = env.reset()
@@ -206,6 +206,50 @@ def test_policies_are_deterministic_in_evaluations(env, algo):
         first, second = (agent.policy(td.clone())["action"] for _ in range(2))
     assert torch.equal(first, second)
     assert (first.abs() <= 1).all()
+
+
+def test_dagger_is_regressed_to_the_actions_of_its_transitions(env):
+    agent = make(env, "dagger")
+    batch, demos = make_transitions(env, 64), make_transitions(env, 32)
+    both = torch.cat((batch, demos))
+    state = agent.normalizer(both["observation"], both["desired_goal"])
+    expected = (agent.actor(state) - both["action"]).square().mean().detach()
+    (first,) = agent.update(batch, demos).values()
+    torch.testing.assert_close(first, expected)
+    for _ in range(20):
+        (last,) = agent.update(batch, demos).values()
+    assert last < 0.9 * first
+
+
+@pytest.mark.parametrize("algo", AGENTS)
+def test_fine_fingers(algo):
+    """Networks see cube roots of the fingers' actions, environments the actions."""
+    seen, given = [], []
+    with torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as env:
+        agent = make(env, algo, fine_fingers=True, random_eps=(0.0, 0.0))
+        plain = make(env, algo, random_eps=(0.0, 0.0))
+        batch, td = make_transitions(env, 64), env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        for policy in ("policy", "explore"):
+            torch.manual_seed(1)
+            seen.append(getattr(plain, policy)(td.clone())["action"])
+            torch.manual_seed(1)
+            given.append(getattr(agent, policy)(td.clone())["action"])
+    seen, given = torch.stack(seen), torch.stack(given)
+    assert torch.equal(given[..., :3], seen[..., :3])
+    torch.testing.assert_close(given[..., 3], seen[..., 3] ** 3)
+    roots, fingers = batch.clone(), batch["action"][:, 3]
+    roots["action"][:, 3] = fingers.sign() * fingers.abs() ** (1 / 3)
+    for learn in ("update", "imitate"):
+        torch.manual_seed(2)
+        found = getattr(agent, learn)(batch.clone())
+        torch.manual_seed(2)
+        torch.testing.assert_close(found, getattr(plain, learn)(roots.clone()))
+
+
+def test_fine_fingers_need_fingers(env):
+    with pytest.raises(ValueError, match="actions move the fingers: not Reach, Push"):
+        make(env, "ddpg", fine_fingers=True)
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "sac"])

@@ -6,7 +6,8 @@ from torch.nn.functional import normalize
 
 import torch_panda
 from agents.geometry import read_geometry
-from experts.rotations import STRAIGHT, compose, to_matrix
+from experts.rotations import STRAIGHT, compose, straighten, to_matrix
+from torch_panda.rotations import rotation_distance
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
 MIRROR_VELOCITY = torch.tensor([1, -1, 1, -1, 1, -1], dtype=torch.float64)
@@ -74,7 +75,7 @@ def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
     observation = torch.randn(20, 20, generator=generator)
     goal = normalize(torch.randn(20, 4, generator=generator), dim=-1)
     cube = observation[:, place] = normalize(observation[:, place], dim=-1)
-    seen, turn, matrix = geometry.turns(observation, goal)
+    seen, turn, matrix, likeness = geometry.turns(observation, goal)
     # It leads from the cube to the goal, and no other of the 24 is nearer.
     torch.testing.assert_close(matrix, to_matrix(turn).flatten(-2))
     torch.testing.assert_close(
@@ -82,8 +83,13 @@ def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
     )
     others = compose(cube[:, None], STRAIGHT)
     torch.testing.assert_close(seen[:, place][:, 3], others[..., 3].abs().amax(1))
+    # As like one of the 24 as the cube's straight orientation, so turned, is the goal.
+    turned = compose(STRAIGHT, straighten(cube)[:, None])
+    left = rotation_distance(turned, goal[:, None]).squeeze(-1)
+    torch.testing.assert_close(likeness, 1 - left)
     for same in STRAIGHT:
         alike = observation.clone()
         alike[:, place] = compose(cube, same)
         again = geometry.turns(alike, compose(goal, same))
-        torch.testing.assert_close(again, (seen, turn, matrix), atol=1e-5, rtol=0)
+        expected = (seen, turn, matrix, likeness)
+        torch.testing.assert_close(again, expected, atol=1e-5, rtol=0)
