@@ -251,8 +251,6 @@ def main(args: Args) -> None:
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
-        if args.algo == "dagger":
-            raise ValueError("workers ask no expert: use train.py for algo dagger")
         connect(args)
         out.mkdir(parents=True, exist_ok=True)
         learner = Learner(args, out)

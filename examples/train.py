@@ -1,4 +1,4 @@
-"""Train DDPG, TD3, SAC or TQC with hindsight experience replay, or DAgger, on any task.
+"""Train DDPG, TD3, SAC or TQC with hindsight experience replay on any task.
 
     python examples/train.py --env-id PandaPush-v1 --algo td3 --total-steps 300000
 
@@ -29,7 +29,6 @@ from tqdm import tqdm
 
 import torch_panda
 from agents import make_agent
-from experts import make_expert
 from torch_panda import Randomization
 from training.buffers import make_buffer, select_episodes
 from training.checkpoint import (
@@ -93,8 +92,6 @@ class Run:
             desired_ratio=args.desired_ratio,
             seed=args.seed,
         )
-        # DAgger: says what it would have done where the policy acts.
-        self.expert = make_expert(args.env_id) if args.algo == "dagger" else None
         self.num_demos = 0  # of each batch
         if args.demos is not None:
             demos = read_demos(args.demos, self.env)
@@ -168,8 +165,6 @@ class Run:
     def store(self, data: TensorDictBase) -> None:
         """Put episodes [num_envs, steps] into the buffer and into the statistics."""
         keep_unmoved = KEEP_UNMOVED if self.args.preset == "tuned" else 1.0
-        if self.expert is not None:
-            data, keep_unmoved = self.expert(data), 1.0
         data = select_episodes(data, keep_unmoved)
         if len(data):
             stored = self.buffer[self.buffer.extend(data.reshape(-1))]

@@ -5,7 +5,7 @@ from typing import Literal
 
 from limits import Discount, Positive, Ratio, Weight
 
-Algo = Literal["ddpg", "td3", "sac", "tqc", "dagger"]
+Algo = Literal["ddpg", "td3", "sac", "tqc"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 AugmentationKind = Literal["none", "mirror", "mirror-shift", "mirror-shift-swap"]
 
@@ -28,10 +28,10 @@ class Hyperparameters:
     action_l2: Weight = 1.0
     """DDPG, TD3: the weight of the mean squared action in the actor's loss"""
     noise_eps: Weight = 0.2
-    """DDPG, TD3, DAgger: the standard deviation of the Gaussian noise on actions"""
+    """DDPG, TD3: the standard deviation of the Gaussian noise on actions"""
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)
-    """DDPG, TD3, DAgger: the probability of a random action in the first and in the
-    last of the parallel environments; those between are evenly spaced"""
+    """DDPG, TD3: the probability of a random action in the first and in the last of the
+    parallel environments; those between are evenly spaced"""
     relative_inputs: RelativeInputs = "none"
     """give the networks positions of objects from the hand and of goals from objects,
     too ("coarse"), and these once more clipped, so that millimetres count ("fine")"""

@@ -80,11 +80,6 @@ def check(args: Args) -> None:
         ValueError: says which, and what is accepted.
     """
     check_limits(args)
-    if args.algo == "dagger" and args.her != "none":
-        raise ValueError(
-            "algo dagger needs her none: with other goals the expert would have done "
-            f"something else, got {args.her}"
-        )
     explores = args.noise_eps or any(args.random_eps)
     if args.algo in ("ddpg", "td3") and not explores:
         raise ValueError(

@@ -18,7 +18,6 @@ import evaluate
 import plot
 import train
 from agents.base import LEARNING_RATE
-from experts import pick_and_place
 from train import Args, Run, default_args, parse
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -80,29 +79,6 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
         evaluate.main(evaluate.Args(run=out, env_id="PandaPush-v1"))
     plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "all.png"))
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_dagger_learns_what_the_expert_does(tmp_path):
-    """Of episodes in which the policy acts, and with the goals that it had."""
-    options = {"algo": "dagger", "her": "none", "eval_interval": 2000}
-    args = Args(env_id="PandaPickAndPlace-v1", total_steps=400, **options)
-    run = Run(replace(args, noise_eps=0.0, random_eps=(0.0, 0.0)), tmp_path)
-    acted, store = [], run.store
-    run.store = lambda data: acted.append(data["action"].clone()) or store(data)
-    assert run.train()
-    rows = run.buffer[:]
-    run.close()
-    observed = torch.cat((rows["observation"][1:], rows["next", "observation"][-1:]))
-    going_on = ~rows["next", "done"].squeeze(1)
-    torch.testing.assert_close(
-        rows["next", "observation"][going_on], observed[going_on]
-    )
-    achieved = rows["observation"][:, 7:10]  # the cube, where the goal is to be
-    expert = pick_and_place.act(rows["observation"], achieved, rows["desired_goal"])
-    torch.testing.assert_close(rows["action"], expert)
-    acted = torch.cat([actions.reshape(-1, 4) for actions in acted])
-    assert (acted - rows["action"]).abs().mean() > 0.1
-    assert float(read_curve(tmp_path)[-1]["actor_loss"]) > 0
 
 
 @pytest.mark.parametrize(
@@ -279,7 +255,6 @@ def test_at_most_30_options_in_whole_phrases(capsys):
         ({"demos": Path("nofile.pt")}, "there is no nofile.pt: .* a file of"),
         ({"pretrain_updates": 9}, "pretrain_updates needs demos to imitate"),
         ({"noise_eps": 0.0, "random_eps": (0.0, 0.0)}, "algo ddpg explores by"),
-        ({"algo": "dagger"}, "algo dagger needs her none: .*, got relabel"),
         ({"her": "parts"}, "--her parts is for goals of several objects"),
         ({"start_at_object": 0.5}, "starts at objects need"),
         ({"out": Path("/dev/null")}, "out must be a folder, got the file /dev/null"),
