@@ -9,6 +9,7 @@ panel has four lines at most: a task with more has a panel for each algorithm.
 
 import csv
 import json
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -25,6 +26,7 @@ Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
 LINES = 4  # of a panel, at most
 COLUMNS = 3  # of panels, at most
+LABEL_WIDTH = 56  # characters; longer labels are broken: a legend takes room
 # Okabe and Ito's, which can be told apart by everybody; then with other dashes.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 DASHES = ("-", "--", ":", "-.")
@@ -113,6 +115,7 @@ def draw_panel(
         values = np.array([[curve[step] for step in steps] for curve in points])
         low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
         label = f"{name} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
+        label = textwrap.fill(label, LABEL_WIDTH)
         marker = "o" if len(steps) == 1 else None
         axes.plot(steps, median, marker=marker, label=label, **looks[name])
         axes.fill_between(steps, low, high, color=looks[name]["color"], alpha=0.2, lw=0)

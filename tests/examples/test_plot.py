@@ -127,6 +127,20 @@ def test_algorithms_share_a_panel_where_they_fit(tmp_path, figures):
     assert len(rows) == 2  # three panels are side by side
 
 
+def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
+    way = {"gamma": 0.9, "noise_eps": 0.1, "batch_size": 64, "anneal_lr": True}
+    way |= {"desired_ratio": 0.5, "updates_per_step": 0.2, "target_interval": 10}
+    args = Args(env_id="PandaPush-v1", num_envs=9, start_at_object=0.5, **way)
+    write_run(tmp_path / "way", args)
+    for task in ("Reach", "Slide"):
+        write_run(tmp_path / task, Args(env_id=f"Panda{task}-v1"))
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    assert all(axes.get_position().width > 0.2 for axes in figures[0].axes)
+    (label,) = lines_of(figures[0].axes[0])
+    assert "gamma 0.9" in label
+    assert "anneal lr" in label
+
+
 def test_band_over_the_steps_that_all_seeds_have(tmp_path, figures):
     curves = [
         {0: 0.0, 100: 0.2, 200: 0.4, 300: 0.6},
