@@ -159,6 +159,7 @@ def test_bad_ranges(options):
         Randomization(**options)
 
 
+@pytest.mark.slow
 def test_a_reset_costs_at_most_a_fifth_of_a_millisecond(capsys):
     """CPU time of the fastest resets, with and without in turn."""
     options = {"num_envs": 1, "num_threads": 1}
