@@ -160,7 +160,7 @@ def test_bad_ranges(options):
 
 
 @pytest.mark.slow
-def test_a_reset_costs_at_most_a_fifth_of_a_millisecond(capsys):
+def test_a_reset_costs_at_most_a_third_more(capsys):
     """CPU time of the fastest resets, with and without in turn."""
     options = {"num_envs": 1, "num_threads": 1}
     with make(**options) as env, make(None, **options) as plain:
@@ -169,7 +169,7 @@ def test_a_reset_costs_at_most_a_fifth_of_a_millisecond(capsys):
             start = time.process_time()
             each.episodes.reset()
             seconds[each].append(time.process_time() - start)
-    cost = min(seconds[env]) - min(seconds[plain])
+    ratio = min(seconds[env]) / min(seconds[plain])
     with capsys.disabled():
-        print(f"randomising costs {1e6 * cost:.0f} us a reset")
-    assert cost < 2e-4
+        print(f"a randomised reset takes {ratio:.2f} times a plain one")
+    assert ratio < 4 / 3
