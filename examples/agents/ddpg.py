@@ -10,11 +10,12 @@ import copy
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
 from agents.base import TAU, Agent
 from agents.hyperparameters import Hyperparameters
 from agents.imitation import imitation_loss
-from agents.networks import make_mlp, make_noise
+from agents.networks import make_mlp
 from agents.transitions import Transitions
 from torch_panda import RobotTaskEnv
 
@@ -47,6 +48,12 @@ class DDPG(Agent):
             -1 / (1 - self.gamma) if env.task.reward_type == "sparse" else None
         )
 
+        noise = AdditiveGaussianModule(
+            env.action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
+        )
+        random_action = EGreedyModule(env.action_spec)
+        # (num_envs,): compared with one random number per environment.
+        random_action.eps = torch.linspace(*hp.random_eps, env.batch_size[0])
         self.actor_parameters = list(self.actor.parameters())
         self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
         self.target: list[Tensor] = [
@@ -55,7 +62,7 @@ class DDPG(Agent):
         ]
         self.assemble(
             TensorDictModule(self.actor, ["normalized"], ["action"]),
-            make_noise(env, hp),
+            [noise, random_action],
             trained=self.online,
         )
 
