@@ -14,12 +14,12 @@ def check_fingers(env: RobotTaskEnv) -> None:
     """Make sure that the last number of an action is for the fingers.
 
     Raises:
-        ValueError: the gripper is blocked.
+        ValueError: the gripper is blocked, or there is none.
     """
-    if env.robot.observation_dim == 6:
+    if not env.robot.has_free_gripper:
         raise ValueError(
             "fine_fingers is for tasks whose actions move the fingers: not Reach, "
-            "Push, Slide or Drawer"
+            "Push, Slide, Drawer or PegInsertion"
         )
 
 

@@ -146,19 +146,20 @@ class Robot:
     @property
     def action_dim(self) -> int:
         """Number of action entries."""
-        return self._arm_action_dim + self._has_free_gripper
+        return self._arm_action_dim + self.has_free_gripper
 
     @property
     def observation_dim(self) -> int:
         """Number of entries of its part of the observation."""
-        return 6 + self._has_free_gripper
+        return 6 + self.has_free_gripper
 
     @property
     def _arm_action_dim(self) -> int:
         return {"ee": 3, "ee_pose": 6}.get(self.control_type, self.num_arm_joints)
 
     @property
-    def _has_free_gripper(self) -> bool:
+    def has_free_gripper(self) -> bool:
+        """Whether the last action entry moves the fingers."""
         return self.gripper is not None and not self.block_gripper
 
     def build(self, client: PhysicsClient) -> int:
@@ -274,7 +275,7 @@ class Robot:
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""
         parts = [simulation.ee_position, simulation.ee_velocity]
-        if self._has_free_gripper:
+        if self.has_free_gripper:
             parts.append(self.fingers_width(simulation))
         return torch.cat(parts, dim=1)
 
