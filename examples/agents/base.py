@@ -125,15 +125,19 @@ class Agent(nn.Module, ABC):
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """One gradient step of the policy alone, towards actions of demonstrations.
 
+        Differences are absolute, as in ACT (arXiv 2304.13705): where a demonstrator
+        does one of two things, what differs least from both is the more frequent one.
+        The least squares are between the two, where it does neither.
+
         Returns:
-            the mean squared difference, a scalar.
+            the mean absolute difference, a scalar.
         """
         rows = self._prepare(Transitions.from_tensordict(demos))
         states = dict(zip(STATE_KEYS, (rows.observation, rows.goal), strict=True))
         normalize, actor = self.policy.module[:2]
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = normalize(demos.empty().update(states))
-            loss = nn.functional.mse_loss(actor(td)["action"], rows.action)
+            loss = nn.functional.l1_loss(actor(td)["action"], rows.action)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

@@ -47,3 +47,17 @@ def test_policy_comes_closer_to_demonstrations(env, algo):
     assert 0 < losses[-1] < 0.9 * losses[0]
     assert not losses[-1].requires_grad
     assert all(map(torch.equal, critics, critics_of(agent)[0]))
+
+
+def test_imitates_the_more_frequent_of_two_actions(env):
+    torch.manual_seed(0)
+    agent = make_agent(env, Hyperparameters())
+    demos = make_transitions(env, 1).expand(32).clone()
+    frequent, rare = torch.tensor((0.6, -0.2, 0.4)), torch.tensor((-0.6, 0.4, -0.4))
+    demos["action"] = torch.where(torch.arange(32)[:, None] % 4 > 0, frequent, rare)
+    for count in range(300):
+        agent.set_learning_rate(1 - count / 300)
+        agent.imitate(demos.clone())
+    with torch.no_grad():
+        action = agent.policy(demos[:1].clone())["action"]
+    torch.testing.assert_close(action, frequent[None], atol=0.02, rtol=0)
