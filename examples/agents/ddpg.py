@@ -33,12 +33,9 @@ class DDPG(Agent):
     def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
         super().__init__(env, hp)
         inputs, action_size = self.state_size, self.action_size
-        norm = hp.layer_norm
-        self.actor = nn.Sequential(
-            make_mlp(inputs, action_size, layer_norm=norm), nn.Tanh()
-        )
+        self.actor = nn.Sequential(make_mlp(inputs, action_size, hp.network), nn.Tanh())
         self.critics = nn.ModuleList(
-            make_mlp(inputs + action_size, 1, layer_norm=norm)
+            make_mlp(inputs + action_size, 1, hp.network)
             for _ in range(self.num_critics)
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)

@@ -7,6 +7,7 @@ from limits import Discount, Positive, Ratio, Weight
 
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
 RelativeInputs = Literal["none", "coarse", "fine"]
+Network = Literal["paper", "layer-norm", "wide"]
 AugmentationKind = Literal["none", "mirror", "mirror-shift", "mirror-shift-swap"]
 
 
@@ -21,8 +22,9 @@ class Hyperparameters:
     the lower part of both (TQC); DDPG has one critic in any case"""
     gamma: Discount | None = None
     """the discount factor; None means 1 - 1 / (steps of an episode), as in Baselines"""
-    layer_norm: bool = False
-    """normalise the units of every hidden layer (LayerNorm)"""
+    network: Network = "paper"
+    """the hidden layers of actors and critics: three of 256 units ("paper"), each of
+    them normalised by LayerNorm ("layer-norm"), or three of 448 such units ("wide")"""
     target_interval: Positive = 1
     """gradient steps between two moves of the target networks"""
     action_l2: Weight = 1.0

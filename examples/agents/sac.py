@@ -22,8 +22,8 @@ class SAC(Agent):
 
     def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
         super().__init__(env, hp)
-        inputs, norm = self.state_size, hp.layer_norm
-        net = make_mlp(inputs, 2 * self.action_size, layer_norm=norm)
+        inputs = self.state_size
+        net = make_mlp(inputs, 2 * self.action_size, hp.network)
         parameters = nn.Sequential(net, NormalParamExtractor())
         actor = ProbabilisticActor(
             TensorDictModule(parameters, ["normalized"], ["loc", "scale"]),
@@ -31,7 +31,7 @@ class SAC(Agent):
             distribution_class=TanhNormal,
         )
         critic = TensorDictModule(
-            make_mlp(inputs + self.action_size, self.critic_outputs, layer_norm=norm),
+            make_mlp(inputs + self.action_size, self.critic_outputs, hp.network),
             ["normalized", "action"],
             ["state_action_value"],
         )

@@ -90,7 +90,7 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
         {"her": "augment"},
         {"her": "none", "random_eps": (0.1, 0.9)},
         {"preset": "tuned", "relative_inputs": "fine", "augmentation": "mirror-shift"},
-        {"start_at_object": 0.5, "target_interval": 3, "layer_norm": True},
+        {"start_at_object": 0.5, "target_interval": 3, "network": "layer-norm"},
         {"desired_ratio": 0.5, "anneal_lr": True},
     ],
     ids=lambda options: "-".join(map(str, options.values())),

@@ -7,6 +7,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MLP
 from torchrl.objectives import DDPGLoss, TD3Loss
 
 import torch_panda
@@ -137,10 +138,13 @@ def test_small_actions_are_preferred(env, algo):
     torch.testing.assert_close(losses[1] - losses[0], penalty)
 
 
-@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize(
+    ("network", "size", "is_normalized"),
+    [("paper", 256, False), ("layer-norm", 256, True), ("wide", 448, True)],
+)
 @pytest.mark.parametrize("algo", ALGOS)
-def test_a_gradient_step_trains_all_networks(env, algo, layer_norm):
-    agent = make(env, algo, layer_norm=layer_norm)
+def test_a_gradient_step_trains_all_networks(env, algo, network, size, is_normalized):
+    agent = make(env, algo, network=network)
     before = {key: x.clone() for key, x in agent.named_parameters()}
     trained = {key for key, x in agent.named_parameters() if x.requires_grad}
     online, target = critics_of(agent)
@@ -155,7 +159,10 @@ def test_a_gradient_step_trains_all_networks(env, algo, layer_norm):
     moved = [a.lerp(b, TAU) for a, b in zip(before_target, online, strict=True)]
     torch.testing.assert_close([x.data for x in target], [x.data for x in moved])
     norms = [m for m in agent.modules() if isinstance(m, nn.LayerNorm)]
-    assert bool(norms) == layer_norm
+    assert bool(norms) == is_normalized
+    hidden = [x for m in agent.modules() if isinstance(m, MLP) for x in list(m)[:-1]]
+    sizes = {x.out_features for x in hidden if isinstance(x, nn.Linear)}
+    assert sizes == {size}
 
 
 @pytest.mark.parametrize("algo", ALGOS)
