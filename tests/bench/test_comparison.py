@@ -1,11 +1,14 @@
 """What is compared, and what is left out."""
 
+from contextlib import closing
+
 import pytest
+import torch
 
 from torch_panda.bench import comparison
 from torch_panda.bench.processes import available_memory
 from torch_panda.bench.runner import ContenderError
-from torch_panda.bench.stepping import Setting
+from torch_panda.bench.stepping import BareBulletContender, Setting
 
 SETTING = Setting("PandaPush-v3", num_envs=2, num_threads=1)
 
@@ -51,7 +54,7 @@ def test_what_does_not_fit_at_once_is_made_anew_for_each_round(monkeypatch, free
     assert not absences
     assert [result.contender for result in results] == ["torch_panda", "fast"]
     assert all(len(result.speeds) == len(result.ratios) == 1 for result in results)
-    assert all(result.footprint is not None for result in results)
+    assert all(result.footprint.creation > 0 for result in results)
     assert largest == most
 
 
@@ -59,3 +62,19 @@ def test_our_own_must_fit(monkeypatch):
     monkeypatch.setattr(comparison, "available_memory", lambda: 80.0)
     with pytest.raises(ContenderError, match=r"2 environments need about 0\.1 GB, "):
         run([])
+
+
+def test_bare_bullet_repeats_an_episode():
+    """Its clients are torch_panda's own, and go through the same states each time."""
+    with closing(BareBulletContender(Setting("PandaPush-v3", 2, 2))) as contender:
+        state = contender._env.episodes.simulation.joint_position
+        episodes = []
+        for _ in range(2):
+            positions = []
+            for _ in range(50):
+                contender.step()
+                positions.append(state.clone())
+            episodes.append(torch.stack(positions))
+    first, second = episodes
+    assert torch.equal(first, second)
+    assert first.std(dim=0).max() > 0.01  # [rad]: it moves

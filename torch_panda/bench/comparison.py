@@ -4,11 +4,10 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from torch_panda.bench.bare_bullet import Speed
 from torch_panda.bench.contenders import CONTENDERS, OURS
 from torch_panda.bench.processes import available_memory
 from torch_panda.bench.runner import ContenderError, Footprint, Runner
-from torch_panda.bench.stepping import Setting
+from torch_panda.bench.stepping import Setting, Speed
 
 # Called with what is being done, whenever a piece of the work begins.
 Progress = Callable[[str], None]
@@ -23,14 +22,14 @@ class Result:
         contender: its name, a key of `CONTENDERS`.
         speeds: steps of all environments together, a round each.
         ratios: torch_panda's speed over this one's, a round each.
-        footprint: what the environments cost; None where it was not measured.
+        footprint: what the environments cost.
     """
 
     setting: Setting
     contender: str
     speeds: tuple[Speed, ...]
     ratios: tuple[Speed, ...]
-    footprint: Footprint | None
+    footprint: Footprint
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def compare(
         else:
             absences.append(Absence(setting, name, reason))
     needed = sum(CONTENDERS[name].memory for name in fitting) * setting.num_envs
-    footprints: dict[str, Footprint | None] = {}
+    footprints: dict[str, Footprint] = {}
     with ExitStack() as stack:
         living: dict[str, Runner] = {}
         for name in fitting:

@@ -13,7 +13,6 @@ import gymnasium
 from torchrl.envs import GymEnv, ParallelEnv
 
 import torch_panda
-from torch_panda.bench.bare_bullet import is_available
 from torch_panda.bench.stepping import (
     BareBulletContender,
     Contender,
@@ -21,6 +20,7 @@ from torch_panda.bench.stepping import (
     TorchRLContender,
     VectorEnvContender,
 )
+from torch_panda.bullet.native import loop_name
 
 # Workers are forked, as Gymnasium does by default on Linux: that is how they start
 # fastest and share most memory.
@@ -109,7 +109,7 @@ class Entry:
         make: makes it.
         memory: what one of its environments takes, about [MB].
         needs: modules that must be installed.
-        is_limit: whether it is Bullet alone: no environments that could be reset.
+        is_native: whether it is the loop that was compiled.
         is_fetch: whether it runs the Fetch robot's task of the same name.
     """
 
@@ -117,15 +117,13 @@ class Entry:
     make: Callable[[Setting], Contender]
     memory: float
     needs: tuple[str, ...] = ()
-    is_limit: bool = False
+    is_native: bool = False
     is_fetch: bool = False
 
     def why_not(self, setting: Setting, memory: float) -> str | None:
         """Why it cannot be measured here, with so much memory [MB]; None: it can."""
-        if self.is_limit and (setting.task != "Push" or setting.is_joints):
-            return "it steps the scene of Push, with end-effector control, only"
-        if self.is_limit and not is_available():
-            return "needs Linux and a C compiler (cc)"
+        if self.is_native and loop_name() != "native":
+            return "torch_panda was installed without its native loop"
         if self.is_fetch and (setting.task not in _FETCH_TASKS or setting.is_joints):
             return f"Fetch has no task like {setting.env_id}"
         missing = [module for module in self.needs if find_spec(module) is None]
@@ -147,7 +145,7 @@ CONTENDERS: dict[str, Entry] = {
         'torch_panda, physics="fast"', partial(_make_ours, "fast"), memory=45
     ),
     "bare-bullet": Entry(
-        "bare Bullet, C threads", BareBulletContender, memory=45, is_limit=True
+        "bare Bullet, C threads", BareBulletContender, memory=45, is_native=True
     ),
     "async": Entry(
         "panda-gym, AsyncVectorEnv",

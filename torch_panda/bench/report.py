@@ -66,11 +66,7 @@ def write_json(
 
 def _row(result: Result) -> tuple[str, ...]:
     setting, footprint = result.setting, result.footprint
-    costs = ["-", "-", "-"]
-    if footprint is not None:
-        costs = [f"{1e3 * footprint.creation:.0f}", "-", f"{1e3 * footprint.reset:.2f}"]
-        if footprint.memory is not None:
-            costs[1] = f"{footprint.memory:.0f}"
+    memory = "-" if footprint.memory is None else f"{footprint.memory:.0f}"
     return (
         setting.env_id,
         str(setting.num_envs),
@@ -80,7 +76,9 @@ def _row(result: Result) -> tuple[str, ...]:
         _spread([ratio.per_second for ratio in result.ratios], digits=2),
         _spread([speed.per_cpu_second for speed in result.speeds], digits=0),
         _spread([ratio.per_cpu_second for ratio in result.ratios], digits=2),
-        *costs,
+        f"{1e3 * footprint.creation:.0f}",
+        memory,
+        f"{1e3 * footprint.reset:.2f}",
     )
 
 

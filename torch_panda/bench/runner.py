@@ -9,10 +9,9 @@ from typing import Any
 
 import torch
 
-from torch_panda.bench.bare_bullet import Speed
 from torch_panda.bench.contenders import CONTENDERS
 from torch_panda.bench.processes import memory
-from torch_panda.bench.stepping import Setting
+from torch_panda.bench.stepping import Setting, Speed
 from torch_panda.closing import Closing
 
 _RESETS = 5
@@ -60,7 +59,7 @@ class Runner(Closing):
         self._process.start()
         theirs.close()
         try:
-            self.footprint: Footprint | None = self._receive()
+            self.footprint: Footprint = self._receive()
         except BaseException:
             self.close()
             raise
@@ -101,25 +100,22 @@ def _serve(pipe: Connection, name: str, setting: Setting) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     entry = CONTENDERS[name]
     try:
-        if entry.is_limit:
-            contender, footprint = entry.make(setting), None
-        else:
-            # One environment is made before, so that imports are not counted.
-            first = entry.make(replace(setting, num_envs=1, num_threads=1))
-            before, start = memory(), time.perf_counter()
-            contender = entry.make(setting)
-            created = time.perf_counter()
-            after = memory()
-            for _ in range(_RESETS):
-                contender.reset()
-            reset = (time.perf_counter() - created) / _RESETS
-            n = setting.num_envs
-            footprint = Footprint(
-                creation=(created - start) / n,
-                memory=(after - before) / n if after and before else None,
-                reset=reset / n,
-            )
-            first.close()
+        # One environment is made before, so that imports are not counted.
+        first = entry.make(replace(setting, num_envs=1, num_threads=1))
+        before, start = memory(), time.perf_counter()
+        contender = entry.make(setting)
+        created = time.perf_counter()
+        after = memory()
+        for _ in range(_RESETS):
+            contender.reset()
+        reset = (time.perf_counter() - created) / _RESETS
+        n = setting.num_envs
+        footprint = Footprint(
+            creation=(created - start) / n,
+            memory=(after - before) / n if after and before else None,
+            reset=reset / n,
+        )
+        first.close()
         pipe.send(footprint)
         while True:
             try:

@@ -1,19 +1,32 @@
 """What is measured at once, and how its environments are stepped."""
 
 import re
-import tempfile
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from torch_panda.bench.bare_bullet import Speed, load_bare_bullet
+import torch_panda
 from torch_panda.bench.processes import cpu_time
+from torch_panda.bullet.body_state import Doubles
+
+
+class Speed(NamedTuple):
+    """Steps of all environments together, by two clocks.
+
+    Attributes:
+        per_second: steps per second.
+        per_cpu_second: steps per second of processor time, of all processes; other
+            work on the machine hardly changes it.
+    """
+
+    per_second: float
+    per_cpu_second: float
 
 
 @dataclass(frozen=True)
@@ -113,25 +126,52 @@ class VectorEnvContender(Contender):
 
 
 class BareBulletContender(Contender):
-    """The Push scene, stepped by C threads that never wait for each other."""
+    """The loop of torch_panda's environments, with nothing between its steps.
+
+    It repeats an episode of random actions: the start and the setpoints are kept.
+    """
 
     def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-        self._directory = tempfile.TemporaryDirectory()
-        self._run = load_bare_bullet(self._directory.name)
+        self._env = torch_panda.make(
+            setting.env_id,
+            num_envs=setting.num_envs,
+            num_threads=setting.num_threads,
+            seed=0,
+        )
+        self._env.reset()
+        self._simulation = simulation = self._env.episodes.simulation
+        state = (
+            simulation.joint_position,
+            simulation.joint_velocity,
+            simulation.object_pose,
+            simulation.object_velocity,
+            simulation.object_joint_position,
+            simulation.object_joint_velocity,
+        )
+        self._start = [(tensor, tensor.clone()) for tensor in state]
+        self._control = self._env.robot.motor_control
+        self._setpoints: list[Doubles] = []
+        for _ in range(self._env.max_episode_steps):
+            action = self._env.action_spec.rand()
+            setpoint = self._env.robot.setpoint(action, simulation).numpy()
+            simulation.step(self._control, setpoint)
+            self._setpoints.append(setpoint)
+        self._num_steps = 0
 
     def step(self) -> None:
-        """Not available: all its steps run in C, see `measure`."""
-        raise NotImplementedError
+        """Step all clients once."""
+        index = self._num_steps % len(self._setpoints)
+        if index == 0:
+            self.reset()
+        self._simulation.step(self._control, self._setpoints[index])
+        self._num_steps += 1
 
     def reset(self) -> None:
-        """Not available: its resets run in C."""
-        raise NotImplementedError
+        """Put all clients to the start."""
+        for tensor, start in self._start:
+            tensor.copy_(start)
+        self._simulation.reset(range(self._simulation.num_envs))
 
     def close(self) -> None:
-        """Remove the compiled library."""
-        self._directory.cleanup()
-
-    def measure(self, num_envs: int, steps: int) -> Speed:
-        """Build the environments, then time their steps."""
-        return self._run(num_envs, self._setting.num_threads, steps)
+        """Free all of it."""
+        self._env.close()
