@@ -20,7 +20,7 @@ from torch_panda.rotations import rotation_distance as distance
 
 # Widths of the fingers [m]: around the cube, closing on it, holding it as firmly as it
 # takes, and where it begins to slip; by what action they loosen and then stay so.
-WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0385
+WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0395
 CATCH = 0.034  # while it swings: closing faster would squeeze it out
 LOOSEN, STAY = 0.0012, -0.001
 ASIDE = 0.014  # [m] beside the cube's centre, so that its weight turns it
@@ -68,12 +68,14 @@ class Plan(NamedTuple):
         pitch: quarter turns about y that come first, each set down again.
         yaw: quarter turns about z that follow.
         swing: whether a swing comes last.
+        stops: whether it lies so when it has stopped spinning, not on the way.
     """
 
     lying: Tensor
     pitch: Tensor
     yaw: Tensor
     swing: Tensor
+    stops: Tensor
 
 
 def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
@@ -100,7 +102,7 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
     caught, turns, swing = best // 32, best // 2 % 16, best % 2 == 1
     lying = lying.take_along_dim(caught[..., None], -2).squeeze(-2)
     pitch, yaw = QUARTERS.to(cube)[turns.squeeze(-1)].split(1, -1)
-    return Plan(lying, pitch, yaw, swing)
+    return Plan(lying, pitch, yaw, swing, caught == 2)
 
 
 def descend(ee: Tensor, point: Tensor) -> Tensor:
@@ -147,7 +149,7 @@ def grasp(
     point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)
     error = (point - ee).abs()
     slides = norm(velocity[..., :2]) > 0.05
-    near = (error < error.new_tensor((0.008, 0.012, 0.01))).all(-1, True)
+    near = (error < error.new_tensor((0.008, 0.02, 0.01))).all(-1, True)
     near = near & (slides | (error[..., :1] < 0.006)) & ripe
     fingers = torch.where(near, open_to(width, CLOSE), open_to(width, WIDE))
     return torch.cat((descend(ee, point), fingers), -1)
@@ -215,7 +217,9 @@ def act(
     set_down = compose(turn(1, plan.pitch * math.pi / 2), plan.lying)
     _, pitch = best_pitch(cube, torch.where(last, goal, set_down))
     swings = plan.swing | (plan.pitch != 0)
-    leave = ~swings & (plan.yaw == 0) | (left < DONE) & (turning < 0.5) & on_table
+    stays = plan.stops | (spin_z.abs() < 0.5)
+    leave = ~swings & (plan.yaw == 0) & stays
+    leave = leave | (left < DONE) & (turning < 0.5) & on_table
 
     # The fingers straighten a cube that they close on at its centre; straight, it is
     # grasped aside. One that spins is caught when it is nearly straight as planned.
