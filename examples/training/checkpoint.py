@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from agents import Agent
 from training import files
+from training.policies import save_policy
 
 RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
 SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
@@ -57,7 +58,7 @@ class Checkpoint:
     progress: Progress
 
     def save(self) -> None:
-        """Write the state."""
+        """Write the state, and the policy as it is: also one that still imitates."""
         state = {
             "args": fixed(self.args),
             "agent": self.agent.state_dict(),
@@ -69,6 +70,8 @@ class Checkpoint:
             "progress": asdict(self.progress),
         }
         files.save(self.path, state)
+        policy = self.path.with_name("checkpoint.pt")
+        save_policy(policy, self.agent, self.args.env_id)
 
     def load(self) -> None:
         """Take what `save` wrote.

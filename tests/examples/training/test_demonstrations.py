@@ -9,6 +9,7 @@ from tests.examples.test_train import After
 from train import Args, Run
 from training import demonstrations
 from training.demonstrations import make_demo_buffer, read_demos
+from training.policies import read_checkpoint
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -109,6 +110,8 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
     assert not stopped.train(After(15))
     stopped.close()
     assert len(stopped.progress.curve) == 1
+    kept, policy = read_checkpoint(tmp_path)["policy"], stopped.agent.policy
+    torch.testing.assert_close(kept, dict(policy.state_dict()), rtol=0, atol=0)
     args.resume = True
     resumed = Run(args, tmp_path)
     assert resumed.progress.pretrained == 15
