@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from torch_panda.bench import comparison
+from torch_panda.bench.contenders import CONTENDERS
 from torch_panda.bench.processes import available_memory
 from torch_panda.bench.runner import ContenderError
-from torch_panda.bench.stepping import BareBulletContender, Setting
+from torch_panda.bench.stepping import Setting
 
 SETTING = Setting("PandaPush-v3", num_envs=2, num_threads=1)
 
@@ -66,7 +67,8 @@ def test_our_own_must_fit(monkeypatch):
 
 def test_bare_bullet_repeats_an_episode():
     """Its clients are torch_panda's own, and go through the same states each time."""
-    with closing(BareBulletContender(Setting("PandaPush-v3", 2, 2))) as contender:
+    setting = Setting("PandaPush-v3", num_envs=2, num_threads=2)
+    with closing(CONTENDERS["bare-bullet"].make(setting)) as contender:
         state = contender._env.episodes.simulation.joint_position
         episodes = []
         for _ in range(2):

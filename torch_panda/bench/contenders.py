@@ -28,16 +28,24 @@ _START_METHOD = "fork"
 _FETCH_TASKS = ("Reach", "Push", "Slide", "PickAndPlace")
 
 
-def _make_ours(physics: torch_panda.PhysicsName, setting: Setting) -> Contender:
-    return TorchRLContender(
-        torch_panda.make(
-            setting.env_id,
-            num_envs=setting.num_envs,
-            num_threads=setting.num_threads,
-            seed=0,
-            physics=physics,
-        )
+def _make_env(
+    setting: Setting, physics: torch_panda.PhysicsName = "exact"
+) -> torch_panda.RobotTaskEnv:
+    return torch_panda.make(
+        setting.env_id,
+        num_envs=setting.num_envs,
+        num_threads=setting.num_threads,
+        seed=0,
+        physics=physics,
     )
+
+
+def _make_ours(physics: torch_panda.PhysicsName, setting: Setting) -> Contender:
+    return TorchRLContender(_make_env(setting, physics))
+
+
+def _make_bare_bullet(setting: Setting) -> Contender:
+    return BareBulletContender(_make_env(setting))
 
 
 def _panda_gym_id(setting: Setting) -> str:
@@ -145,7 +153,7 @@ CONTENDERS: dict[str, Entry] = {
         'torch_panda, physics="fast"', partial(_make_ours, "fast"), memory=45
     ),
     "bare-bullet": Entry(
-        "bare Bullet, C threads", BareBulletContender, memory=45, is_native=True
+        "bare Bullet, C threads", _make_bare_bullet, memory=45, is_native=True
     ),
     "async": Entry(
         "panda-gym, AsyncVectorEnv",

@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-import torch_panda
 from torch_panda.bench.processes import cpu_time
 from torch_panda.bullet.body_state import Doubles
+from torch_panda.envs import RobotTaskEnv
 
 
 class Speed(NamedTuple):
@@ -128,18 +128,13 @@ class VectorEnvContender(Contender):
 class BareBulletContender(Contender):
     """The loop of torch_panda's environments, with nothing between its steps.
 
-    It repeats an episode of random actions: the start and the setpoints are kept.
+    It repeats an episode of random actions, whose setpoints are found the first time.
     """
 
-    def __init__(self, setting: Setting) -> None:
-        self._env = torch_panda.make(
-            setting.env_id,
-            num_envs=setting.num_envs,
-            num_threads=setting.num_threads,
-            seed=0,
-        )
-        self._env.reset()
-        self._simulation = simulation = self._env.episodes.simulation
+    def __init__(self, env: RobotTaskEnv) -> None:
+        self._env = env
+        env.reset()
+        self._simulation = simulation = env.episodes.simulation
         state = (
             simulation.joint_position,
             simulation.joint_velocity,
@@ -149,21 +144,19 @@ class BareBulletContender(Contender):
             simulation.object_joint_velocity,
         )
         self._start = [(tensor, tensor.clone()) for tensor in state]
-        self._control = self._env.robot.motor_control
+        self._control = env.robot.motor_control
         self._setpoints: list[Doubles] = []
-        for _ in range(self._env.max_episode_steps):
-            action = self._env.action_spec.rand()
-            setpoint = self._env.robot.setpoint(action, simulation).numpy()
-            simulation.step(self._control, setpoint)
-            self._setpoints.append(setpoint)
-        self._num_steps = 0
+        self._num_steps = 0  # of this episode
 
     def step(self) -> None:
         """Step all clients once."""
-        index = self._num_steps % len(self._setpoints)
-        if index == 0:
+        if self._num_steps == self._env.max_episode_steps:
             self.reset()
-        self._simulation.step(self._control, self._setpoints[index])
+        if self._num_steps == len(self._setpoints):
+            action = self._env.action_spec.rand()
+            setpoint = self._env.robot.setpoint(action, self._simulation)
+            self._setpoints.append(setpoint.numpy())
+        self._simulation.step(self._control, self._setpoints[self._num_steps])
         self._num_steps += 1
 
     def reset(self) -> None:
@@ -171,6 +164,7 @@ class BareBulletContender(Contender):
         for tensor, start in self._start:
             tensor.copy_(start)
         self._simulation.reset(range(self._simulation.num_envs))
+        self._num_steps = 0
 
     def close(self) -> None:
         """Free all of it."""
