@@ -152,7 +152,7 @@ struct row client_row(const struct batch *batch, int env) {
     const struct scene *scene = batch->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
     int num_object_joints = scene->num_object_joints;
-    size_t size = 2 * n + 10 + 16 * num_objects + 2 * num_object_joints;
+    size_t size = 2 * n + 10 + 19 * num_objects + 2 * num_object_joints;
     struct row row;
     row.joint_position = batch->state + env * size;
     row.joint_velocity = row.joint_position + n;
@@ -160,10 +160,9 @@ struct row client_row(const struct batch *batch, int env) {
     row.ee_velocity = row.ee_position + 3;
     row.ee_orientation = row.ee_velocity + 3;
     row.object_pose = row.ee_orientation + 4;
-    row.object_velocity = row.object_pose + 7 * num_objects;
-    row.object_joint_position = row.object_velocity + 6 * num_objects;
+    row.object_joint_position = row.object_pose + 7 * num_objects;
     row.object_joint_velocity = row.object_joint_position + num_object_joints;
-    row.object_euler = row.object_joint_velocity + num_object_joints;
+    row.object_state = row.object_joint_velocity + num_object_joints;
     return row;
 }
 
@@ -181,11 +180,13 @@ int client_read_state(struct batch *batch, int env) {
     for (int k = 0, first = 0; k < scene->num_objects; k++) {
         if (!ask_state(batch, env, scene->objects[k], &body)) return 0;
         int count = scene->object_joint_counts[k];
+        double *state = row.object_state + STATE_SIZE * k;
         copy(row.object_pose + 7 * k, body.q, 7);
-        copy(row.object_velocity + 6 * k, body.u, 6);
+        copy(state, body.q, 3);
+        euler_angles(body.q + 3, state + 3);
+        copy(state + VELOCITY, body.u, 6);
         copy(row.object_joint_position + first, body.q + Q_OFFSET, count);
         copy(row.object_joint_velocity + first, body.u + U_OFFSET, count);
-        euler_angles(body.q + 3, row.object_euler + 3 * k);
         first += count;
     }
     return 1;

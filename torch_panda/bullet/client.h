@@ -110,10 +110,11 @@ struct batch { /* many clients of one scene */
     doubles setpoint;              /* a row a client */
 };
 
+enum { STATE_SIZE = 12, VELOCITY = 6 }; /* position, Euler angles, velocity */
 struct row { /* a client's */
     double *joint_position, *joint_velocity, *ee_position, *ee_velocity;
-    double *ee_orientation, *object_pose, *object_velocity, *object_joint_position;
-    double *object_joint_velocity, *object_euler;
+    double *ee_orientation, *object_pose, *object_joint_position;
+    double *object_joint_velocity, *object_state; /* STATE_SIZE an object */
 };
 
 struct row client_row(const struct batch *batch, int env);

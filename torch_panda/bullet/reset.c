@@ -107,7 +107,7 @@ static int place(struct batch *batch, int env) {
             return 0;
     for (int k = 0; k < scene->num_objects; k++)
         if (!set_base(batch, env, scene->objects[k], row.object_pose + 7 * k,
-                      row.object_velocity + 6 * k))
+                      row.object_state + STATE_SIZE * k + VELOCITY))
             return 0;
     for (int k = 0, first = 0; k < scene->num_objects; k++) {
         int count = scene->object_joint_counts[k];

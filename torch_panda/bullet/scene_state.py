@@ -35,7 +35,7 @@ class SceneState:
                 self._jointed_objects.append((body, joints, own))
                 n_more += len(joints)
         arm = (n_joints, n_joints, 3, 3, 4)
-        sizes = (*arm, 7 * n_objects, 6 * n_objects, n_more, n_more, 3 * n_objects)
+        sizes = (*arm, 7 * n_objects, n_more, n_more, 12 * n_objects)
         # In one tensor, which one check finds finite or not.
         self.rows = torch.zeros(num_envs, sum(sizes), dtype=torch.float64, device="cpu")
         (
@@ -45,14 +45,15 @@ class SceneState:
             self.ee_velocity,
             self.ee_orientation,
             object_pose,
-            object_velocity,
             self.object_joint_position,
             self.object_joint_velocity,
-            object_euler,
+            object_state,
         ) = self.rows.split(sizes, dim=1)
+        self.ee_state = self.rows[:, 2 * n_joints : 2 * n_joints + 6]
         self.object_pose = object_pose.unflatten(1, (n_objects, 7))
-        self.object_velocity = object_velocity.unflatten(1, (n_objects, 6))
-        self.object_euler = object_euler.unflatten(1, (n_objects, 3))
+        self.object_state = object_state.unflatten(1, (n_objects, 12))
+        self.object_euler = self.object_state[..., 3:6]
+        self.object_velocity = self.object_state[..., 6:]
         self.marker_pose = torch.zeros(
             num_envs, len(scene.markers), 7, dtype=torch.float64, device="cpu"
         )
@@ -94,7 +95,7 @@ class SceneState:
         joints, speeds, ee_position, ee_velocity, ee_orientation, *objects = (
             self._parts[env]
         )
-        poses, velocities, object_joints, object_speeds, angles = objects
+        poses, object_joints, object_speeds, states = objects
         state = client.state(scene.robot, link_velocities=True)
         joints[:] = state.joint_positions
         speeds[:] = state.joint_velocities
@@ -103,9 +104,11 @@ class SceneState:
         ee_velocity[:] = state.link_velocity(scene.ee_link)[:3]
         for k, body in enumerate(scene.objects):
             state = client.state(body)
-            poses[7 * k : 7 * k + 7] = state.base_pose
-            velocities[6 * k : 6 * k + 6] = state.base_velocity
-            angles[3 * k : 3 * k + 3] = euler_angles(*state.base_pose[3:].tolist())
+            pose = poses[7 * k : 7 * k + 7]
+            pose[:] = state.base_pose
+            angles = euler_angles(*pose[3:].tolist())
+            observed = (*pose[:3], *angles, *state.base_velocity)
+            states[12 * k : 12 * k + 12] = observed
         for body, _, own in self._jointed_objects:
             state = client.state(body)
             object_joints[own] = state.joint_positions

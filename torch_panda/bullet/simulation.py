@@ -37,8 +37,10 @@ class VectorSimulation:
         joint_velocity: (num_envs, n_joints) [rad/s] or [m/s].
         ee_position: (num_envs, 3) [m].
         ee_velocity: (num_envs, 3) [m/s].
+        ee_state: (num_envs, 6), both.
         ee_orientation: (num_envs, 4), quaternion xyzw.
         object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
+        object_state: (num_envs, n_objects, 12), position, Euler angles and velocity.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
         object_joint_position: (num_envs, n_object_joints) [rad] or [m], of all joints
             of the first object, then of the next.
@@ -93,8 +95,10 @@ class VectorSimulation:
         self.joint_velocity = self._state.joint_velocity
         self.ee_position = self._state.ee_position
         self.ee_velocity = self._state.ee_velocity
+        self.ee_state = self._state.ee_state
         self.ee_orientation = self._state.ee_orientation
         self.object_pose = self._state.object_pose
+        self.object_state = self._state.object_state
         self.object_velocity = self._state.object_velocity
         self.object_joint_position = self._state.object_joint_position
         self.object_joint_velocity = self._state.object_joint_velocity

@@ -274,10 +274,9 @@ class Robot:
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""
-        parts = [simulation.ee_position, simulation.ee_velocity]
-        if self.has_free_gripper:
-            parts.append(self.fingers_width(simulation))
-        return torch.cat(parts, dim=1)
+        if not self.has_free_gripper:
+            return simulation.ee_state
+        return torch.cat((simulation.ee_state, self.fingers_width(simulation)), dim=1)
 
     def fingers_width(self, simulation: VectorSimulation) -> Tensor:
         """Distance between the fingers [m]: (num_envs, 1), float64.

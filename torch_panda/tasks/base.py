@@ -252,6 +252,4 @@ class Task(ABC):
 
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
     """Position, Euler angles [rad] and velocity of an object: (num_envs, 12)."""
-    position = simulation.object_pose[:, index, :3]
-    euler, velocity = simulation.object_euler, simulation.object_velocity
-    return torch.cat((position, euler[:, index], velocity[:, index]), dim=1)
+    return simulation.object_state[:, index]

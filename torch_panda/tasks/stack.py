@@ -13,7 +13,6 @@ from torch_panda.tasks.base import (
     Bodies,
     RewardType,
     Task,
-    object_observation,
 )
 from torch_panda.tasks.table import (
     CUBE,
@@ -108,8 +107,7 @@ class Stack(Task):
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, Euler angles and velocity of both cubes: (num_envs, 24)."""
-        cubes = (object_observation(simulation, 0), object_observation(simulation, 1))
-        return torch.cat(cubes, dim=1)
+        return simulation.object_state.flatten(1)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """The positions of both cubes: (num_envs, 6)."""
