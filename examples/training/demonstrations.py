@@ -65,15 +65,17 @@ def pretrain(
     *,
     updates: int,
     batch_size: int,
+    learning_rate: float = 1.0,
     stop: object = False,
 ) -> None:
     """Take gradient steps that only imitate, from where the run is, and save it.
 
     Args:
-        checkpoint: of the run, whose learning rate falls to 0 meanwhile.
+        checkpoint: of the run.
         demos: to imitate.
         updates: gradient steps, over all.
         batch_size: transitions per gradient step.
+        learning_rate: at first, of that of training; it falls to 0 meanwhile.
         stop: ends this early when it is true.
     """
     agent, progress = checkpoint.agent, checkpoint.progress
@@ -82,7 +84,7 @@ def pretrain(
     )
     while progress.pretrained < updates and not stop:
         started = time.perf_counter()
-        agent.set_learning_rate(1 - progress.pretrained / updates)
+        agent.set_learning_rate(learning_rate * (1 - progress.pretrained / updates))
         agent.imitate(demos.sample(batch_size))
         progress.pretrained += 1
         progress.seconds += time.perf_counter() - started

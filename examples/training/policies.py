@@ -35,8 +35,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return files.read(path, "a policy", keys, map_location="cpu")
 
 
-def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> TensorDictModuleBase:
-    """The policy of a checkpoint that `save_policy` wrote.
+def load_agent(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Agent:
+    """A new agent with the policy of a checkpoint that `save_policy` wrote.
 
     Raises:
         ValueError: the environment's spaces are not those it was trained on, or
@@ -48,12 +48,17 @@ def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> TensorDictModu
             f"the policy was saved by another version, with options that this one does "
             f"not have: {', '.join(sorted(unknown))}"
         )
-    policy = make_agent(env, Hyperparameters(**options)).policy
+    agent = make_agent(env, Hyperparameters(**options))
     try:
-        policy.load_state_dict(checkpoint["policy"])
+        agent.policy.load_state_dict(checkpoint["policy"])
     except RuntimeError:
         raise ValueError(
             f"the policy was trained on {checkpoint['env_id']}, whose spaces are not "
             "those of this environment"
         ) from None
-    return policy
+    return agent
+
+
+def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> TensorDictModuleBase:
+    """The policy of a checkpoint; raises as `load_agent`."""
+    return load_agent(checkpoint, env).policy

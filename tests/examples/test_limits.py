@@ -22,7 +22,7 @@ def numbers(hint):
 
 
 @pytest.mark.parametrize(
-    "script", ["train", "evaluate", "record_demos", "watch", "distributed"]
+    "script", ["train", "evaluate", "record_demos", "refine", "watch", "distributed"]
 )
 def test_every_number_has_a_limit(script):
     if script == "distributed":
