@@ -1,6 +1,6 @@
 """Refine a policy by hindsight alone: it imitates itself, asked for what it achieved.
 
-    python examples/refine.py examples/policies/PandaSlide-v1.pt --out runs/slide
+    python examples/refine.py runs/PandaSlide-v1-ddpg-relabel-0 --out runs/slide
 
 A policy that nearly does what it is asked for does exactly what it achieves. So it
 plays, its episodes' goals become what they achieved at their end, and it imitates them:

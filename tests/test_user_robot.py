@@ -114,6 +114,15 @@ def pick_and_place(env, steps):
     return td
 
 
+def test_a_tool_weighs_nothing(file):
+    robot = make_gantry(file)
+    with RobotTaskEnv(robot=robot, task=Reach()) as env:
+        simulation = env.episodes.simulation
+        body, client = simulation.scene.robot, simulation.clients[0]
+        assert client.mass(body, robot.ee_link) == 0.0
+        assert client.mass(body, robot.ee_link - 1) == 0.1
+
+
 def test_it_grasps(file):
     robot, task = make_gantry(file), PickAndPlace()
     with RobotTaskEnv(

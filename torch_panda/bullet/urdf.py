@@ -89,7 +89,12 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     for mesh in tree.iter("mesh"):
         if (found := find_mesh(mesh.get("filename", ""), source)) is not None:
             mesh.set("filename", str(found))
-    robot.append(ElementTree.fromstring("<link name='tool'/>"))
+    # A link without this would weigh 1 kg, Bullet's default.
+    nothing = (
+        "<mass value='0'/><inertia ixx='0' iyy='0' izz='0' ixy='0' ixz='0' iyz='0'/>"
+    )
+    link = f"<link name='tool'><inertial>{nothing}</inertial></link>"
+    robot.append(ElementTree.fromstring(link))
     x, y, z = tool.position
     robot.append(
         ElementTree.fromstring(
