@@ -152,7 +152,7 @@ struct row client_row(const struct batch *batch, int env) {
     const struct scene *scene = batch->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
     int num_object_joints = scene->num_object_joints;
-    size_t size = 2 * n + 10 + 19 * num_objects + 2 * num_object_joints;
+    size_t size = 2 * n + 10 + (7 + STATE_SIZE) * num_objects + 2 * num_object_joints;
     struct row row;
     row.joint_position = batch->state + env * size;
     row.joint_velocity = row.joint_position + n;

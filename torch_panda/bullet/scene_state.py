@@ -20,7 +20,7 @@ class SceneState:
 
     Attributes:
         rows: (num_envs, k) float64 and contiguous. All but ``marker_pose`` are parts of
-            it, in the order of `VectorSimulation`'s attributes.
+            it, in the order of ``client_row`` in ``client.c``.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
