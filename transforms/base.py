@@ -218,8 +218,7 @@ def find_buffer() -> tuple[ReplayBuffer | None, str]:
     """Returns the buffer that calls, if any, and its method; refuses `__setitem__`.
 
     torchrl gives transforms no handle on their buffer, whose size, layout and sampler
-    decide what is right, and a transform may go from one to another: so the functions
-    that call are looked at (3 us, as most are ruled out by their module).
+    decide what is right: so the functions that call are looked at (3 us).
     """
     frame = inspect.currentframe()
     while frame is not None:

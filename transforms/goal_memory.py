@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Generator
+from torch import Generator, Tensor
 
 from torch_panda.transforms import strategies
 from torch_panda.transforms.strategies import Integers, Weights
@@ -195,8 +195,7 @@ class GoalMemory:
     def load(self, state: dict[str, Any]) -> None:
         """Takes the state that another memory returned."""
         for name, value in copy.deepcopy(state).items():
-            is_array = isinstance(value, torch.Tensor)
-            setattr(self, name, value.numpy() if is_array else value)
+            setattr(self, name, value.numpy() if isinstance(value, Tensor) else value)
         known = state["open"] if self._links else {}  # else used again, ids might not
         self.open = {i: (t, s, bytes.fromhex(g)) for i, (t, s, g) in known.items()}
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import ReplayBuffer, RoundRobinWriter
+from torchrl.data import ReplayBuffer, ReplayBufferEnsemble, RoundRobinWriter
 
 from torch_panda.transforms import base
 from torch_panda.transforms.goal_memory import Goals
@@ -87,7 +87,8 @@ class HindsightRelabel(base.BufferTransform):
         return batch.squeeze(-1) if is_item else batch
 
     def _stored(self, buffer: ReplayBuffer | None) -> int:
-        if buffer is not None:
+        # An ensemble samples the rows of several buffers: which one's is not known.
+        if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):
             return len(buffer.storage)
         return min(count := self._memory.count, self.capacity or count)
 

@@ -6,7 +6,6 @@ known. All but "desired" are those of Andrychowicz et al. 2017, section 4.5.
 """
 
 from collections.abc import Callable, Mapping
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ def parse(strategy: Weighted) -> Weights:
         if not callable(name) and name not in NAMES:
             known = f"one of {[*NAMES]}, a callable, or a mapping of these to weights"
             raise ValueError(f"strategy must be {known}, got {name!r}.")
-    if not all(weight > 0 and isfinite(weight) for weight in weights.values()):
+    if not all(weight > 0 and np.isfinite(weight) for weight in weights.values()):
         raise ValueError(f"strategy must have positive weights, got {strategy!r}.")
     total = sum(weights.values())
     return {name: weight / total for name, weight in weights.items()}

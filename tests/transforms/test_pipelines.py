@@ -12,6 +12,7 @@ from torchrl.data import (
     LazyTensorStorage,
     MultiStep,
     ReplayBuffer,
+    ReplayBufferEnsemble,
     SliceSampler,
     TensorDictMaxValueWriter,
     TensorDictReplayBuffer,
@@ -21,6 +22,7 @@ from torchrl.envs import (
     CatTensors,
     Compose,
     DoubleToFloat,
+    ObservationNorm,
     ParallelEnv,
     RewardScaling,
     SerialEnv,
@@ -154,6 +156,22 @@ def test_copies_of_the_goal_are_refused(hindsight, collector):
             rb.extend(data.reshape(-1))
 
 
+def test_copies_that_are_less_precise_are_refused():
+    data = Envs(4, [5]).chunk(10).reshape(-1)
+    for key in ("desired_goal", "achieved_goal"):
+        for entry in (data, data["next"]):
+            entry[key] = entry[key].double() + torch.rand(40, 3, dtype=torch.float64)
+    data["policy_input"] = torch.cat([torch.rand(40, 4), data["desired_goal"]], 1)
+    goals = data["next", "achieved_goal"], data["desired_goal"]
+    data["next", "reward"] = reward_fn(*goals).float()
+    for dtype, shape in ((torch.float32, (40, 7)), (torch.float16, (40, 1, 7))):
+        seen = data.clone()
+        seen["policy_input"] = data["policy_input"].to(dtype).reshape(shape)
+        rb = buffer(HindsightRelabel(reward_fn))
+        with pytest.raises(ValueError, match=r"policy_input.*copy"):
+            rb.extend(seen)
+
+
 def test_copies_made_in_the_buffer_before_hindsight_are_refused():
     env = make()
     cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
@@ -205,13 +223,27 @@ def test_rewards_of_several_steps_are_refused(hindsight, n_steps):
 
 
 @BOTH
-@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaPushDense-v1"])
-@pytest.mark.parametrize("scaling", [(0.0, 10.0), (0.0, 0.1), (1.0, 2.0)])
+@pytest.mark.parametrize(
+    "env_id", ["PandaPush-v1", "PandaPushDense-v1", "PandaReach-v1"]
+)
+@pytest.mark.parametrize("scaling", [(0.0, 10.0), (0.0, 0.1), (1.0, 2.0), (1.0, 1.0)])
 def test_scaled_rewards_are_refused(hindsight, env_id, scaling):
+    """Also those of which only successes tell, which are few at Reach."""
     env = TransformedEnv(make(env_id, 8), RewardScaling(*scaling))
     rb = buffer(hindsight.from_env(env))
     with pytest.raises(ValueError, match=r"reward_fn's times.*RewardScaling.*after"):
-        for data in collect(env, 10, 30):
+        for data in collect(env, 50, 30):
+            rb.extend(data.reshape(-1))
+
+
+def test_goals_normalised_in_the_environment_warn():
+    env = TransformedEnv(
+        make("PandaReach-v1", 8),
+        ObservationNorm(0.0, 5.0, in_keys=["achieved_goal", "desired_goal"]),
+    )
+    rb = buffer(HindsightRelabel.from_env(env))
+    with pytest.warns(UserWarning, match="reward_fn gives other rewards"):
+        for data in collect(env, 50, 8):
             rb.extend(data.reshape(-1))
 
 
@@ -241,6 +273,23 @@ def test_other_rewards_warn_once():
 
 def slices():
     return SliceSampler(slice_len=4, traj_key=("collector", "traj_ids"))
+
+
+@pytest.mark.parametrize("strategy", ["future", "episode", "random"])
+def test_an_ensemble_of_buffers_is_relabelled(strategy):
+    transforms = [
+        HindsightRelabel(reward_fn, strategy=strategy, her_ratio=1.0) for _ in "ab"
+    ]
+    members = [buffer(transform) for transform in transforms]
+    for number, member in enumerate(members):
+        member.extend(Envs(4, [10]).chunk(40 + number).reshape(-1))
+    both = ReplayBufferEnsemble(*members, batch_size=64)
+    for _ in range(3):
+        for batch, member in zip(both.sample().unbind(0), members, strict=True):
+            own = member.storage[:]["desired_goal"]
+            is_old = (batch["desired_goal"][:, None] == own).all(-1).any(1)
+            assert is_old.float().mean() < 0.1
+    assert [transform._memory.freed for transform in transforms] == [0, 0]
 
 
 @pytest.mark.parametrize("unit", ["row", "slice"])
