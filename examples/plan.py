@@ -30,7 +30,7 @@ class Args:
     """What to solve, and how hard to think."""
 
     env_id: str = "PandaPush-v1"
-    """one of torch_panda.ENV_IDS"""
+    """one of torch_panda.ENV_IDS whose goal is a position, such as Push"""
     episodes: Positive = 5
     """episodes to run"""
     seed: Seed = 0
@@ -105,7 +105,10 @@ def main(args: Args) -> None:
     """Run the episodes and print how they end."""
     try:
         check_limits(args)
-        env, fork = make(args, seed=args.seed), Fork(args)
+        env = make(args, seed=args.seed)
+        if env.task.goal_dim != 3:
+            raise ValueError(f"the goal must be a position, {args.env_id}'s is not")
+        fork = Fork(args)
     except ValueError as error:
         raise SystemExit(str(error)) from None
     torch.manual_seed(args.seed)

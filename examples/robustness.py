@@ -23,6 +23,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import torch_panda
 from limits import Positive, Seed, check_limits
 from torch_panda import Randomization
+from training.files import prepare
 from training.policies import load_policy, read_checkpoint
 
 
@@ -71,7 +72,12 @@ def success_grid(
             state["physics_parameters"] = factors.double()
             start = env.reset(state, set_state=True)
             played = env.rollout(
-                env.max_episode_steps, policy, auto_reset=False, tensordict=start
+                env.max_episode_steps,
+                policy,
+                auto_reset=False,
+                break_when_any_done=False,
+                break_when_all_done=True,  # a -v3 episode ends at its first success
+                tensordict=start,
             )
             successes += played["next", "success"][:, -1, 0].cpu()
     return successes / episodes
@@ -103,6 +109,7 @@ def plot_grids(grids: dict[str, torch.Tensor], args: Args) -> None:
 def main(args: Args) -> None:
     """Evaluate each policy on the grid, print the means and draw them."""
     check_limits(args)
+    prepare(args.out)
     factors = torch.cartesian_prod(
         torch.tensor(args.frictions), torch.tensor(args.masses)
     )
@@ -129,5 +136,5 @@ def main(args: Args) -> None:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None

@@ -59,3 +59,9 @@ def test_plans_lead_to_the_goal(args):
         after = env.task.distance(end["achieved_goal"], end["desired_goal"])
         assert after < 0.6 * before
         fork.model.close()
+
+
+def test_a_goal_that_is_no_position_is_refused(args):
+    args.env_id = "PandaStack-v1"
+    with pytest.raises(SystemExit, match=r"position.*PandaStack-v1"):
+        plan.main(args)

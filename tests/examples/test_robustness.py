@@ -8,6 +8,7 @@ import torch
 import robustness
 import torch_panda
 from torch_panda import Randomization
+from training.policies import load_policy, read_checkpoint
 
 POLICY = Path(__file__).parents[2] / "examples" / "policies" / "PandaPush-v1.pt"
 
@@ -48,3 +49,21 @@ def test_cells_differ_in_physics_only():
     assert (spy.seen[0] == spy.seen[0][0]).all()
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
     assert success.shape == (3,)
+
+
+def test_an_episode_that_ends_early_leaves_the_others_their_time():
+    factors = torch.tensor([[1.0, 1.0], [0.5, 1.0], [2.0, 1.0]])
+
+    def play(cells):
+        with torch_panda.make(
+            "PandaPush-v3",
+            num_envs=len(cells),
+            seed=0,
+            randomize=Randomization(object_mass=(0.5, 2), object_friction=(1, 1)),
+        ) as env:
+            policy = load_policy(read_checkpoint(POLICY), env)
+            return robustness.success_grid(env, policy, cells, episodes=4).tolist()
+
+    alone = [play(cell[None])[0] for cell in factors]
+    assert play(factors) == alone
+    assert alone[0] > 0.5
