@@ -87,7 +87,7 @@ class DataCheck:
         at_low, at_high = (stored[rows].median() for rows in is_kind[:2])
         factor = float((at_high - at_low) / (high - low).clamp(min=1e-12))
         if low == high:  # as long as nothing succeeds: likelier than a constant
-            factor = float(at_low / low) if low and at_low else 1.0
+            factor = float(at_low / low) if low else 0.0
         constant = float(at_low) - factor * float(low)
         if factor and not differs(factor, constant):
             raise ValueError(
