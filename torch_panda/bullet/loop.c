@@ -1,4 +1,5 @@
-/* A vector step of many clients, in threads of its own and without Python.
+/* A vector step of many clients, or their reset, in threads of its own and without
+   Python.
 
    Clients, each as in client.c, are drawn by whichever thread is free; the caller's
    takes part, and returns when all are done. The last clients are drawn in pieces of a
@@ -20,8 +21,12 @@ enum {
     PIECE = 5             /* substeps; other threads begin with a cold cache */
 };
 
+/* Do a part of a client's work; answer whether more of it is to be done. */
+typedef int work(struct batch *batch, int env, int piece);
+
 struct loop {
     struct batch *batch;
+    work *work;
     int num_envs, num_done, num_failed;
     int *queue; /* a ring of num_envs clients that wait to be drawn */
     int first, num_waiting, num_whole; /* of them the first ones are not cut up */
@@ -33,7 +38,7 @@ struct loop {
     pthread_t threads[];
 };
 
-/* Step clients until none is left to be drawn; the mutex is held before and after. */
+/* Work on clients until none is left to be drawn; the mutex is held before and after. */
 static void take_part(struct loop *loop) {
     while (loop->num_waiting) {
         int env = loop->queue[loop->first];
@@ -41,7 +46,7 @@ static void take_part(struct loop *loop) {
         loop->first = (loop->first + 1) % loop->num_envs;
         loop->num_waiting--;
         pthread_mutex_unlock(&loop->mutex);
-        int goes_on = client_take_piece(loop->batch, env, piece);
+        int goes_on = loop->work(loop->batch, env, piece);
         pthread_mutex_lock(&loop->mutex);
         if (goes_on) {
             int last = (loop->first + loop->num_waiting++) % loop->num_envs;
@@ -89,26 +94,46 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
     return loop;
 }
 
-/* Step some clients, of which none may be named twice; return how many have failed.
-   The array that names them is shuffled. */
-int loop_step(struct loop *loop, const struct control *control, doubles setpoint,
-              int *envs, int num_envs) {
+/* Work on some clients, the last ones in pieces; return how many have failed. */
+static int share_out(struct loop *loop, work *work, int *envs, int num_envs,
+                     int num_whole) {
     fenv_t before; /* of the caller, who may flush denormal numbers to zero */
     fegetenv(&before);
     fesetenv(FE_DFL_ENV);
     pthread_mutex_lock(&loop->mutex);
-    loop->batch->control = control, loop->batch->setpoint = setpoint;
+    loop->work = work;
     loop->queue = envs, loop->num_envs = loop->num_waiting = num_envs;
-    /* More than the last two of each thread would gain less than it costs. */
-    loop->num_whole = num_envs - (loop->num_threads ? 2 * (loop->num_threads + 1) : 0);
+    loop->num_whole = num_whole;
     loop->first = loop->num_done = loop->num_failed = 0;
-    for (int k = 0; k < num_envs; k++) loop->batch->clients[envs[k]]->num_substeps = 0;
     pthread_cond_broadcast(&loop->begun);
     take_part(loop);
     while (loop->num_done < num_envs) pthread_cond_wait(&loop->done, &loop->mutex);
     pthread_mutex_unlock(&loop->mutex);
     fesetenv(&before);
     return loop->num_failed;
+}
+
+/* Step some clients, of which none may be named twice; return how many have failed.
+   The array that names them is shuffled. */
+int loop_step(struct loop *loop, const struct control *control, doubles setpoint,
+              int *envs, int num_envs) {
+    struct batch *batch = loop->batch;
+    batch->control = control, batch->setpoint = setpoint;
+    for (int k = 0; k < num_envs; k++) batch->clients[envs[k]]->num_substeps = 0;
+    /* More than the last two of each thread would gain less than it costs. */
+    int num_pieces = loop->num_threads ? 2 * (loop->num_threads + 1) : 0;
+    return share_out(loop, client_take_piece, envs, num_envs, num_envs - num_pieces);
+}
+
+static int reset(struct batch *batch, int env, int piece) {
+    (void)piece;
+    client_reset(batch, env);
+    return 0;
+}
+
+/* Reset some clients, as `loop_step` steps them. */
+int loop_reset(struct loop *loop, int *envs, int num_envs) {
+    return share_out(loop, reset, envs, num_envs, num_envs);
 }
 
 /* End the threads. A forked child, which has none, must not call this. */

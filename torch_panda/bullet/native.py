@@ -184,8 +184,10 @@ class Library:
             POINTER(c_int),
             c_int,
         )
-        self.reset = library.client_reset
-        self.reset.argtypes = (POINTER(Batch), c_int)
+        self.reset = library.loop_reset
+        self.reset.argtypes = (c_void_p, POINTER(c_int), c_int)
+        self.reset_one = library.client_reset
+        self.reset_one.argtypes = (POINTER(Batch), c_int)
         self.euler_angles = library.euler_angles
         self.euler_angles.restype = None
         self.euler_angles.argtypes = (POINTER(c_double), POINTER(c_double))

@@ -106,21 +106,25 @@ class NativeLoop:
             self._describe(control)
         chosen = range(len(self._clients)) if envs is None else envs
         queue = (c_int * len(chosen))(*chosen)
-        failed = self._library.step(
+        if self._library.step(
             self._loop, self._control, setpoint.ctypes.data, queue, len(queue)
-        )
-        if failed:
-            errors = {env: self._error(env) for env in sorted(chosen)}
-            env, error = next((env, e) for env, e in errors.items() if e)
-            raise WorkerError(env, error) from error
+        ):
+            self._raise_first(chosen)
 
-    def reset(self, env: int) -> None:
+    def reset(self, envs: Sequence[int]) -> None:
+        """Put some clients where the state says, with no past; errors as of `step`."""
+        self._start()
+        queue = (c_int * len(envs))(*envs)
+        if self._library.reset(self._loop, queue, len(queue)):
+            self._raise_first(envs)
+
+    def reset_one(self, env: int) -> None:
         """Put a client where the state says, with no past, in the calling thread.
 
         Raises:
             BulletError: Bullet failed, or the client is closed.
         """
-        self._library.reset(self._batch, env)
+        self._library.reset_one(self._batch, env)
         if error := self._error(env):
             raise error
 
@@ -154,6 +158,12 @@ class NativeLoop:
             doubles([self._physics.ik_damping] * len(control.forces)),
         )
         self._described = control
+
+    def _raise_first(self, envs: Sequence[int]) -> None:
+        """Raise the error of the first client that has failed."""
+        errors = {env: self._error(env) for env in sorted(envs)}
+        env, error = next((env, e) for env, e in errors.items() if e)
+        raise WorkerError(env, error) from error
 
     def _error(self, env: int) -> BulletError | None:
         """Why a client has failed in this step or reset, if it has."""

@@ -205,12 +205,16 @@ class VectorSimulation:
         Raises:
             WorkerError: Bullet or ``vary`` failed in one client; it names the client.
         """
+        if self._native is not None and vary is None:
+            self._pool.wait()
+            self._native.reset(envs)
+            return
 
         def reset_one(env: int) -> None:
             if vary is not None:
                 vary(env)
             if self._native is not None:
-                self._native.reset(env)
+                self._native.reset_one(env)
                 return
             client = self._clients[env]
             self._broad_phases[env].restore()

@@ -185,9 +185,10 @@ class Episodes(Closing):
             if given.start:
                 self._replay(envs, given)
             observed = self._observe()
-            for key in ("terminated", "truncated", "done"):
-                # A given state may be an episode's last; the next step ends it again.
-                observed[key][envs] = False
+            if state is not None:
+                # It may be an episode's last; the next step ends that again.
+                for key in ("terminated", "truncated", "done"):
+                    observed[key][envs] = False
             return observed
 
     def step(self, action: Tensor | None, stepped: Tensor | None = None) -> Observed:

@@ -41,7 +41,8 @@ class History:
     def begin(self, envs: Sequence[int], state: dict[str, Tensor]) -> None:
         """Episodes start in these environments, from these tensors (n, ...)."""
         for key, start in self._start.items():
-            start[envs] = state[key][envs]
+            # As arrays: to index tensors takes three times as long.
+            start.numpy()[envs] = state[key].numpy()[envs]
         for env in envs:
             self._begun[env] = len(self._steps)
         if (past := min(self._begun)) > _PIECE:

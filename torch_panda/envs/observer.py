@@ -87,7 +87,7 @@ class EpisodeObserver:
         success = task.is_success(achieved_goal, desired_goal)
         truncated = step_count >= self._max_episode_steps
         if self._terminate_on_success:
-            terminated = success & (step_count > 0)
+            terminated = success.logical_and(step_count)  # not before the first step
         else:
             terminated = torch.zeros_like(success)
         if failure is not None:
@@ -103,7 +103,7 @@ class EpisodeObserver:
             "success": success,
             "terminated": terminated,
             "truncated": truncated,
-            "done": terminated | truncated,
+            "done": terminated.logical_or(truncated),
         }
 
     def reward(self, action: Tensor, observed: Observed) -> Tensor:

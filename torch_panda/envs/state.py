@@ -199,6 +199,6 @@ def _read(
 
 
 def _check_rows(key: str, is_right: Tensor, envs: list[int], wanted: str) -> None:
-    wrong = (~is_right).flatten(1).any(dim=1).nonzero()
-    if len(wrong):
-        raise ValueError(f"{key} of environment {envs[int(wrong[0])]} must be {wanted}")
+    if not is_right.all():
+        wrong = envs[int((~is_right).flatten(1).any(dim=1).nonzero()[0])]
+        raise ValueError(f"{key} of environment {wrong} must be {wanted}")

@@ -201,9 +201,11 @@ class Robot:
             (num_envs, k), float64: the arm's part, as `arm_setpoint`, and behind it the
             positions of the other joints [rad] or [m].
         """
-        arm = self.arm_setpoint(action[:, : self._arm_action_dim], simulation)
-        others = self._rest.expand(len(arm), -1)
-        if self.gripper is not None and not self.block_gripper:
+        if self.gripper is None or self.block_gripper:
+            arm = self.arm_setpoint(action, simulation)
+            others = self._rest.expand(len(arm), -1)
+        else:
+            arm = self.arm_setpoint(action[:, :-1], simulation)
             fingers = simulation.joint_position[:, self.num_arm_joints :]
             others = self.gripper.setpoint(action[:, -1:], fingers)
         return torch.cat((arm, others), dim=1)

@@ -242,8 +242,9 @@ class Task(ABC):
         return (distance > self.distance_threshold).float().neg()
 
     def _check_goals(self, achieved_goal: Tensor, desired_goal: Tensor) -> None:
-        shapes = tuple(achieved_goal.shape), tuple(desired_goal.shape)
-        if any(shape[-1:] != (self.goal_dim,) for shape in shapes):
+        sizes = (self.goal_dim,)
+        if achieved_goal.shape[-1:] != sizes or desired_goal.shape[-1:] != sizes:
+            shapes = tuple(achieved_goal.shape), tuple(desired_goal.shape)
             raise ValueError(
                 f"achieved_goal and desired_goal must have shape "
                 f"(..., {self.goal_dim}), got {shapes[0]} and {shapes[1]}"
@@ -252,4 +253,4 @@ class Task(ABC):
 
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
     """Position, Euler angles [rad] and velocity of an object: (num_envs, 12)."""
-    return simulation.object_state[:, index]
+    return simulation.object_state.select(1, index)
