@@ -1,7 +1,6 @@
 """What spawned workers build: batched environments that report on their threads."""
 
 import functools
-import threading
 
 import torch
 from torchrl.data import Unbounded
@@ -13,12 +12,11 @@ NUM_ENVS = 2  # of each worker
 
 
 class ReportThreads(Transform):
-    """Adds the number of this process's stepping threads and of torch's threads."""
+    """Adds how many threads step the environments, and how many torch has."""
 
     def _report(self, tensordict):
-        names = [thread.name for thread in threading.enumerate()]
-        own = sum(name.startswith("torch_panda") for name in names)
-        report = torch.tensor([own, torch.get_num_threads()])
+        stepping = self.parent.base_env.num_threads
+        report = torch.tensor([stepping, torch.get_num_threads()])
         return tensordict.set("threads", report.repeat(*tensordict.batch_size, 1))
 
     def _step(self, tensordict, next_tensordict):

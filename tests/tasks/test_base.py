@@ -3,6 +3,7 @@
 import math
 
 import pybullet
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -46,3 +47,33 @@ def test_flip_takes_opposite_quaternions_for_one_orientation():
     other = torch.tensor([0.5, -0.5, 0.5, -0.5])
     assert not Flip().is_success(quaternion, other)
     assert Flip(reward_type="dense").compute_reward(quaternion, other) == -1.0
+
+
+class FromBothSides(Push):
+    """Success is a matter of x alone."""
+
+    def is_success(self, achieved_goal, desired_goal):
+        return (achieved_goal - desired_goal)[..., :1].abs() < 0.01
+
+
+class Bonus(Push):
+    """Success pays 10, in whole numbers."""
+
+    def compute_reward(self, achieved_goal, desired_goal):
+        return 10 * self.is_success(achieved_goal, desired_goal).int()
+
+
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+@pytest.mark.parametrize("kind", [Push, Stack, Flip, FromBothSides, Bonus])
+def test_a_step_is_judged_by_what_a_task_overrides(kind, reward_type):
+    task = kind(reward_type=reward_type)
+    goal, offset = torch.rand(2, 100, task.goal_dim)
+    achieved = goal + 0.1 * (offset - 0.5)
+    # One at the threshold: neither a success nor unrewarded.
+    achieved[0], goal[0], goal[0, 0] = 0.0, 0.0, task.distance_threshold
+    success, reward = task.judge(achieved, goal)
+    assert 0 < success.sum() < 100 or kind is Flip
+    assert torch.equal(success, task.is_success(achieved, goal))
+    expected = task.compute_reward(achieved, goal)
+    assert torch.equal(reward, expected.float())
+    assert reward.dtype == torch.float32

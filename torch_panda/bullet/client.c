@@ -148,11 +148,16 @@ void euler_angles(doubles quaternion, double *angles) {
     angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
 }
 
+static size_t row_size(const struct scene *scene) {
+    return 2 * scene->num_joints + 10 + (7 + STATE_SIZE) * scene->num_objects +
+           2 * scene->num_object_joints;
+}
+
 struct row client_row(const struct batch *batch, int env) {
     const struct scene *scene = batch->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
     int num_object_joints = scene->num_object_joints;
-    size_t size = 2 * n + 10 + (7 + STATE_SIZE) * num_objects + 2 * num_object_joints;
+    size_t size = row_size(scene);
     struct row row;
     row.joint_position = batch->state + env * size;
     row.joint_velocity = row.joint_position + n;
@@ -192,6 +197,13 @@ int client_read_state(struct batch *batch, int env) {
     return 1;
 }
 
+static int is_finite(const struct batch *batch, int env) {
+    size_t size = row_size(batch->scene);
+    for (size_t k = 0; k < size; k++)
+        if (!isfinite(batch->state[env * size + k])) return 0;
+    return 1;
+}
+
 int client_is_open(struct batch *batch, int env) {
     int is_closed = batch->clients[env]->handle == NULL;
     batch->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0, NULL};
@@ -210,6 +222,7 @@ int client_take_piece(struct batch *batch, int env, int piece) {
     if (begin == 0 && !begin_step(batch, env)) return 0;
     if (!advance(batch, env, end)) return 0;
     if (end < all) return 1;
-    client_read_state(batch, env);
+    if (client_read_state(batch, env) && !is_finite(batch, env))
+        batch->failures[env].expected = DIVERGED;
     return 0;
 }

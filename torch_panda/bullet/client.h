@@ -91,9 +91,10 @@ struct control { /* MotorControl of control.py */
     doubles forces, ik_damping; /* one a joint */
 };
 
-enum { NO_ANSWER = -1, CLIENT_CLOSED = -2 };
+enum { NO_ANSWER = -1, CLIENT_CLOSED = -2, DIVERGED = -3 };
 struct failure {
-    int expected; /* status code, or CLIENT_CLOSED; 0 where nothing has failed */
+    int expected; /* status code, CLIENT_CLOSED, or DIVERGED, when the state is read but
+                     not finite; 0 where nothing has failed */
     int answer;   /* status code, or NO_ANSWER */
     const char *action; /* what Bullet could not do */
 };

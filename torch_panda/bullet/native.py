@@ -31,6 +31,7 @@ ARM_MODES = {"position": 0, "velocity": 1, "torque": 2}
 # In a `Failure`, beside status codes.
 NO_ANSWER = -1  # as answer
 CLIENT_CLOSED = -2  # as expected
+DIVERGED = -3  # as expected
 
 # In the order of ``struct functions``.
 _BULLET = (

@@ -88,7 +88,7 @@ class NativeLoop:
         control: MotorControl,
         setpoint: Doubles,
         envs: Sequence[int] | None = None,
-    ) -> None:
+    ) -> list[int]:
         """Control, advance and read some clients; None means all.
 
         Ctrl-C is raised when it is done.
@@ -98,6 +98,9 @@ class NativeLoop:
             setpoint: (num_envs, setpoint_dim) float64 and contiguous.
             envs: which clients, none of them twice.
 
+        Returns:
+            the clients whose state is not finite.
+
         Raises:
             WorkerError: Bullet failed in one client; all others are done nevertheless.
         """
@@ -106,17 +109,20 @@ class NativeLoop:
             self._describe(control)
         chosen = range(len(self._clients)) if envs is None else envs
         queue = (c_int * len(chosen))(*chosen)
-        if self._library.step(
+        if not self._library.step(
             self._loop, self._control, setpoint.ctypes.data, queue, len(queue)
         ):
-            self._raise_first(chosen)
+            return []
+        self._check(chosen)
+        failures = self._failures
+        return [e for e in chosen if failures[e].expected == native.DIVERGED]
 
     def reset(self, envs: Sequence[int]) -> None:
         """Put some clients where the state says, with no past; errors as of `step`."""
         self._start()
         queue = (c_int * len(envs))(*envs)
         if self._library.reset(self._loop, queue, len(queue)):
-            self._raise_first(envs)
+            self._check(envs)
 
     def reset_one(self, env: int) -> None:
         """Put a client where the state says, with no past, in the calling thread.
@@ -159,18 +165,18 @@ class NativeLoop:
         )
         self._described = control
 
-    def _raise_first(self, envs: Sequence[int]) -> None:
-        """Raise the error of the first client that has failed."""
-        errors = {env: self._error(env) for env in sorted(envs)}
-        env, error = next((env, e) for env, e in errors.items() if e)
-        raise WorkerError(env, error) from error
+    def _check(self, envs: Sequence[int]) -> None:
+        """Raise the error of the first of these clients that has one."""
+        for env in sorted(envs):
+            if error := self._error(env):
+                raise WorkerError(env, error) from error
 
     def _error(self, env: int) -> BulletError | None:
         """Why a client has failed in this step or reset, if it has."""
         failure = self._failures[env]
         if failure.expected == native.CLIENT_CLOSED:
             return client_closed()
-        if not failure.expected:
+        if failure.expected in (0, native.DIVERGED):
             return None
         code = None if failure.answer == native.NO_ANSWER else failure.answer
         return refusal(failure.action.decode(), code, failure.expected)

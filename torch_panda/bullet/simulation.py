@@ -146,7 +146,7 @@ class VectorSimulation:
 
     def step(
         self, control: Control, setpoint: Doubles, envs: Sequence[int] | None = None
-    ) -> None:
+    ) -> list[int]:
         """Control the robots, advance time and read the state.
 
         In C where that was compiled and ``control`` is data, else in Python threads:
@@ -157,6 +157,9 @@ class VectorSimulation:
             setpoint: (num_envs, k) float64, a row for each client's robot.
             envs: which clients; None means all.
 
+        Returns:
+            the clients whose state is not finite.
+
         Raises:
             WorkerError: Bullet failed in one client; it names the client.
             ValueError: ``control`` needs another ``setpoint``, or another robot.
@@ -166,8 +169,7 @@ class VectorSimulation:
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
                 self._pool.wait()  # after a second Ctrl-C, its threads may be at work
-                self._native.step(control, setpoint, envs)
-                return
+                return self._native.step(control, setpoint, envs)
 
         def step_one(env: int) -> None:
             client = self._clients[env]
@@ -181,6 +183,7 @@ class VectorSimulation:
             self._state.read(env, client)
 
         self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
+        return self._state.diverged()
 
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for these environments, in the threads that step them.
@@ -222,10 +225,6 @@ class VectorSimulation:
             self._state.read(env, client)
 
         self._pool.run(reset_one, envs)
-
-    def diverged(self) -> list[int]:
-        """The clients whose state is not finite."""
-        return self._state.diverged()
 
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""

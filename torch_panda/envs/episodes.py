@@ -214,13 +214,12 @@ class Episodes(Closing):
             envs = None if stepped is None else indices(stepped)
             self._starts.step_count += 1 if stepped is None else stepped
             self._history.append(action, stepped)
-            self._act(action, envs)
-            if diverged := self.simulation.diverged():
+            if diverged := self._act(action, envs):
                 self._recover(diverged)
             self._observer.after_step(range(self.num_envs) if envs is None else envs)
-            observed = self._observe()
-            reward = self._observer.reward(action, observed)
-            observed["reward"] = reward if stepped is None else reward * stepped
+            observed = self._observe(action)
+            if stepped is not None:
+                observed["reward"] = observed["reward"] * stepped
             return observed
 
     def get_state(self, *, exact: bool = False) -> Observed:
@@ -283,13 +282,14 @@ class Episodes(Closing):
         self._starts.place(envs)
         self._observer.after_reset(envs)
 
-    def _observe(self) -> Observed:
-        return self._observer.observe(self._starts.goal, self._starts.step_count)
+    def _observe(self, action: Tensor | None = None) -> Observed:
+        starts = self._starts
+        return self._observer.observe(starts.goal, starts.step_count, action)
 
-    def _act(self, action: Tensor, envs: Sequence[int] | None) -> None:
-        """Advance physics by a step."""
+    def _act(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
+        """Advance physics by a step; return where it has diverged."""
         setpoint = self.robot.setpoint(action, self.simulation).numpy()
-        self.simulation.step(self._control, setpoint, envs)
+        return self.simulation.step(self._control, setpoint, envs)
 
     def _replay(self, envs: list[int], given: GivenState) -> None:
         """Take the actions of an exact state, and make sure that they lead there."""

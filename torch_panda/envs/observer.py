@@ -71,12 +71,16 @@ class EpisodeObserver:
         for reading in self._readings:
             reading.after_step(envs)
 
-    def observe(self, goal: Tensor, step_count: Tensor) -> Observed:
+    def observe(
+        self, goal: Tensor, step_count: Tensor, action: Tensor | None = None
+    ) -> Observed:
         """Observation, goals, success and ends, (n, ...), in new tensors.
 
         Args:
             goal: the desired goals, (n, goal_dim).
             step_count: steps of the present episodes, (n, 1).
+            action: the one that led here, (n, action_dim): its ``reward``, (n, 1)
+                float32, is observed, too.
         """
         simulation, task, failure = self._simulation, self._task, self._hooks.failure
         observation = torch.cat(
@@ -84,7 +88,13 @@ class EpisodeObserver:
         )
         achieved_goal = task.achieved_goal(simulation).float()
         desired_goal = goal.float()
-        success = task.is_success(achieved_goal, desired_goal)
+        observed: Observed = {}
+        if action is None:
+            success = task.is_success(achieved_goal, desired_goal)
+        else:
+            success, observed["reward"] = self._judge(
+                action, achieved_goal, desired_goal
+            )
         truncated = step_count >= self._max_episode_steps
         if self._terminate_on_success:
             terminated = success.logical_and(step_count)  # not before the first step
@@ -92,7 +102,6 @@ class EpisodeObserver:
             terminated = torch.zeros_like(success)
         if failure is not None:
             terminated = terminated | failure() & (step_count > 0)
-        observed: Observed = {}
         for observer in self._observers:
             observed |= observer.observe()
         return {
@@ -106,12 +115,15 @@ class EpisodeObserver:
             "done": terminated.logical_or(truncated),
         }
 
-    def reward(self, action: Tensor, observed: Observed) -> Tensor:
-        """The reward of a step, (n, 1) float32, of what was observed after it."""
-        goals = observed["achieved_goal"], observed["desired_goal"]
+    def _judge(
+        self, action: Tensor, achieved_goal: Tensor, desired_goal: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Success and reward of a step, (n, 1) each, after what it led to."""
         if self._hooks.reward is None:
-            return self._task.compute_reward(*goals).float()
-        return self._hooks.reward(action, *goals).float()
+            return self._task.judge(achieved_goal, desired_goal)
+        success = self._task.is_success(achieved_goal, desired_goal)
+        reward = self._hooks.reward(action, achieved_goal, desired_goal)
+        return success, reward.float()
 
     def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
         """What a viewer says of the environments as they are, (n, ...)."""

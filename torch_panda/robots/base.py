@@ -233,9 +233,9 @@ class Robot:
                 return (
                     simulation.joint_position[:, : self.num_arm_joints] + displacement
                 )
-        position = simulation.ee_position + displacement[:, :3]
+        shift = displacement if self.control_type == "ee" else displacement[:, :3]
         # The end-effector must not be sent below the table.
-        position = position.clamp(self._lowest, self._highest)
+        position = (simulation.ee_position + shift).clamp(self._lowest, self._highest)
         if self.control_type == "ee":
             return position
         turn = rotation_vector_to_quaternion(displacement[:, 3:].double())

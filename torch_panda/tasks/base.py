@@ -238,7 +238,28 @@ class Task(ABC):
         self._check_goals(achieved_goal, desired_goal)
         if self.reward_type == "dense":
             return -self.distance(achieved_goal, desired_goal).float()
+        return self._sparse_reward(self.success_distance(achieved_goal, desired_goal))
+
+    def judge(
+        self, achieved_goal: Tensor, desired_goal: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """`is_success` and `compute_reward`, of one distance where both need just that.
+
+        What a step calls; tasks override those two.
+        """
+        own = type(self)
+        if (
+            self.reward_type == "dense"
+            or own.is_success is not Task.is_success
+            or own.compute_reward is not Task.compute_reward
+        ):
+            goals = achieved_goal, desired_goal
+            return self.is_success(*goals), self.compute_reward(*goals).float()
         distance = self.success_distance(achieved_goal, desired_goal)
+        return distance < self.distance_threshold, self._sparse_reward(distance)
+
+    def _sparse_reward(self, distance: Tensor) -> Tensor:
+        """-1 beyond the threshold, else 0, float32."""
         return (distance > self.distance_threshold).float().neg()
 
     def _check_goals(self, achieved_goal: Tensor, desired_goal: Tensor) -> None:
