@@ -8,7 +8,6 @@ from torchrl.collectors import Collector, MultiAsyncCollector
 from torchrl.envs import (
     CatTensors,
     Compose,
-    EnvBase,
     InitTracker,
     ObservationNorm,
     RewardSum,
@@ -56,33 +55,6 @@ def test_transformed_environments_do_not_lose_a_state_silently():
             transformed.reset(state, set_state=True)
         start = transformed.base_env.reset(state, set_state=True)
         assert (start.select(*state.keys()) == state).exclude("desired_goal").all()
-
-
-@pytest.mark.parametrize("num_envs", [None, 3])
-@pytest.mark.parametrize("more", [{}, {"hidden": torch.ones(4)}])
-def test_environments_that_end_are_reset_as_torchrl_does(num_envs, more):
-    options = {"num_envs": num_envs, "num_threads": 1, "seed": 3}
-    ours, theirs = (torch_panda.make("PandaReach-v3", **options) for _ in range(2))
-    resets = 0
-    with ours, theirs:
-        starts = [env.reset() for env in (ours, theirs)]
-        torch.manual_seed(0)
-        for _ in range(120):
-            action = ours.action_spec.rand()
-            extra = {key: x.expand(*ours.batch_size, 4) for key, x in more.items()}
-            rows = [td.update({"action": action, **extra}) for td in starts]
-            stepped = [
-                env.step(td) for env, td in zip((ours, theirs), rows, strict=True)
-            ]
-            following = [ours._step_mdp(td) for td in stepped]
-            starts = [
-                ours.maybe_reset(following[0]),
-                EnvBase.maybe_reset(theirs, following[1]),
-            ]
-            resets += int(stepped[0]["next", "done"].sum())
-            assert starts[0].keys() == starts[1].keys()
-            assert (starts[0] == starts[1]).all()
-    assert resets > 2 * (num_envs or 1)
 
 
 def test_batched_environments():

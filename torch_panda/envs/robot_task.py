@@ -120,7 +120,6 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         specs = Specs(episodes, device, observe_state=observe_state)
         self.observation_spec, self.action_spec = specs.observation, specs.action
         self.reward_spec, self.done_spec = specs.reward, specs.done
-        self._observed_keys = {*specs.observation.keys(), *specs.done.keys()}
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
 
@@ -251,24 +250,6 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
             return super().step(tensordict)
         # torchrl would complete and reshape what `_step` returns: it is as it must be.
         return tensordict.set("next", self._step(tensordict))
-
-    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Start new episodes where one is done, as in torchrl.
-
-        Args:
-            tensordict: what the environments observe, from torchrl's ``step_mdp``.
-
-        Returns:
-            The same, with what is observed of the starts of episodes.
-        """
-        done = tensordict.get("done", None)
-        if done is None or not done.any():
-            return tensordict
-        if self.episodes.entries or tensordict.keys() != self._observed_keys:
-            return super().maybe_reset(tensordict)
-        # torchrl would choose, entry by entry, between what was and is observed: where
-        # no episode starts, both are the same.
-        return self._reset(TensorDict({"_reset": done}, self.batch_size))
 
     # ---- what torchrl calls ------------------------------------------------------
 
