@@ -6,7 +6,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from torch_panda import Panda, Task
+from torch_panda import Panda, Reach, RobotTaskEnv, Task
 from torch_panda.tasks import Bodies, create_table
 
 # A box on a slide along x, with a knob towards the robot.
@@ -208,3 +208,30 @@ def test_the_drawer_is_drawn():
         forward(env)
         assert (env.render(size=64) != before).any()
         assert "object" in env.segmentation_ids
+
+
+class Buffered(Reach):
+    """A task that fills the same tensors at every step, and changes the action."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.goal, self.out = torch.zeros(2, 3), torch.zeros(2, 1)
+
+    def achieved_goal(self, simulation):
+        return self.goal.copy_(simulation.ee_position)
+
+    def reward(self, simulation, action, achieved_goal, desired_goal):
+        action.zero_()
+        return self.out.copy_(-self.distance(achieved_goal, desired_goal))
+
+
+def test_steps_do_not_share_what_a_task_uses_again():
+    with RobotTaskEnv(
+        robot=Panda(block_gripper=True), task=Buffered(), num_envs=2, seed=0
+    ) as env:
+        following = env.rollout(5)["next"]
+        exact = env.get_state(exact=True)
+        assert exact["actions"].any()
+    goals = following["achieved_goal"], following["desired_goal"]
+    assert len(following["reward"].unique()) == 10
+    assert torch.equal(following["reward"], -env.task.distance(*goals))

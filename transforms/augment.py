@@ -21,7 +21,7 @@ class HindsightAugment(base.BufferTransform):
     Args:
         reward_fn: see `BufferTransform`; called once an `extend`.
         k: number of relabelled copies of a transition.
-        **options: as for `HindsightRelabel`; no strategy of other episodes.
+        **options: of `BufferTransform`; no strategy of other episodes.
     """
 
     def __init__(self, reward_fn: GoalFunction, *, k: int = 4, **options: Any) -> None:  # noqa: ANN401
@@ -36,12 +36,11 @@ class HindsightAugment(base.BufferTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Takes transitions in and returns those of the episodes that have ended."""
-        buffer, _ = base.find_buffer()
-        if not tensordict.ndim:
+        buffer, method = base.find_buffer()
+        if method == "add" or not tensordict.ndim:
             raise ValueError("`add` takes many rows for one item: use `extend`.")
-        if base.samples_slices(buffer) or (
-            buffer is not None and buffer.storage.ndim > 1
-        ):
+        ndim = 1 if buffer is None else buffer.storage.ndim
+        if ndim > 1 or base.samples_slices(buffer):
             raise RuntimeError(
                 "HindsightAugment stores rows one by one: use ndim=1, and "
                 'no slices but HindsightRelabel(unit="slice").'
@@ -51,7 +50,7 @@ class HindsightAugment(base.BufferTransform):
             if self._held:
                 stored = self._memory.count - int(self._held[0][base.SERIAL_KEY].min())
             batch = self._note(tensordict, stored)
-            self._held.append(batch.reshape(-1).clone())
+            self._held.append(batch.reshape(-1).to_tensordict())  # dense, and a copy
             serials = [b.get(base.SERIAL_KEY).numpy(force=True) for b in self._held]
             is_open = self._memory.is_open(np.concatenate(serials))
             if is_open.all():
@@ -60,13 +59,12 @@ class HindsightAugment(base.BufferTransform):
             self._held = [held[stays]] if is_open.any() else []
             ended = held[~stays]
             ended = ended[ended.get(base.SERIAL_KEY).argsort()]  # in order of time
-            number = torch.arange(len(ended), device="cpu")
-            copies = ended[number.repeat_interleave(self.k)]
-            serial = copies.get(base.SERIAL_KEY)
-            tags = serial.numpy(force=True)
-            drawn = self._memory.draw(tags, self._weights, self._generator)
-        goals = torch.from_numpy(drawn).to(serial.device)
-        rows = torch.arange(len(serial), device=serial.device)
+            copies = ended.repeat_interleave(self.k, dim=0)
+            tag = copies.get(base.SERIAL_KEY)
+            serial, weights = tag.numpy(force=True), self._weights
+            drawn = self._memory.draw(serial, weights, self._generator)
+        goals = torch.from_numpy(drawn).to(tag.device)
+        rows = torch.arange(len(tag), device=tag.device)
         copies = self._rewriter.rewrite(copies, rows, goals, is_own=True)
         return TensorDict.cat([ended, copies]).exclude(base.SERIAL_KEY)
 

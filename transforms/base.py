@@ -12,7 +12,7 @@ from torchrl.data import ReplayBuffer, SliceSampler
 from torchrl.data.replay_buffers.sample_units import Sequence
 from typing_extensions import Self
 
-from torch_panda.transforms.checks import DataCheck
+from torch_panda.transforms.checks import N_STEP, DataCheck
 from torch_panda.transforms.goal_memory import GoalMemory
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
 from torch_panda.transforms.strategies import DESIRED, Integers, Weighted, parse
@@ -128,15 +128,13 @@ class BufferTransform(envs.Transform):
     def _check_first(self, batch: TensorDictBase) -> None:
         """Refuses a chain of transforms, or data, that hindsight cannot be right in."""
         if _has_multi_step(self):
-            raise RuntimeError(
-                "n-step rewards, of MultiStepTransform, are not known for other goals: "
-                'sample slices with HindsightRelabel(unit="slice") instead.'
-            )
+            raise RuntimeError(N_STEP)
         self._rewriter.check(batch)
         goals = [batch.get(key) for key in self._rewriter.goal_keys[1:]]
-        size = goals[0].shape[-1]
-        if self.goal_parts is not None and sum(self.goal_parts) != size:
-            raise ValueError(f"goal_parts must add up to {size}: {self.goal_parts}")
+        size, is_vector = goals[0].shape[-1], goals[0].ndim == batch.ndim + 1
+        parts = self.goal_parts
+        if parts is not None and not (is_vector and sum(parts) == size):
+            raise ValueError(f"goal_parts must add up to a vector of {size}: {parts}")
         if torch.bfloat16 in (goals[0].dtype, goals[1].dtype):
             raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
 
@@ -228,8 +226,7 @@ def find_buffer() -> tuple[ReplayBuffer | None, str]:
                 method = frame.f_code.co_name
                 if method == "__setitem__":
                     raise RuntimeError(
-                        "hindsight cannot follow rows that are replaced: extend() the "
-                        "buffer instead of assigning to its rows."
+                        "hindsight cannot follow rows that are replaced: use extend()."
                     )
                 return buffer, method
         frame = frame.f_back

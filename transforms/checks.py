@@ -9,6 +9,10 @@ from torch_panda.transforms.rewrite import Rewriter, evaluate
 # Rows of a batch, and batches asked for several goals, that are looked at.
 MAX_ROWS, MAX_BATCHES = 128, 10
 MIN_NUMBERS = 6  # of two goals at least: so many do not coincide by chance
+N_STEP = (
+    "rewards of several steps (MultiStep, MultiStepTransform) are not known for other "
+    'goals: store one step a row and sample slices, HindsightRelabel(unit="slice").'
+)
 
 
 class DataCheck:
@@ -25,10 +29,7 @@ class DataCheck:
             return
         steps = batch.get("steps_to_next_obs", None)
         if steps is not None and (steps != 1).any():
-            raise ValueError(
-                "rewards of several steps (of MultiStep) are not known for other goals:"
-                ' collect one step and sample slices, HindsightRelabel(unit="slice").'
-            )
+            raise ValueError(N_STEP)
         batch = batch.reshape(-1)
         goals = batch.get(self._rewriter.goal_key)
         if (goals != goals[:1]).any():

@@ -21,12 +21,10 @@ class GoalMemory:
     Transitions are numbered in the order of writing: their serials. A round-robin
     buffer overwrites its oldest rows, so it holds the last serials, and with a
     transition all that lies ahead of it. A ring holds their trajectories and steps. The
-    goals of one trajectory lie, in order of time, in a region of `_goals` that is a
-    power of two long. A full one moves to a larger region; the old one is used again.
+    goals of one lie, in order of time, in a region of `_goals`; a full one is moved.
 
     A transition goes on with the trajectory of its id, unless that was done, or got to
-    another goal than this one begins with (as ids begin anew with every collector). If
-    none ever begins where the one before got to, ids decide.
+    another goal than this one begins with, if any ever begins where one before got to.
     """
 
     def __init__(self) -> None:
@@ -63,7 +61,8 @@ class GoalMemory:
             stored: how many transitions before them are still stored.
         """
         if not self.count:
-            self._goals = np.zeros((0, len(goals), *goals[0].shape[1:]), goals[0].dtype)
+            shape = (0, len(goals), *goals[0].shape[1:])
+            self._goals = np.zeros(shape, np.result_type(*goals))
         self._make_room(len(ids), stored)
         serial = np.arange(self.count, self.count + len(ids))
         trajectory, step = self._place(ids, done, root, goals[0])

@@ -25,18 +25,13 @@ class HindsightRelabel(base.BufferTransform):
 
     Args:
         reward_fn: maps (achieved_goal, desired_goal), (n, *goal) each, to (n, 1).
-        her_ratio: fraction of the rows that are relabelled, in [0, 1]: k / (k + 1) for
-            the k goals a transition of the paper.
-        unit: "row" draws a goal a row, "slice" one for all rows of a slice (that follow
-            each other in the batch and in time), drawn for its last row: for learners
-            on a `SliceSampler`, which puts stored ends back unless truncated_key=None.
+        her_ratio: fraction of rows to relabel: k / (k + 1) for the paper's k goals.
+        unit: "row" draws a goal a row, "slice" one for all rows of a slice, drawn for
+            its last row. A `SliceSampler` puts old ends back unless truncated_key=None.
         capacity: transitions to remember where no buffer calls, which would tell it.
-        goal_parts: sizes of the parts of a goal vector, e.g. (3, 3) for two objects.
-            Every part is relabelled with probability her_ratio, with a goal drawn for
-            it alone (Lanier et al. 2019, arXiv 1906.03710).
-        **options: strategy, success_fn, terminated_fn, goal_key, achieved_goal_key,
-            reward_key, success_key, trajectory_key, single_env, seed: see
-            `BufferTransform`.
+        goal_parts: sizes of the parts of a goal vector, e.g. (3, 3), each of which is
+            relabelled for itself, at her_ratio (Lanier et al. 2019, arXiv 1906.03710).
+        **options: of `BufferTransform`, which are the same for `HindsightAugment`.
 
     Raises:
         ValueError: an argument is none of what is accepted, which the message names.
@@ -64,16 +59,19 @@ class HindsightRelabel(base.BufferTransform):
         self.her_ratio, self.unit = her_ratio, unit
         self.capacity, self.goal_parts = capacity, goal_parts
         self._looks_ahead = all(name in LOOKING_AHEAD for name in self._weights)
+        self._check_sampled = base.DataCheck(self._rewriter)  # behind other transforms
         self._is_first_sample = True
+        self._last_write = 0, 0  # rows stored before it, and its own
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Notes the transitions that are about to be stored."""
-        buffer, _ = base.find_buffer()
+        buffer, method = base.find_buffer()
         is_item = not tensordict.ndim  # one step
         if buffer is not None:
             ndim, writer = buffer.storage.ndim, type(buffer.writer)
             fits = tensordict.ndim in (ndim - 1, ndim) and buffer.dim_extend == ndim - 1
-            if not fits or not issubclass(writer, RoundRobinWriter):
+            one_item = method == "add" and tensordict.shape[ndim - 1 :].numel() > 1
+            if one_item or not fits or not issubclass(writer, RoundRobinWriter):
                 raise RuntimeError(
                     f"rows must be written round-robin (here: {writer.__name__}) in "
                     f"order of time; got {list(tensordict.shape)} for ndim={ndim}: "
@@ -83,7 +81,8 @@ class HindsightRelabel(base.BufferTransform):
             is_item = tensordict.ndim < ndim
         batch = tensordict.unsqueeze(-1) if is_item else tensordict
         with self._lock:
-            batch = self._note(batch, self._stored(buffer))
+            self._last_write = self._stored(buffer), batch.numel()
+            batch = self._note(batch, self._last_write[0])
         return batch.squeeze(-1) if is_item else batch
 
     def _stored(self, buffer: ReplayBuffer | None) -> int:
@@ -102,7 +101,10 @@ class HindsightRelabel(base.BufferTransform):
                 cure = 'pass unit="slice" for one goal a slice'
                 warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
         with self._lock:
-            floor = self._memory.count - self._stored(buffer)
+            stored, (before, number) = self._stored(buffer), self._last_write
+            if stored == before < getattr(getattr(buffer, "storage", 0), "max_size", 0):
+                stored += number  # which are noted, but not written yet
+            floor = self._memory.count - stored
             if tag is None or floor < 0:
                 raise (KeyError if tag is None else RuntimeError)(
                     "HindsightRelabel must be in the buffer before the first extend(), "
@@ -110,7 +112,7 @@ class HindsightRelabel(base.BufferTransform):
                 )
             if not self._looks_ahead:
                 self._memory.free(floor)
-            self._check_data(tensordict)
+            self._check_sampled(tensordict)
             rows, goals = self._draw(tag.numpy(force=True).reshape(-1), tensordict)
         if not len(rows):
             return tensordict.exclude(base.SERIAL_KEY)
@@ -157,9 +159,8 @@ class HindsightRelabel(base.BufferTransform):
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
         """Notes transitions that exist already: a data set, or a buffer's storage.
 
-        They have trajectory ids and any shape, or are [trajectories, time]. Returns
-        them flat and with a tag, for the `TensorStorage` of a buffer with this
-        transform; `data` itself, which may be memory-mapped, is only read.
+        They have trajectory ids, or are [trajectories, time]. Returns them flat and
+        with a tag, for the `TensorStorage` of a buffer with this transform.
         """
         if self._memory.count:
             raise RuntimeError("prepare() must come before other transitions.")

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
@@ -58,7 +59,8 @@ class Rewriter:
             new[self.success_key] = evaluate(self.success_fn, achieved, goals, success)
         if self.terminated_fn is not None:
             done, terminated = flat.get(_DONE), flat.get(_TERMINATED)
-            truncated = flat.get(("next", "truncated"), done & ~terminated)
+            # torchrl's trainers call every row truncated: `done` says which were.
+            truncated = flat.get(("next", "truncated"), ~terminated) & done
             stays = terminated.index_select(0, rows)
             if stays.any():  # unless the old goal is why it ended: a failure, say
                 old = old_goals.index_select(0, rows)
@@ -75,7 +77,8 @@ def evaluate(
     function: GoalFunction, achieved: Tensor, desired: Tensor, old: Tensor
 ) -> Tensor:
     """Returns what a function gives for goals, (n, *goal) each, in the old type."""
-    values = function(achieved, desired)
+    with torch.no_grad():  # it may be learned
+        values = function(achieved, desired)
     expected = (len(achieved), *old.shape[1:])
     is_tensor = isinstance(values, Tensor)
     got = tuple(values.shape) if is_tensor else type(values).__name__

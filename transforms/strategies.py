@@ -63,8 +63,7 @@ def choose_steps(
         return end - 1
     if isinstance(strategy, str):
         return draw_integers(step if strategy == "future" else first, end, generator)
-    zero = np.zeros_like(step)
-    numbers = (step - first, zero, end - first)
+    numbers = (step - first, 0 * step, end - first)
     s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in numbers)
     chosen = strategy(s, f, e, generator)
     is_right = isinstance(chosen, Tensor) and chosen.shape == s.shape

@@ -113,7 +113,9 @@ def test_default_dtype_and_device_change_nothing():
             "PandaPush-v1", seed=0, depth=True, sensors=("joint_torque",)
         ) as env:
             td = env.rollout(2, lambda td: td.set("action", torch.ones(3).cpu()))
-            return td["next"], env.get_state()
+            exact = env.get_state(exact=True)
+            env.reset(exact, set_state=True)
+            return td["next"], env.get_state(), exact
 
     expected = observe()
     torch.set_default_dtype(torch.float64)

@@ -77,3 +77,18 @@ def test_a_step_is_judged_by_what_a_task_overrides(kind, reward_type):
     expected = task.compute_reward(achieved, goal)
     assert torch.equal(reward, expected.float())
     assert reward.dtype == torch.float32
+
+
+def test_a_step_is_judged_by_what_one_task_has_of_its_own():
+    task = Push()
+    task.compute_reward = lambda achieved, desired: torch.full((4, 1), 5.0)
+    goal = torch.rand(4, 3)
+    success, reward = task.judge(goal, goal)
+    assert success.all()
+    assert (reward == 5).all()
+
+
+@pytest.mark.parametrize("threshold", [math.nan, -0.01, math.inf])
+def test_thresholds_that_are_none(threshold):
+    with pytest.raises(ValueError, match="distance_threshold must be finite"):
+        Push(distance_threshold=threshold)

@@ -183,7 +183,7 @@ class VectorSimulation:
             self._state.read(env, client)
 
         self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
-        return self._state.diverged()
+        return self.diverged()
 
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for these environments, in the threads that step them.
@@ -225,6 +225,10 @@ class VectorSimulation:
             self._state.read(env, client)
 
         self._pool.run(reset_one, envs)
+
+    def diverged(self) -> list[int]:
+        """The clients whose state, as it was last read, is not finite."""
+        return self._state.diverged()
 
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""

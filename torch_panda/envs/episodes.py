@@ -176,14 +176,20 @@ class Episodes(Closing):
                 )
                 if self.simulation.scene.markers and "desired_goal" in given.values:
                     self._starts.check_goal(given.values["desired_goal"], envs)
+            # Until that is done: what fails leaves a world that is of no episode.
+            self._never_reset.update(envs)
+            # A step that failed elsewhere has told of no divergence.
+            for env in self.simulation.diverged():
+                self.simulation.rebuild(env)
             for env in envs:
-                self._draw_start(env)
+                self._starts.draw(env)
             tensors = self._starts.state()
             for key, value in (given.start or given.values).items():
                 tensors[key][envs] = value
             self._place(envs)
             if given.start:
                 self._replay(envs, given)
+            self._never_reset.difference_update(envs)
             observed = self._observe()
             if state is not None:
                 # It may be an episode's last; the next step ends that again.
@@ -220,6 +226,8 @@ class Episodes(Closing):
             observed = self._observe(action)
             if stepped is not None:
                 observed["reward"] = observed["reward"] * stepped
+            for key in ("success", "terminated") if diverged else ():
+                observed[key][diverged] = False  # of the next episode's start
             return observed
 
     def get_state(self, *, exact: bool = False) -> Observed:
@@ -270,11 +278,6 @@ class Episodes(Closing):
 
     # ---- parts -------------------------------------------------------------------
 
-    def _draw_start(self, env: int) -> None:
-        """Put the start of an environment's next episode into the state tensors."""
-        self._never_reset.discard(env)
-        self._starts.draw(env)
-
     def _place(self, envs: list[int]) -> None:
         """Put environments where the state tensors say."""
         self._starts.mark(envs)
@@ -306,7 +309,7 @@ class Episodes(Closing):
         """Start the next episode of environments whose physics has diverged."""
         for env in envs:
             self.simulation.rebuild(env)
-            self._draw_start(env)
+            self._starts.draw(env)
         self._place(envs)
         if self.on_divergence == "raise":
             raise BulletError(
@@ -325,8 +328,8 @@ class Episodes(Closing):
         self._check_open()
         if self._never_reset:
             raise BulletError(
-                f"environments {sorted(self._never_reset)} were never reset: call "
-                f"reset first"
+                f"environments {sorted(self._never_reset)} were never reset, or their "
+                f"last reset failed: call reset first"
             )
 
 

@@ -84,7 +84,8 @@ class History:
         ]
         counts = torch.zeros(len(begun), dtype=torch.int64, device="cpu")
         most = int(sum(taken, start=counts).max())
-        actions = torch.zeros(len(begun), most, self._action_dim, device="cpu")
+        shape = (len(begun), most, self._action_dim)
+        actions = torch.zeros(shape, dtype=torch.float32, device="cpu")
         for (action, _), who in zip(self._steps[first:], taken, strict=True):
             rows = who.nonzero().flatten()
             actions[rows, counts[rows]] = action[rows]

@@ -46,8 +46,10 @@ class TaskHooks:
         self.entries: dict[str, Entry] = {}
         if _overrides(task, "reward"):
             self.reward = partial(task.reward, simulation)
-            goal = torch.zeros(n, task.goal_dim, device="cpu")
-            action = torch.zeros(n, action_dim, device="cpu")
+            goal, action = (
+                torch.zeros(n, size, dtype=torch.float32, device="cpu")
+                for size in (task.goal_dim, action_dim)
+            )
             reward = self.reward(action, goal, goal.clone())
             check_result(task, "reward", reward, (n, 1))
         if _overrides(task, "failure"):

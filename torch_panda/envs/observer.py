@@ -86,7 +86,8 @@ class EpisodeObserver:
         observation = torch.cat(
             (self._robot.observation(simulation), task.observation(simulation)), dim=1
         )
-        achieved_goal = task.achieved_goal(simulation).float()
+        # Copied in any case: a task may use its own tensor again.
+        achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
         desired_goal = goal.float()
         observed: Observed = {}
         if action is None:
@@ -122,8 +123,8 @@ class EpisodeObserver:
         if self._hooks.reward is None:
             return self._task.judge(achieved_goal, desired_goal)
         success = self._task.is_success(achieved_goal, desired_goal)
-        reward = self._hooks.reward(action, achieved_goal, desired_goal)
-        return success, reward.float()
+        reward = self._hooks.reward(action.clone(), achieved_goal, desired_goal)
+        return success, reward.to(torch.float32, copy=True)
 
     def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
         """What a viewer says of the environments as they are, (n, ...)."""

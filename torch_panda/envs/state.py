@@ -156,7 +156,7 @@ def read_state(
             f"out {sorted(found)} to start from the rest"
         )
     n, most = len(next(iter(like.values()))), given[ACTIONS].shape[-2]
-    actions = torch.zeros(n, most, action_dim, device="cpu")
+    actions = torch.zeros(n, most, action_dim, dtype=torch.float32, device="cpu")
     count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
     state.start = read(START)
     state.actions = _read(ACTIONS, given[ACTIONS], batch_shape, actions, envs)

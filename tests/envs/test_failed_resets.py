@@ -1,0 +1,108 @@
+"""After a reset that fails there is no episode, until another one does not."""
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv
+from torch_panda.bullet.pool import WorkerError
+
+pytestmark = pytest.mark.usefixtures("loop")
+
+
+class FailsOnce(Reach):
+    fails = True
+
+    def sample_goal(self, rng):
+        if self.fails:
+            self.fails = False
+            raise RuntimeError("no goal yet")
+        return super().sample_goal(rng)
+
+
+class FailsInTheThirdEpisode(Push):
+    calls = 0
+
+    def randomize(self, client, bodies, rng):
+        self.calls += 1
+        if self.calls == 3:
+            raise RuntimeError("boom")
+
+
+def make(task, **options):
+    robot = Panda(block_gripper=True)
+    return RobotTaskEnv(robot=robot, task=task, num_threads=1, seed=0, **options)
+
+
+def test_a_start_that_cannot_be_drawn():
+    with make(FailsOnce()) as env:
+        with pytest.raises(RuntimeError, match="no goal yet"):
+            env.reset()
+        with pytest.raises(BulletError, match=r"environments \[0\] .*reset first"):
+            env.step(env.rand_action())
+        assert env.rollout(3).shape == (3,)
+
+
+def test_physics_that_cannot_be_varied():
+    with make(FailsInTheThirdEpisode(), num_envs=2) as env:
+        env.rollout(5)
+        mask = torch.tensor([[True], [False]])
+        with pytest.raises(WorkerError, match="environment 0: RuntimeError: boom"):
+            env.reset(env.rand_action().set("_reset", mask))
+        with pytest.raises(BulletError, match=r"environments \[0\] .*reset failed"):
+            env.step(env.rand_action())
+        # That environment is reset, too, whatever else is.
+        env.reset(env.rand_action().set("_reset", ~mask))
+        exact = env.get_state(exact=True)
+        env.reset(exact, set_state=True)
+
+
+class Driver(Panda):
+    broken = None
+
+    def control(self, client, body, setpoint):
+        if client is self.broken:
+            raise RuntimeError("motor")
+        super().control(client, body, setpoint)
+
+
+def test_divergence_beside_another_failure():
+    """The next reset cures what the error did not tell of."""
+
+    def make_driven():
+        robot, options = Driver(block_gripper=True), {"num_threads": 1, "seed": 0}
+        return RobotTaskEnv(robot=robot, task=Push(), num_envs=2, **options)
+
+    with make_driven() as env, make_driven() as fresh:
+        env.reset(), fresh.reset()
+        simulation = env.episodes.simulation
+        scene = simulation.scene
+        env.robot.broken = simulation.clients[0]
+        simulation.clients[1].set_joint(scene.robot, scene.joints[0], 0.0, 1e300)
+        with pytest.raises(WorkerError, match="environment 0: RuntimeError: motor"):
+            env.step(env.rand_action())
+        env.robot.broken = None
+        actions = torch.ones(2, 3)
+        found = [
+            e.step(e.reset().set("action", actions))["next", "observation"]
+            for e in (env, fresh)
+        ]
+        assert torch.equal(*found)
+
+
+def test_what_diverges_is_no_success_of_the_next_episode():
+    options = {"seed": 0, "on_divergence": "reset"}
+    solved = 0
+    with torch_panda.make("PandaPush-v3", **options) as env:
+        simulation = env.episodes.simulation
+        robot, joint = simulation.scene.robot, simulation.scene.joints[0]
+        for _ in range(8):
+            env.reset()
+            simulation.clients[0].set_joint(robot, joint, 0.0, 1e300)
+            after = env.step(env.rand_action())["next"]
+            goals = after["achieved_goal"], after["desired_goal"]
+            solved += int(env.is_success(*goals))
+            ends = [after[key].item() for key in ("success", "terminated", "truncated")]
+            assert ends == [False, False, True]
+            assert after["done"]
+    assert solved  # where it could be taken for one
