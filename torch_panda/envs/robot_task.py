@@ -61,7 +61,8 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: what happens when a step leaves an environment in a state that is
             not finite. It is put at the start of its next episode; then "raise" raises
-            `BulletError`, while "reset" lets the step end there, ``truncated``.
+            `BulletError`, while "reset" lets the step end there, ``truncated`` and no
+            success; its reward is that of the start.
         randomize: physics that are drawn for every episode; None: they are the task's.
 
     Raises:
