@@ -35,7 +35,8 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
     under ``next``: ``observation``, ``achieved_goal``, ``desired_goal`` (float32),
     ``success``, ``terminated``, ``truncated`` and ``done`` (bool) and ``reward``
     (float32), the last five of shape (*batch, 1). A step or reset that fails in one
-    environment raises `WorkerError`, which names it; the others have gone on.
+    environment raises `WorkerError`, which names it; the others have gone on. Those of
+    a reset that failed must be reset again.
 
     It serves one thread at a time: a call while another thread is in it raises
     `BulletError`. ``state_dict`` holds seeds and numbers of episodes, so that a run can
