@@ -102,8 +102,9 @@ class HindsightRelabel(base.BufferTransform):
                 warnings.warn(f"the rows of a slice have several goals: {cure}.")  # noqa: B028
         with self._lock:
             stored, (before, number) = self._stored(buffer), self._last_write
-            if stored == before < getattr(getattr(buffer, "storage", 0), "max_size", 0):
-                stored += number  # which are noted, but not written yet
+            size = 0 if buffer is None else getattr(buffer.storage, "max_size", 0)
+            if stored == before < size:  # what was noted has not been written yet
+                stored += number
             floor = self._memory.count - stored
             if tag is None or floor < 0:
                 raise (KeyError if tag is None else RuntimeError)(

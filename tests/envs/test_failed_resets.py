@@ -66,13 +66,28 @@ class Driver(Panda):
         super().control(client, body, setpoint)
 
 
+def make_driven():
+    robot, options = Driver(block_gripper=True), {"num_threads": 1, "seed": 0}
+    return RobotTaskEnv(robot=robot, task=Push(), num_envs=2, **options)
+
+
+def test_a_reset_of_others_leaves_a_divergence_to_be_found():
+    with make_driven() as env:
+        env.reset()
+        simulation = env.episodes.simulation
+        scene = simulation.scene
+        env.robot.broken = simulation.clients[0]
+        simulation.clients[1].set_joint(scene.robot, scene.joints[0], 0.0, 1e300)
+        with pytest.raises(WorkerError, match="environment 0: RuntimeError: motor"):
+            env.step(env.rand_action())
+        env.robot.broken = None
+        env.reset(env.rand_action().set("_reset", torch.tensor([[True], [False]])))
+        with pytest.raises(BulletError, match=r"environments \[1\] diverged"):
+            env.step(env.rand_action())
+
+
 def test_divergence_beside_another_failure():
     """The next reset cures what the error did not tell of."""
-
-    def make_driven():
-        robot, options = Driver(block_gripper=True), {"num_threads": 1, "seed": 0}
-        return RobotTaskEnv(robot=robot, task=Push(), num_envs=2, **options)
-
     with make_driven() as env, make_driven() as fresh:
         env.reset(), fresh.reset()
         simulation = env.episodes.simulation

@@ -179,7 +179,7 @@ class Episodes(Closing):
             # Until that is done: what fails leaves a world that is of no episode.
             self._never_reset.update(envs)
             # A step that failed elsewhere has told of no divergence.
-            for env in self.simulation.diverged():
+            for env in set(envs).intersection(self.simulation.diverged()):
                 self.simulation.rebuild(env)
             for env in envs:
                 self._starts.draw(env)
@@ -226,8 +226,8 @@ class Episodes(Closing):
             observed = self._observe(action)
             if stepped is not None:
                 observed["reward"] = observed["reward"] * stepped
-            for key in ("success", "terminated") if diverged else ():
-                observed[key][diverged] = False  # of the next episode's start
+            if diverged:  # what is observed there is the next episode's start
+                observed["success"][diverged] = observed["terminated"][diverged] = False
             return observed
 
     def get_state(self, *, exact: bool = False) -> Observed:

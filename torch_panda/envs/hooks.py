@@ -46,10 +46,8 @@ class TaskHooks:
         self.entries: dict[str, Entry] = {}
         if _overrides(task, "reward"):
             self.reward = partial(task.reward, simulation)
-            goal, action = (
-                torch.zeros(n, size, dtype=torch.float32, device="cpu")
-                for size in (task.goal_dim, action_dim)
-            )
+            goal = torch.zeros(n, task.goal_dim, dtype=torch.float32, device="cpu")
+            action = torch.zeros(n, action_dim, dtype=torch.float32, device="cpu")
             reward = self.reward(action, goal, goal.clone())
             check_result(task, "reward", reward, (n, 1))
         if _overrides(task, "failure"):

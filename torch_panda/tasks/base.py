@@ -250,8 +250,8 @@ class Task(ABC):
     ) -> tuple[Tensor, Tensor]:
         """`is_success` and `compute_reward`, of one distance where both need just that.
 
-        What a step calls; tasks override those two. It takes 0.15 ms instead of 0.20,
-        of 2 ms of a step of one environment.
+        What a step calls; tasks override those two. With 4 environments it saves 0.05
+        of some 4 ms.
         """
         is_success, compute_reward = self.is_success, self.compute_reward
         if (
