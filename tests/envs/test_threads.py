@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+import timeit
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -175,14 +176,23 @@ def test_threads_one_after_the_other():
     assert len(results) == 4
 
 
-def test_the_guard_costs_less_than_a_microsecond():
-    with torch_panda.make("PandaReach-v1") as env:
+def test_the_guard_costs_little_beside_a_step():
+    with torch_panda.make("PandaReach-v1", seed=0) as env:
         guard = env.episodes._guard
-        fastest = float("inf")
-        for _ in range(20):
-            start = time.perf_counter()
-            for _ in range(1000):
-                with guard:
-                    pass
-            fastest = min(fastest, (time.perf_counter() - start) / 1000)
-    assert fastest < 1e-6
+        start = env.reset()
+        start["action"] = torch.zeros(3)
+
+        def guarded():
+            with guard:
+                pass
+
+        # In turns, the fastest of each: a busy machine slows both.
+        turns = [
+            (
+                timeit.timeit(guarded, number=100) / 100,
+                timeit.timeit(lambda: env.step(start), number=1),
+            )
+            for _ in range(50)
+        ]
+    of_guard, of_step = map(min, zip(*turns, strict=True))
+    assert of_guard < 0.002 * of_step
