@@ -11,6 +11,7 @@ import torch_panda
 from evaluate import evaluate
 from training.policies import load_agent, load_policy, read_checkpoint, save_policy
 
+pytestmark = pytest.mark.usefixtures("quick")
 POLICIES = refine.Path(refine.__file__).parent / "policies"
 
 
