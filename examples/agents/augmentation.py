@@ -1,4 +1,4 @@
-"""Data augmentation: transitions mirrored, moved over the table, objects exchanged.
+"""Data augmentation: transitions mirrored, moved over the table.
 
 Such transitions are as possible as those that were seen, nearly: see Invariant
 Transform Experience Replay (arXiv 1909.10707) for mirrors.
@@ -22,8 +22,7 @@ class Augmentation:
         kind: what to do.
 
     Raises:
-        ValueError: the robot is not controlled by its end-effector, or there are no two
-            objects to exchange.
+        ValueError: the robot is not controlled by its end-effector.
     """
 
     def __init__(self, geometry: Geometry, kind: AugmentationKind) -> None:
@@ -32,21 +31,14 @@ class Augmentation:
                 f"augmentation {kind!r} is for end-effector control: with joint "
                 "control pass --augmentation none"
             )
-        if kind == "mirror-shift-swap" and len(geometry.goal_positions) != 2:
-            raise ValueError(
-                "augmentation 'mirror-shift-swap' is for tasks of two equal objects, "
-                "such as Stack"
-            )
         self.geometry, self.kind = geometry, kind
 
     def __call__(self, rows: Transitions) -> Transitions:
         """Augment a batch; what was given stays as it is."""
         if self.kind != "none":
             rows = mirror(rows, self.geometry)
-        if self.kind.startswith("mirror-shift"):
+        if self.kind == "mirror-shift":
             rows = shift(rows, self.geometry, SHIFT)
-        if self.kind == "mirror-shift-swap":
-            rows = swap(rows, self.geometry)
         return rows
 
 
@@ -85,22 +77,4 @@ def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions
         observation=shifted(rows.observation, geometry.positions),
         goal=shifted(rows.goal, geometry.goal_positions),
         next_observation=shifted(rows.next_observation, geometry.positions),
-    )
-
-
-def swap(rows: Transitions, geometry: Geometry) -> Transitions:
-    """Let two equal objects, with their goals, change places in half of the rows."""
-    chosen = torch.rand_like(rows.reward) < 0.5
-
-    def swapped(values: Tensor, begin: int) -> Tensor:
-        """Exchange the halves of what follows ``begin``."""
-        first, second = values[:, begin:].chunk(2, 1)
-        other = torch.cat((values[:, :begin], second, first), 1)
-        return torch.where(chosen, other, values)
-
-    _, begin, _ = geometry.positions
-    return rows._replace(
-        observation=swapped(rows.observation, begin),
-        goal=swapped(rows.goal, 0),
-        next_observation=swapped(rows.next_observation, begin),
     )

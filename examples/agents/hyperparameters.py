@@ -8,7 +8,7 @@ from limits import Discount, Positive, Ratio, Weight
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 Network = Literal["paper", "layer-norm", "wide"]
-AugmentationKind = Literal["none", "mirror", "mirror-shift", "mirror-shift-swap"]
+AugmentationKind = Literal["none", "mirror", "mirror-shift"]
 
 
 @dataclass
@@ -42,4 +42,4 @@ class Hyperparameters:
     a tenth of a millimetre counts"""
     augmentation: AugmentationKind = "none"
     """mirror half of each batch in the robot's plane of symmetry, and, if wanted, shift
-    the scene over the table in half of it, and exchange two equal objects in half"""
+    the scene over the table in half of it"""

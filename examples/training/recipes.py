@@ -57,14 +57,13 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
-    # The cubes are the same (of -v3 in all but mass): what is learned of one goes for
-    # the other. A stack is many steps, and seldom done by a hand that acts at random.
+    # A stack is many steps, and seldom done by a hand that acts at random: most episodes
+    # begin in its course, and each cube has a hindsight of its own.
     "Stack": {
         **OBJECT,
         "gamma": 0.98,
         "random_eps": (0.0, 0.5),
         "relative_inputs": "fine",
-        "augmentation": "mirror-shift-swap",
         "start_at_object": 0.75,
         "her": "parts",
         "anneal_lr": True,
