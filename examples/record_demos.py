@@ -92,10 +92,12 @@ def disturb(
 
 
 def play(
-    env: torch_panda.RobotTaskEnv, expert: TensorDictModuleBase
+    env: torch_panda.RobotTaskEnv,
+    expert: TensorDictModuleBase,
+    exploration: ExplorationType = ExplorationType.RANDOM,
 ) -> list[TensorDictBase]:
     """One fresh episode of every environment, each with its transitions (steps,)."""
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+    with torch.no_grad(), set_exploration_type(exploration):
         rollout = env.rollout(
             env.max_episode_steps,
             expert,

@@ -19,16 +19,25 @@ import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
 import torch_panda
 from limits import Positive, Seed, check_limits
 from record_demos import play
 from training.buffers import STORED_KEYS, make_buffer
-from training.checkpoint import Checkpoint, Progress, StopSignal, check_folder
+from training.checkpoint import (
+    SAVE_INTERVAL,
+    Checkpoint,
+    Progress,
+    StopSignal,
+    check_folder,
+    crossed,
+)
 from training.curve import Curve, reseed
 from training.demonstrations import pretrain
 from training.policies import load_agent, read_checkpoint
+from training.recipes import find_changes
 
 LEARNING_RATE = 0.3  # at first, of that of training
 
@@ -99,10 +108,11 @@ class Refinement:
             ValueError: the policy achieves nothing that could be asked for.
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
-        if progress.pretrained == args.updates:
+        if len(progress.curve) > 1:
             return True
         if not progress.curve:
             self.curve.add(progress)  # the policy that was given
+            checkpoint.save()
         self.play(stop)
         checkpoint.save()
         if stop:
@@ -129,13 +139,16 @@ class Refinement:
         bar = tqdm(desc="playing", initial=progress.steps, total=last, unit="step")
         while progress.steps < last and not stop:
             reseed(self.env)
-            episodes = play(self.env, self.agent.policy)
+            policy = self.agent.policy
+            episodes = play(self.env, policy, ExplorationType.DETERMINISTIC)
             asked = [ask_for_achieved(x, self.env.task, self.varies) for x in episodes]
             if rows := [row for row in asked if row is not None]:
                 self.buffer.extend(TensorDict.cat(rows))
-            steps = sum(map(len, episodes))
+            steps, before = sum(map(len, episodes)), progress.steps
             progress.steps += steps
             bar.update(steps)
+            if crossed(SAVE_INTERVAL, before, progress.steps):
+                self.checkpoint.save()
         bar.close()
 
     def close(self) -> None:
@@ -172,7 +185,9 @@ def main(args: Args) -> None:
         check_folder(args.out, resume=args.resume)
         run = Refinement(args)
         args.out.mkdir(parents=True, exist_ok=True)
+        default = Args(args.policy, args.out, env_id=args.env_id)
         options = {"algo": run.agent.hp.algo, "preset": "refined", **asdict(args)}
+        options["changed"] = find_changes(args, default)
         (args.out / "args.json").write_text(json.dumps(options, default=str, indent=2))
         stop = StopSignal()
         finished = run.run(stop)

@@ -135,7 +135,8 @@ class Run:
             pretrain(checkpoint, self.demos, updates=count, batch_size=size, stop=stop)
             if progress.pretrained < count:
                 return False
-            self.curve.add(progress)
+        if args.pretrain_updates and len(progress.curve) == 1:
+            self.curve.add(progress)  # what was imitated
             checkpoint.save()
 
         bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")

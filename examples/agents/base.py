@@ -11,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agents.augmentation import Augmentation
 from agents.fingers import check_fingers, from_fine, to_fine
-from agents.geometry import read_geometry
+from agents.geometry import check_layout, read_geometry
 from agents.hyperparameters import Hyperparameters
 from agents.normalizer import Normalizer
 from agents.transitions import Transitions
@@ -48,6 +48,8 @@ class Agent(nn.Module, ABC):
         if hp.fine_fingers:
             check_fingers(env)
         geometry = read_geometry(env)
+        if (hp.relative_inputs, hp.augmentation) != ("none", "none"):
+            check_layout(geometry, env)
         size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
         self.normalizer = Normalizer(size, geometry, hp.relative_inputs)
         self.augmentation = Augmentation(geometry, hp.augmentation)

@@ -6,6 +6,7 @@ tests/examples/test_training_speed.py).
 """
 
 import copy
+import math
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -17,7 +18,7 @@ from agents.hyperparameters import Hyperparameters
 from agents.imitation import imitation_loss
 from agents.networks import make_mlp
 from agents.transitions import Transitions
-from torch_panda import RobotTaskEnv
+from torch_panda import RobotTaskEnv, Task
 
 # Weight of the squares of what enters the actor's tanh: where tanh is flat no gradient
 # is left, and policies of Slide were lost so (arXiv 1707.01495, appendix A).
@@ -40,10 +41,7 @@ class DDPG(Agent):
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        # Sparse rewards are -1 and 0: so much can returns be, at least (Baselines).
-        self.lowest = (
-            -1 / (1 - self.gamma) if env.task.reward_type == "sparse" else None
-        )
+        self.lowest = lowest_return(env.task, self.gamma)
 
         noise = AdditiveGaussianModule(
             env.action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
@@ -103,3 +101,14 @@ class DDPG(Agent):
         """Move the target networks towards their networks, by TAU."""
         with torch.no_grad():
             torch._foreach_lerp_(self.target, self.online, TAU)
+
+
+def lowest_return(task: Task, gamma: float) -> float | None:
+    """What rewards of -1 and 0 sum up to at least, as in Baselines; None: not known."""
+    kind = type(task)
+    has_own = (
+        kind.compute_reward is not Task.compute_reward or kind.reward is not Task.reward
+    )
+    if has_own or task.reward_type != "sparse":
+        return None
+    return -1 / (1 - gamma) if gamma < 1 else -math.inf

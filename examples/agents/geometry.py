@@ -121,6 +121,24 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
     )
 
 
+def check_layout(geometry: Geometry, env: RobotTaskEnv) -> None:
+    """Make sure that a task, perhaps one's own, observes what the geometry says.
+
+    Raises:
+        ValueError: it does not.
+    """
+    sizes = [
+        env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal")
+    ]
+    known = [len(geometry.observation), len(geometry.goal)]
+    if sizes != known:
+        raise ValueError(
+            "relative inputs and augmentation need observations and goals laid out as "
+            f"those of the shipped tasks, of {known} numbers here, got {sizes}: pass "
+            "--relative-inputs none --augmentation none"
+        )
+
+
 def _task_layout(task: Task) -> tuple[str, ...]:
     """What the numbers of a task's observation are, by names of `_FACTORS`."""
     match task:

@@ -86,7 +86,8 @@ def moved(data: TensorDictBase) -> Tensor:
 
     Every hindsight goal of the others is reached without acting (arXiv 2012.08850).
     """
-    goal = data["next", "achieved_goal"][:, SETTLED:]
+    goal = data["next", "achieved_goal"]
+    goal = goal[:, min(SETTLED, goal.shape[1] // 2) :]
     change = (goal - goal[:, :1]).abs()
     return (change > MOVED).flatten(1).any(1)
 

@@ -3,6 +3,7 @@
 import time
 from pathlib import Path
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from tqdm import tqdm
@@ -13,6 +14,8 @@ from training import files
 from training.buffers import STORED_KEYS
 from training.checkpoint import SAVE_INTERVAL, Checkpoint
 
+OTHER_REWARDS = 0.01  # of all, at most
+
 
 def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     """Transitions (n,) of whole episodes.
@@ -22,7 +25,8 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         env: the environment that they are for.
 
     Raises:
-        ValueError: it holds none, or none of such an environment.
+        ValueError: it holds none, or none of such an environment: sizes or rewards
+            differ.
     """
     if not path.exists():
         raise ValueError(
@@ -46,9 +50,30 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             raise ValueError(
                 f"{path}: {key} has size {demos[key].shape[-1]}, the task's has {size}"
             )
+    check_rewards(path, demos, env)
     # What is beyond the environment clips, too.
     demos["action"] = demos["action"].clamp(-1.0, 1.0)
     return demos.to(env.device)
+
+
+def check_rewards(path: Path, demos: TensorDictBase, env: RobotTaskEnv) -> None:
+    """Make sure that demonstrations were rewarded as the task rewards.
+
+    Raises:
+        ValueError: they were not.
+    """
+    after = demos["next"]
+    expected = env.compute_reward(after["achieved_goal"], demos["desired_goal"])
+    found = after["reward"].to(expected)
+    # A rounded goal at the edge of success may count otherwise.
+    other = ~torch.isclose(found, expected, rtol=1e-3, atol=1e-3)
+    if other.double().mean() > OTHER_REWARDS:
+        k = int(other.flatten().nonzero()[0])
+        raise ValueError(
+            f"{path}: {other.double().mean():.0%} of the rewards are not the task's, "
+            f"the first is {float(found[k]):g} instead of {float(expected[k]):g}: were "
+            "they recorded with another id or other options?"
+        )
 
 
 def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:

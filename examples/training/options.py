@@ -80,7 +80,7 @@ def check(args: Args) -> None:
         ValueError: says which, and what is accepted.
     """
     check_limits(args)
-    explores = args.noise_eps or any(args.random_eps)
+    explores = args.noise_eps or any(args.random_eps[: args.num_envs])
     if args.algo in ("ddpg", "td3") and not explores:
         raise ValueError(
             f"algo {args.algo} explores by noise_eps and random_eps: one of them must "

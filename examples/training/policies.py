@@ -2,7 +2,7 @@
 
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -48,6 +48,13 @@ def load_agent(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Agent:
             f"the policy was saved by another version, with options that this one does "
             f"not have: {', '.join(sorted(unknown))}"
         )
+    for name, hint in get_type_hints(Hyperparameters).items():
+        accepted = get_args(hint) if get_origin(hint) is Literal else ()
+        if accepted and name in options and options[name] not in accepted:
+            raise ValueError(
+                f"the policy was saved by another version: {name} must be one of "
+                f"{accepted}, got {options[name]!r}"
+            )
     agent = make_agent(env, Hyperparameters(**options))
     try:
         agent.policy.load_state_dict(checkpoint["policy"])

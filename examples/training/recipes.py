@@ -8,6 +8,8 @@ import re
 from dataclasses import asdict
 from typing import Any
 
+from torch_panda import ENV_IDS
+
 # Every object task: hindsight about what moved, and symmetry.
 OBJECT: dict[str, Any] = {
     "num_envs": 8,
@@ -57,8 +59,8 @@ RECIPES: dict[str, dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
-    # A stack is many steps, and seldom done by a hand that acts at random: most episodes
-    # begin in its course, and each cube has a hindsight of its own.
+    # A stack is many steps, and seldom done by a hand that acts at random: most
+    # episodes begin in its course, and each cube has a hindsight of its own.
     "Stack": {
         **OBJECT,
         "gamma": 0.98,
@@ -93,6 +95,8 @@ RECIPES: dict[str, dict[str, Any]] = {
 
 def find_recipe(env_id: str) -> dict[str, Any]:
     """The recipe of an environment's task; none of an unknown one."""
+    if env_id not in ENV_IDS:
+        return {}
     tasks = "|".join(RECIPES)
     found = re.match(rf"[A-Z]\w*?({tasks})(Joints)?(Dense)?-v\d", env_id)
     recipe = RECIPES.get(found[1], {}) if found else {}
@@ -105,4 +109,6 @@ def find_changes(args: Any, default: Any) -> dict[str, Any]:  # noqa: ANN401 (da
     """The options that make another way to train of a preset's, for plots' labels."""
     ours, others = asdict(args), asdict(default)
     plain = PLAIN_OPTIONS
+    if ours.get("anneal_lr"):  # by when the learning rate has fallen
+        plain = plain - {"total_steps"}
     return {k: x for k, x in ours.items() if x != others[k] and k not in plain}

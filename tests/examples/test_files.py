@@ -54,6 +54,14 @@ def test_policies_of_other_versions(tmp_path, script):
         script.main(script.Args(**given))
 
 
+def test_a_policy_with_a_value_of_another_version(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    options = {"augmentation": "mirror-shift-swap"}
+    save(path, {"env_id": "PandaReach-v1", "hyperparameters": options, "policy": {}})
+    with pytest.raises(SystemExit, match=r"augmentation must be one of .*-swap'$"):
+        evaluate.main(evaluate.Args(run=path))
+
+
 @BAD
 def test_files_that_hold_no_demonstrations(tmp_path, content):
     path = tmp_path / "demos.pt"

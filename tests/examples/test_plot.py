@@ -180,3 +180,10 @@ def test_no_run_and_no_place(runs, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(SystemExit, match=r"^cannot draw: \[Errno"):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "file" / "curves.png"))
+
+
+def test_when_the_learning_rate_has_fallen_is_another_line():
+    args, default = Args(total_steps=200_000), Args()
+    assert find_changes(args, default) == {}
+    args.anneal_lr = default.anneal_lr = True
+    assert find_changes(args, default) == {"total_steps": 200_000}

@@ -5,9 +5,11 @@ import json
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import refine
 import torch_panda
+from agents import Hyperparameters, make_agent
 from evaluate import evaluate
 from training.policies import load_agent, load_policy, read_checkpoint, save_policy
 
@@ -64,7 +66,10 @@ def test_a_policy_that_misses_learns_to_hit(crooked, tmp_path):
     out = tmp_path / "run"
     refine.main(refine.Args(crooked, out, steps=12_800, updates=800, batch_size=512))
     assert success(out) > 0.9
-    assert json.loads((out / "args.json").read_text())["preset"] == "refined"
+    options = json.loads((out / "args.json").read_text())
+    assert options["preset"] == "refined"
+    changed = {"steps": 12_800, "updates": 800, "batch_size": 512}
+    assert options["changed"] == changed
 
 
 class Stop:
@@ -94,6 +99,54 @@ def test_a_stopped_run_goes_on_bit_for_bit(crooked, tmp_path, asked):
         assert len(run.progress.curve) == 2
     for key, value in policies[0].items():
         assert torch.equal(value, policies[1][key]), key
+
+
+@pytest.mark.parametrize("during", ["play", "evaluation"])
+def test_a_killed_run_goes_on_from_its_last_save(
+    crooked, tmp_path, monkeypatch, during
+):
+    class Kill(BaseException):
+        pass
+
+    def kill(*arguments):
+        raise Kill
+
+    options = {"steps": 600, "updates": 4, "num_envs": 4, "batch_size": 64}
+    args = refine.Args(crooked, tmp_path / "run", **options)
+    args.out.mkdir()
+    run = refine.Refinement(args)
+    add, played = run.curve.add, refine.play
+    if during == "evaluation":  # the one after the imitation
+        run.curve.add = lambda progress: kill() if progress.curve else add(progress)
+    plays = iter([played, played, kill if during == "play" else played])
+    with monkeypatch.context() as patch, pytest.raises(Kill):
+        patch.setattr(refine, "SAVE_INTERVAL", 200)
+        patch.setattr(refine, "play", lambda *args: next(plays)(*args))
+        run.run()
+    run.close()
+    args.resume = True
+    resumed = refine.Refinement(args)
+    assert resumed.progress.steps == (400 if during == "play" else 600)
+    assert resumed.run()
+    resumed.close()
+    assert len(resumed.progress.curve) == 2
+
+
+def test_a_stochastic_policy_is_refined_without_its_noise(tmp_path, monkeypatch):
+    with torch_panda.make("PandaReach-v1", num_envs=2) as env:
+        agent = make_agent(env, Hyperparameters(algo="sac"))
+    save_policy(tmp_path / "sac.pt", agent, "PandaReach-v1")
+    options = {"steps": 100, "updates": 1, "num_envs": 2, "batch_size": 4}
+    run = refine.Refinement(refine.Args(tmp_path / "sac.pt", tmp_path, **options))
+    asked = []
+    monkeypatch.setattr(refine, "ask_for_achieved", lambda x, *_: asked.append(x))
+    run.play(stop=False)
+    run.close()
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        for episode in asked:
+            played = episode["action"].clone()
+            own = run.agent.policy(episode.clone())["action"]
+            torch.testing.assert_close(played, own)
 
 
 def test_what_cannot_be_refined_is_refused(crooked, tmp_path):

@@ -1,6 +1,7 @@
 """The algorithms: their losses, what a gradient step changes, and how they explore."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from torchrl.objectives import DDPGLoss, TD3Loss
 import torch_panda
 from agents import AGENTS, Hyperparameters, make_agent
 from agents.base import TAU
-from agents.ddpg import SATURATION_L2
+from agents.ddpg import SATURATION_L2, lowest_return
 from agents.td3 import NOISE_CLIP, POLICY_NOISE
 from tests.examples.agents.transitions import make_transitions
 
@@ -123,6 +124,35 @@ def test_targets_are_possible_returns(env, algo):
         expected = len(agent.critics) * (value - target).square().mean()
         losses = copy.deepcopy(agent).update(batch.clone())
         torch.testing.assert_close(losses["critic_loss"], expected)
+
+
+class PushForOne(torch_panda.Push):
+    """A reward of 1 for success, and else of 0."""
+
+    def compute_reward(self, achieved_goal, desired_goal):
+        return self.is_success(achieved_goal, desired_goal).float()
+
+
+class PushGently(torch_panda.Push):
+    """Beside the sparse reward, one for small actions."""
+
+    def reward(self, simulation, action, achieved_goal, desired_goal):
+        sparse = super().reward(simulation, action, achieved_goal, desired_goal)
+        return sparse - action.square().sum(-1, keepdim=True)
+
+
+@pytest.mark.parametrize(
+    ("task", "gamma", "expected"),
+    [
+        (torch_panda.Push(), 0.75, -4.0),
+        (torch_panda.Push(), 1.0, -math.inf),
+        (torch_panda.Push(reward_type="dense"), 0.75, None),
+        (PushForOne(), 0.75, None),
+        (PushGently(), 0.75, None),
+    ],
+)
+def test_only_the_librarys_own_sparse_rewards_bound_returns(task, gamma, expected):
+    assert lowest_return(task, gamma) == expected
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])

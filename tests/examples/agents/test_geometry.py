@@ -5,6 +5,7 @@ import torch
 from torch.nn.functional import normalize
 
 import torch_panda
+from agents import Hyperparameters, make_agent
 from agents.geometry import read_geometry
 from experts.rotations import STRAIGHT, compose, straighten, to_matrix
 from torch_panda.rotations import rotation_distance
@@ -93,3 +94,25 @@ def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
         again = geometry.turns(alike, compose(goal, same))
         expected = (seen, turn, matrix, likeness)
         torch.testing.assert_close(again, expected, atol=1e-5, rtol=0)
+
+
+class PushAndTell(torch_panda.Push):
+    """Observes one number more."""
+
+    observation_dim = 13
+
+    def observation(self, simulation):
+        height = simulation.object_pose[:, 0, 2:3]
+        return torch.cat((super().observation(simulation), height), 1)
+
+
+@pytest.mark.parametrize(
+    "options", [{"relative_inputs": "coarse"}, {"augmentation": "mirror-shift"}]
+)
+def test_other_layouts_are_not_guessed(options):
+    scene = {"robot": torch_panda.Panda(block_gripper=True), "task": PushAndTell()}
+    with torch_panda.RobotTaskEnv(**scene, num_envs=2) as env:
+        with pytest.raises(ValueError, match=r"\[18, 3\] numbers here, got \[19, 3\]"):
+            make_agent(env, Hyperparameters(**options))
+        agent = make_agent(env, Hyperparameters())
+        assert env.rollout(2, agent.policy)["action"].shape == (2, 2, 3)

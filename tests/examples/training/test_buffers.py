@@ -90,3 +90,11 @@ def test_episodes_in_which_nothing_moved(stack):
     assert abs(sum(kept) / 200 - (1 + 3 / 4)) < 0.2
     assert len(select_episodes(data, 1.0)) == 4
     assert data["next", "done"][:, -1].all()
+
+
+def test_short_episodes_in_which_something_moved(stack):
+    data = play(stack)[:, :3]
+    goal = data["next", "achieved_goal"]
+    goal[:] = goal[:, :1]
+    goal[1, 2, 4] += 0.02
+    assert moved(data).tolist() == [False, True, False, False]

@@ -1,5 +1,7 @@
 """Learning from a file of demonstrations, before and beside one's own transitions."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -49,6 +51,15 @@ def test_demonstrations_without_a_transition(env, make_demos):
     content = TensorDict(torch.load(path)).auto_batch_size_(1)
     torch.save(content[:0].to_dict(), path)
     with pytest.raises(ValueError, match=f"{path} holds no transitions"):
+        read_demos(path, env)
+
+
+def test_demonstrations_of_other_rewards(make_demos):
+    path = make_demos()
+    with (
+        torch_panda.make("PandaPushDense-v1", num_envs=1) as env,
+        pytest.raises(ValueError, match=r"100% of the rewards .* is -1 instead of -0"),
+    ):
         read_demos(path, env)
 
 
@@ -120,3 +131,35 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
     torch.testing.assert_close(weights(resumed), after, rtol=0, atol=0)
     points = [run.progress.curve[-1]["success"] for run in (resumed, whole)]
     assert points[0] == points[1]
+
+
+def test_what_was_imitated_is_evaluated_also_after_a_kill(make_demos, tmp_path):
+    """A kill, or a second Ctrl-C, ends the evaluation after the last imitation."""
+    options = {"total_steps": 100, "pretrain_updates": 4, "updates_per_step": 0.05}
+    args = small(make_demos(), **options)
+    whole = Run(args, tmp_path)
+    assert whole.train()
+    whole.close()
+
+    class Kill(BaseException):
+        pass
+
+    killed = Run(args, tmp_path)
+    add = killed.curve.add
+
+    def add_or_die(progress, losses=None):
+        if progress.curve:
+            raise Kill
+        add(progress, losses)
+
+    killed.curve.add = add_or_die
+    with pytest.raises(Kill):
+        killed.train()
+    killed.close()
+    resumed = Run(replace(args, resume=True), tmp_path)
+    assert resumed.train()
+    resumed.close()
+    assert [row["step"] for row in resumed.progress.curve] == [0, 0, 100]
+    state = resumed.agent.state_dict()
+    for key, value in whole.agent.state_dict().items():
+        assert torch.equal(state[key], value), key

@@ -35,6 +35,7 @@ def test_recipes_fit_joint_control(env_id, tmp_path):
 
 def test_unknown_tasks_and_the_paper_have_none():
     assert find_recipe("PandaFly-v1") == find_recipe("Fly-v1") == {}
+    assert find_recipe("BallPush-v0") == {}  # somebody's own
     assert default_args("paper", "PandaPush-v1") == Args(env_id="PandaPush-v1")
 
 
