@@ -16,11 +16,13 @@ have torch_panda and the same Ray (this folder's files are brought along):
     ray start --address=FIRST:6379     # on the others
 """
 
+import json
 import logging
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -34,8 +36,9 @@ import torch_panda
 from agents import Hyperparameters, make_agent
 from limits import Positive, Seed, Weight, check_limits
 from training.buffers import STORED_KEYS, make_buffer
-from training.checkpoint import Progress, StopSignal, crossed
+from training.checkpoint import Progress, StopSignal, check_folder, crossed
 from training.curve import Curve
+from training.recipes import find_changes
 
 try:
     import ray
@@ -218,6 +221,29 @@ def draw_seed() -> int:
     return int(torch.randint(2**62, ()))
 
 
+def check(args: Args) -> None:
+    """Refuse options that would end the training later, or teach nothing.
+
+    Raises:
+        ValueError: says which, and what is accepted.
+    """
+    check_limits(args)
+    explores = args.noise_eps or any(args.random_eps)
+    if args.algo in ("ddpg", "td3") and not explores:
+        raise ValueError(
+            f"algo {args.algo} explores by noise_eps and random_eps: one of them must "
+            "be above 0"
+        )
+
+
+def options(args: Args) -> dict[str, Any]:
+    """What args.json holds, for plots; where a run is made is no way to train."""
+    where = {"address": args.address, "cpus_per_worker": args.cpus_per_worker}
+    default = Args(env_id=args.env_id, **where)
+    changed = find_changes(args, default)
+    return {"preset": "distributed", **asdict(args), "changed": changed}
+
+
 def connect(args: Args) -> None:
     """Join the cluster, or start one.
 
@@ -250,13 +276,15 @@ def main(args: Args) -> None:
     """Train, and say where the policy is."""
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
-        check_limits(args)
+        check(args)
+        check_folder(out, resume=False)
         connect(args)
-        out.mkdir(parents=True, exist_ok=True)
         learner = Learner(args, out)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "args.json").write_text(json.dumps(options(args), default=str, indent=2))
         learner.train(StopSignal())
         learner.close()
-    except (ConnectionError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise SystemExit(str(error)) from None
     except RayActorError as error:
         raise SystemExit(f"a worker died: {error}") from None

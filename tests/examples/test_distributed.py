@@ -1,6 +1,7 @@
 """The distributed example, on a Ray cluster of two nodes on this machine."""
 
 import importlib
+import json
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+import plot
 from torch_panda.transforms import HindsightRelabel
 from training import curve
 
@@ -145,6 +147,46 @@ def test_too_small_a_cluster_is_an_error(distributed, address):
     with pytest.raises(ValueError, match="room for 0 workers of 2 CPUs, not for 2"):
         distributed.connect(distributed.Args(address=address, cpus_per_worker=2))
     ray.shutdown()
+
+
+@pytest.mark.parametrize("name", ["curve.csv", "checkpoint.pt"])
+def test_another_run_is_not_overwritten(distributed, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(distributed, "connect", pytest.fail)
+    (tmp_path / name).write_text("theirs")
+    with pytest.raises(SystemExit, match=f"^{tmp_path} holds a run: "):
+        distributed.main(distributed.Args(out=tmp_path))
+    assert (tmp_path / name).read_text() == "theirs"
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+def test_something_must_explore(distributed, tmp_path, monkeypatch, algo):
+    monkeypatch.setattr(distributed, "connect", pytest.fail)
+    args = distributed.Args(
+        algo=algo, noise_eps=0.0, random_eps=(0.0, 0.0), out=tmp_path / "run"
+    )
+    with pytest.raises(SystemExit, match=f"^algo {algo} explores by noise_eps and "):
+        distributed.main(args)
+    assert not args.out.exists()
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_run_is_drawn(distributed, address, tmp_path):
+    args = distributed.Args(
+        address=address,
+        num_envs=4,
+        steps_per_batch=5,
+        total_steps=40,
+        updates_per_step=0.25,
+        out=tmp_path / "run",
+    )
+    distributed.main(args)
+    written = json.loads((args.out / "args.json").read_text())
+    assert (written["env_id"], written["total_steps"]) == ("PandaReach-v1", 40)
+    runs = plot.read_runs([tmp_path])
+    (line,) = runs["PandaReach-v1"]["DDPG"]
+    assert line == "distributed, num envs 4, steps per batch 5, updates per step 0.25"
+    (drawn,) = runs["PandaReach-v1"]["DDPG"][line]
+    assert [row["step"] for row in drawn] == [0, 40]
 
 
 @pytest.mark.slow
