@@ -238,8 +238,9 @@ def check(args: Args) -> None:
 
 def options(args: Args) -> dict[str, Any]:
     """What args.json holds, for plots; where a run is made is no way to train."""
-    where = {"address": args.address, "cpus_per_worker": args.cpus_per_worker}
-    default = Args(env_id=args.env_id, **where)
+    default = Args(
+        env_id=args.env_id, address=args.address, cpus_per_worker=args.cpus_per_worker
+    )
     changed = find_changes(args, default)
     return {"preset": "distributed", **asdict(args), "changed": changed}
 
