@@ -130,6 +130,8 @@ def read_runs(folders: list[Path]) -> Runs:
     """
     runs: Runs = {}
     for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
+        if not (path.parent / "args.json").exists():
+            continue
         try:
             args = json.loads((path.parent / "args.json").read_text())
             task, algo = str(args["env_id"]), str(args["algo"]).upper()

@@ -160,7 +160,7 @@ def test_band_over_the_steps_that_all_seeds_have(tmp_path, figures):
 
 
 def spoil_arguments(folder):
-    (folder / "args.json").unlink()
+    (folder / "args.json").write_text("{}")
 
 
 def spoil_curve(folder):
@@ -172,6 +172,13 @@ def test_a_folder_that_holds_no_run_is_named(runs, tmp_path, spoil):
     spoil(runs / "1")
     with pytest.raises(SystemExit, match=f"^cannot draw: {runs / '1'} holds no run: "):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
+
+
+def test_what_is_no_run_is_left_out(runs, tmp_path, figures):
+    (runs / "1" / "args.json").unlink()
+    plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
+    (axes,) = figures[0].axes
+    assert lines_of(axes) == ["DDPG, paper (1 seed)"]
 
 
 def test_no_run_and_no_place(runs, tmp_path):
