@@ -6,8 +6,9 @@ from importlib.util import find_spec
 import pytest
 
 from torch_panda.__main__ import main
-from torch_panda.bench import command
+from torch_panda.bench import command, comparison
 from torch_panda.bench.contenders import CONTENDERS, OURS
+from torch_panda.bench.runner import ContenderError
 from torch_panda.bullet.native import LIBRARY
 
 
@@ -64,6 +65,39 @@ def test_table_json_and_plot(tmp_path, capsys):
     bare = [e for e in entries if e["contender"] == "bare-bullet"]
     measured = [] if LIBRARY is None else [1, 2, 1, 2]
     assert [e["setting"]["num_envs"] for e in bare] == measured
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ContenderError("no memory"), r"^Setting\(.*num_envs=2.*\): no memory$"),
+        (KeyboardInterrupt(), "^interrupted$"),
+    ],
+)
+def test_what_was_measured_before_a_failure_is_kept(
+    tmp_path, capsys, monkeypatch, error, message
+):
+    def compare(setting, *args, **options):
+        if setting.num_envs > 1:
+            raise error
+        return comparison.compare(setting, *args, **options)
+
+    monkeypatch.setattr(command, "compare", compare)
+    path, picture = tmp_path / "bench.json", tmp_path / "bench.png"
+    options = ["--ids", "PandaReach-v3", "--others", "--rounds", "1", "--steps", "1"]
+    options += ["--json", str(path), "--plot", str(picture)]
+    with pytest.raises(SystemExit, match=message):
+        main(["bench", *options, "--num-envs", "1", "2", "3"])
+    assert [row[:4] for row in rows_of(capsys.readouterr().out)] == [
+        ["PandaReach-v3", "1", "1", OURS]
+    ]
+    assert len(json.loads(path.read_text())["results"]) == 1
+    assert picture.exists()
+    path.unlink()
+    with pytest.raises(SystemExit, match=message):
+        main(["bench", *options, "--num-envs", "2"])
+    assert not capsys.readouterr().out
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("name", list(CONTENDERS))

@@ -73,10 +73,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, and print the table.
+    """Measure, and print the table: after an error or Ctrl-C, of what there is.
 
     Raises:
-        SystemExit: a library of the extra ``bench`` is missing, or a contender failed.
+        SystemExit: a library of the extra ``bench`` is missing, a contender failed, or
+            Ctrl-C was pressed.
     """
     for library in ("tqdm", *(["matplotlib"] if args.plot else [])):
         if find_spec(library) is None:
@@ -90,6 +91,7 @@ def run(args: argparse.Namespace) -> None:
     ]
     results: list[Result] = []
     absences: list[Absence] = []
+    failure: str | None = None
     total = work_of(len(settings), 1 + len(args.others), args.rounds)
     with tqdm(total=total, unit="measurement") as bar:
 
@@ -107,10 +109,16 @@ def run(args: argparse.Namespace) -> None:
                     progress=progress,
                 )
             except ContenderError as error:
-                sys.exit(f"{setting}: {error}")
+                failure = f"{setting}: {error}"
+                break
+            except KeyboardInterrupt:
+                failure = "interrupted"
+                break
             results += measured
             absences += missing
         bar.total = bar.n
+    if failure is not None and not results:
+        sys.exit(failure)
     print(table(results))
     if absences:
         print(notes(absences))
@@ -118,3 +126,5 @@ def run(args: argparse.Namespace) -> None:
         write_json(args.json, results, absences)
     if args.plot is not None:
         plot(args.plot, results)
+    if failure is not None:
+        sys.exit(failure)
