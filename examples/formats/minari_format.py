@@ -1,6 +1,5 @@
 """Minari's format (https://minari.farama.org): data sets by id, in one folder."""
 
-import re
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -9,12 +8,12 @@ import minari
 import numpy as np
 import torch
 from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_dataset import parse_dataset_id
 from minari.storage import get_dataset_path
 from tensordict import TensorDict, TensorDictBase
 
 from torch_panda import RobotTaskEnv
 
-ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 OBSERVED = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -30,11 +29,13 @@ class MinariWriter:
     """
 
     def __init__(self, dataset_id: str, env_id: str) -> None:
-        if not ID.fullmatch(dataset_id):
+        try:
+            parse_dataset_id(dataset_id)
+        except (ValueError, TypeError):  # TypeError: without a version
             raise ValueError(
-                "the id of a data set ends in its version, such as "
-                f"panda/push-expert-v0, got {dataset_id!r}"
-            )
+                "the id of a data set ends in its version, and a namespace has two "
+                f"characters or more, such as panda/push-expert-v0, got {dataset_id!r}"
+            ) from None
         if self.folder(dataset_id).exists():
             raise ValueError(f"there is a data set {dataset_id} already")
         self.dataset_id, self.env_id = dataset_id, env_id

@@ -74,7 +74,9 @@ def test_a_policy_learns_from_it(recorded):
 def test_bad_names_are_one_line(recorded):
     for name, message in (
         (recorded[1], "already"),
-        ("push", "ends in its version, such as .*, got 'push'"),
+        ("push", "ends in its version, .* such as .*, got 'push'"),
+        ("x/y-v0", "a namespace has two characters or more, .*, got 'x/y-v0'"),
+        ("panda/x.y-v0", "such as panda/push-expert-v0, got 'panda/x.y-v0'"),
     ):
         with pytest.raises(SystemExit, match=message):
             record("minari", name, "PandaReach-v1", 1)
