@@ -17,6 +17,7 @@ matplotlib.use("Agg")  # no display is needed
 import matplotlib.pyplot as plt
 import torch
 import tyro
+from matplotlib.backend_bases import FigureCanvasBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -83,7 +84,28 @@ def success_grid(
     return successes / episodes
 
 
-def plot_grids(grids: dict[str, torch.Tensor], args: Args) -> None:
+def check_format(path: Path) -> None:
+    """Refuse what a figure cannot be written as; without a suffix it becomes a .png.
+
+    Raises:
+        ValueError: says what it can.
+    """
+    formats = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in formats:
+        names = ", ".join(f".{name}" for name in sorted(formats))
+        raise ValueError(f"out must end in one of {names}, got {path.name!r}")
+
+
+def name_all(runs: list[Path]) -> list[str]:
+    """What each is called: its own name, after its folder's where that repeats."""
+    names = [run.stem if run.is_file() else run.name for run in runs]
+    return [
+        f"{run.absolute().parent.name}/{name}" if names.count(name) > 1 else name
+        for run, name in zip(runs, names, strict=True)
+    ]
+
+
+def plot_grids(grids: list[tuple[str, torch.Tensor]], args: Args) -> None:
     """Draw success over mass and friction, a panel a policy."""
     figure, panels = plt.subplots(
         1,
@@ -92,7 +114,7 @@ def plot_grids(grids: dict[str, torch.Tensor], args: Args) -> None:
         layout="constrained",
         squeeze=False,
     )
-    for axes, (name, grid) in zip(panels[0], grids.items(), strict=True):
+    for axes, (name, grid) in zip(panels[0], grids, strict=True):
         image = axes.imshow(grid, origin="lower", vmin=0, vmax=1, cmap="viridis")
         axes.set_xticks(range(len(args.masses)), [f"{x:g}" for x in args.masses])
         axes.set_yticks(range(len(args.frictions)), [f"{x:g}" for x in args.frictions])
@@ -109,6 +131,7 @@ def plot_grids(grids: dict[str, torch.Tensor], args: Args) -> None:
 def main(args: Args) -> None:
     """Evaluate each policy on the grid, print the means and draw them."""
     check_limits(args)
+    check_format(args.out)
     prepare(args.out)
     factors = torch.cartesian_prod(
         torch.tensor(args.frictions), torch.tensor(args.masses)
@@ -116,8 +139,8 @@ def main(args: Args) -> None:
     factors = factors.flip(1)  # mass first, as in physics_parameters
     ranges = [(float(column.min()), float(column.max())) for column in factors.T]
     randomize = Randomization(object_mass=ranges[0], object_friction=ranges[1])
-    grids: dict[str, torch.Tensor] = {}
-    for run in args.runs:
+    grids: list[tuple[str, torch.Tensor]] = []
+    for run, name in zip(args.runs, name_all(args.runs), strict=True):
         checkpoint = read_checkpoint(run)
         with torch_panda.make(
             checkpoint["env_id"],
@@ -127,8 +150,8 @@ def main(args: Args) -> None:
         ) as env:
             policy = load_policy(checkpoint, env)
             success = success_grid(env, policy, factors, args.episodes)
-        name = run.stem if run.is_file() else run.name
-        grids[name] = success.reshape(len(args.frictions), len(args.masses))
+        grid = success.reshape(len(args.frictions), len(args.masses))
+        grids.append((name, grid))
         print(f"{name}: {success.mean():.1%} over the grid, worst {success.min():.1%}")
     plot_grids(grids, args)
 

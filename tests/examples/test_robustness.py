@@ -1,7 +1,9 @@
 """Policies on a grid of masses and frictions."""
 
+import shutil
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 import torch
 
@@ -21,6 +23,42 @@ def test_draws_a_grid(tmp_path, capsys):
     robustness.main(args)
     assert "PandaPush-v1:" in capsys.readouterr().out
     assert out.stat().st_size > 1000
+
+
+def test_policies_of_one_name_are_all_drawn(tmp_path, monkeypatch, capsys):
+    runs = [tmp_path / name / "checkpoint.pt" for name in ("a", "b")]
+    for run in runs:
+        run.parent.mkdir()
+        shutil.copy(POLICY, run)
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    args = robustness.Args(
+        [*runs, POLICY, runs[0]],
+        masses=(1.0,),
+        frictions=(1.0,),
+        episodes=1,
+        out=tmp_path / "grid.png",
+    )
+    robustness.main(args)
+    names = ["a/checkpoint", "b/checkpoint", "PandaPush-v1", "a/checkpoint"]
+    titles = [axes.get_title() for axes in figures[0].axes]
+    assert [title for title in titles if title] == names
+    output = capsys.readouterr().out
+    assert [line.split(":")[0] for line in output.splitlines()] == names
+    monkeypatch.undo()
+    plt.close(figures[0])
+
+
+def test_a_format_that_is_none_is_refused_before_playing(tmp_path, monkeypatch):
+    monkeypatch.setattr(robustness, "success_grid", pytest.fail)
+    message = r"^out must end in one of .*\.png, .*, got 'grid\.foo'$"
+    with pytest.raises(ValueError, match=message):
+        robustness.main(robustness.Args([POLICY], out=tmp_path / "grid.foo"))
+
+
+@pytest.mark.parametrize("name", ["grid", "grid.pdf", "grid.PNG"])
+def test_other_formats_are_accepted(name):
+    robustness.check_format(Path(name))
 
 
 def test_cells_differ_in_physics_only():
