@@ -39,6 +39,8 @@ def show(
                 success = bool(state["success"][0])
                 due += 1 / FPS
                 time.sleep(max(0.0, due - time.perf_counter()))
+                if state["done"][0]:
+                    break  # a -v3 episode ends at its first success
             outcome = "success" if success else "no success"
             print(f"episode {episode} of {episodes}: {outcome}", flush=True)
 

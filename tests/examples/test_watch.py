@@ -5,14 +5,18 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
 import gallery
+import torch_panda
 import watch
+from experts import make_expert
 
 
 @pytest.mark.parametrize("policy", ["random", "expert"])
@@ -106,6 +110,19 @@ def test_window_without_a_display_is_one_line():
     assert process.returncode == 1
     assert output.count("needs a display with OpenGL") == 1
     assert "Traceback" not in output
+
+
+def test_an_episode_that_ends_at_success_is_one(monkeypatch, capsys):
+    window = Mock()
+    monkeypatch.setattr(watch, "FPS", 1e9)
+    with torch_panda.make("PandaReach-v3", num_envs=1, seed=0) as env:
+        monkeypatch.setattr(env, "open_window", lambda: nullcontext(window))
+        watch.show(env, make_expert("PandaReach-v3"), episodes=2)
+    assert capsys.readouterr().out.splitlines() == [
+        "episode 1 of 2: success",
+        "episode 2 of 2: success",
+    ]
+    assert 2 < window.show.call_count < 50  # the ends of both episodes are shown
 
 
 def test_gallery(tmp_path):
