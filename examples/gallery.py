@@ -7,7 +7,7 @@ python examples/gallery.py --policies examples/policies/*.pt --out policies.png
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 
 import torch_panda
 from experts import make_expert
+from limits import Limit, Positive, Seed, check_limits
 from training.files import prepare
 from training.policies import load_policy, read_checkpoint
 from video import FPS, play, tile
@@ -28,6 +29,7 @@ TASKS = (
 NEAR = torch_panda.Camera(distance=1.0, yaw=60, pitch=-25, target=(-0.2, 0.0, 0.23))
 # Slide's goals are out of reach.
 FAR = torch_panda.Camera(distance=1.5, yaw=50, pitch=-25, target=(0.05, 0.0, 0.12))
+STEPS = 50  # of an episode
 COLUMNS = (0, 4, 8, 14, 24)  # steps of a policy that are drawn
 
 Picture = npt.NDArray[np.uint8]
@@ -39,11 +41,11 @@ class Args:
 
     policies: tuple[Path, ...] = ()
     """checkpoints to draw step by step, a row each; none: all tasks, by the experts"""
-    step: int = 15
+    step: Annotated[int, Limit(f"from 0 to {STEPS}", lambda x: 0 <= x <= STEPS)] = 15
     """of all tasks, the step of the episode that is drawn; an animation has all"""
-    seed: int = 4
+    seed: Seed = 4
     """of the environments"""
-    size: tuple[int, int] = (300, 400)
+    size: tuple[Positive, Positive] = (300, 400)
     """height and width of a cell [pixels]"""
     out: Path = Path("gallery.png")
     """picture (.png) or animation (.gif) to write"""
@@ -100,6 +102,7 @@ def main(args: Args) -> None:
     """Draw what was asked for."""
     options: dict[str, Any] = {"seed": args.seed, "size": args.size}
     try:
+        check_limits(args)
         if args.out.suffix not in (".png", ".gif"):
             raise ValueError(f"out must end in .png or .gif, got {args.out.name!r}")
         prepare(args.out)
@@ -114,7 +117,7 @@ def main(args: Args) -> None:
             pictures = [np.vstack(rows)]
         else:
             animated = args.out.suffix == ".gif"
-            steps = 50 if animated else args.step
+            steps = STEPS if animated else args.step
             episodes = [
                 draw(env_id, make_expert(env_id), steps, **options)
                 for env_id in (f"Panda{task}-v1" for task in TASKS)

@@ -22,6 +22,7 @@ class Limit:
 Positive = Annotated[int, Limit("positive", lambda x: x > 0)]
 Count = Annotated[int, Limit("at least 0", lambda x: x >= 0)]
 Seed = Annotated[int, Limit("from 0 to 2**64 - 1", lambda x: 0 <= x < 2**64)]
+Port = Annotated[int, Limit("from 1 to 65535", lambda x: 1 <= x <= 65535)]
 Weight = Annotated[float, Limit("at least 0 and finite", lambda x: 0 <= x < inf)]
 Factor = Annotated[float, Limit("at least 1 and finite", lambda x: 1 <= x < inf)]
 Ratio = Annotated[float, Limit("from 0 to 1", lambda x: 0 <= x <= 1)]

@@ -19,7 +19,7 @@ from torchrl.envs.utils import RandomPolicy
 
 import torch_panda
 from experts import make_expert
-from limits import Positive, Seed, check_limits
+from limits import Port, Positive, Seed, check_limits
 from training.policies import load_policy, read_checkpoint
 from video import FPS, play, record
 
@@ -108,7 +108,7 @@ class Args:
     a run that is training is read again as it changes"""
     host: str = "127.0.0.1"
     """with --web, the address to serve at; 0.0.0.0 lets other machines in"""
-    port: Positive = 8080
+    port: Port = 8080
     """with --web, the port, or the next one that is free"""
 
 

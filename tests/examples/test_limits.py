@@ -9,6 +9,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import evaluate
+import gallery
 import record_demos
 import train
 import watch
@@ -22,7 +23,8 @@ def numbers(hint):
 
 
 @pytest.mark.parametrize(
-    "script", ["train", "evaluate", "record_demos", "refine", "watch", "distributed"]
+    "script",
+    ["train", "evaluate", "record_demos", "refine", "watch", "gallery", "distributed"],
 )
 def test_every_number_has_a_limit(script):
     if script == "distributed":
@@ -81,6 +83,8 @@ def test_devices_that_do_not_work(tmp_path, device):
         (evaluate, "task_options", {"play": nan}),
         *((record_demos, "episodes", 0), (record_demos, "num_envs", 0)),
         *((watch, "num_envs", 0), (watch, "seed", 2**64)),
+        *((watch, "port", 0), (watch, "port", 65536)),
+        *((gallery, "step", -1), (gallery, "step", 51), (gallery, "seed", -1)),
     ],
 )
 def test_others_refuse(tmp_path, script, option, value):
@@ -95,3 +99,7 @@ def test_accepts_ends_of_ranges():
     highest = {"seed": 2**64 - 1, "desired_ratio": 1.0, "random_eps": (1.0, 1.0)}
     check_limits(train.Args(**highest, gamma=1.0))
     check_limits(train.Args(gamma=None))
+    for port in (1, 65535):
+        check_limits(watch.Args(port=port))
+    for step in (0, 50):
+        check_limits(gallery.Args(step=step))
