@@ -50,7 +50,7 @@ def test_policies_of_one_name_are_all_drawn(tmp_path, monkeypatch, capsys):
 
 
 def test_a_format_that_is_none_is_refused_before_playing(tmp_path, monkeypatch):
-    monkeypatch.setattr(robustness, "success_grid", pytest.fail)
+    monkeypatch.setattr(robustness, "success_grid", lambda *_: pytest.fail("played"))
     message = r"^out must end in one of .*\.png, .*, got 'grid\.foo'$"
     with pytest.raises(ValueError, match=message):
         robustness.main(robustness.Args([POLICY], out=tmp_path / "grid.foo"))
