@@ -12,7 +12,9 @@ from torchrl.record.loggers import Logger
 import torch_panda
 from tests.panda_gym_reference import make_reference, start
 from torch_panda import BulletError, Camera
+from torch_panda.bullet import Sphere
 from torch_panda.rendering.visual_client import VisualClient
+from torch_panda.tasks import Bodies
 
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
 # panda-gym's view in half its size; above 200 pixels, meshes have all their details.
@@ -79,6 +81,46 @@ def test_targets_are_seen_through():
     assert behind[0] == behind[1] == behind[2]
     assert seen[0] < behind[0] and seen[0] == seen[2] < seen[1]
     assert seen[0] > 0.7 * behind[0]
+
+
+class HiddenURDF(torch_panda.Task):
+    """A goal in the air where a cube's URDF is built, and the cube elsewhere."""
+
+    goal_dim, observation_dim = 3, 0
+    place = (0.0, 0.25, 0.2)
+
+    def __init__(self, *, marker_first):
+        super().__init__()
+        self.marker_first = marker_first
+
+    def build(self, client):
+        if self.marker_first:
+            marker = client.create_marker(self.place, Sphere(0.015))
+        cube = client.load_urdf("cube_small.urdf", position=self.place)
+        if not self.marker_first:
+            marker = client.create_marker(self.place, Sphere(0.015))
+        return Bodies(objects=(cube,), markers=(marker,))
+
+    def sample_goal(self, rng):
+        return self.place
+
+    def sample_objects(self, rng):
+        return ((-0.2, -0.3, 0.03, 0, 0, 0, 1),)
+
+    def achieved_goal(self, simulation):
+        return simulation.object_pose[:, 0, :3]
+
+
+@pytest.mark.parametrize("marker_first", [True, False])
+def test_markers_are_seen_where_a_urdf_was_built(marker_first):
+    task = HiddenURDF(marker_first=marker_first)
+    with torch_panda.RobotTaskEnv(robot=torch_panda.Panda(), task=task) as env:
+        env.reset()
+        camera = Camera(target=task.place, distance=0.2, width=40, height=40)
+        seen = env.render(camera=camera)
+        env.episodes.simulation.marker_pose[..., 2] = -50.0
+        changed = (seen != env.render(camera=camera)).any(dim=-1)
+    assert changed.sum() > 20
 
 
 def test_shadows_only_darken():

@@ -12,6 +12,7 @@ from torch_panda.rendering.frames import Frames, blend
 from torch_panda.rendering.visual_client import VisualClient
 
 NOTHING = -1  # in a segmentation
+_OUT_OF_SIGHT = (0.0, 0.0, -500.0)  # where URDFs are put among markers [m]
 # What changes nothing that is seen: robots do so, too.
 _NOT_SEEN = {"set_dynamics", "set_joint_friction"}
 
@@ -55,10 +56,13 @@ class SceneRenderer:
                 self._markers = VisualClient("markers")
                 self._marker_bodies = build_scene.build_markers(self._markers)
                 _check_same_task(self._markers, self._solids)
-                visuals = self._markers.visuals
-                self._opacity = np.zeros(max(visuals) + 1, dtype=np.float32)
+                bodies, visuals = self._markers.bodies, self._markers.visuals
+                self._opacity = np.zeros(max(bodies) + 1, dtype=np.float32)
                 for body, visual in visuals.items():
                     self._opacity[body] = visual.opacity
+                # Bullet draws their collision shapes, which would hide markers.
+                for body in set(bodies) - visuals.keys() - set(self._marker_bodies):
+                    self._markers.set_base(body, _OUT_OF_SIGHT)
         except BaseException:
             self.close()
             raise
