@@ -9,6 +9,8 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from tests.gymnasium_envs.equal import assert_equal
@@ -47,7 +49,7 @@ def act(observation, rng):
 def test_same_as_sync_vector_env(env_id, limit, mode):
     ours, theirs = make_pair(env_id, mode, limit)
     assert isinstance(ours, GoalVectorEnv)
-    assert ours.metadata["autoreset_mode"] is mode
+    assert ours.metadata["autoreset_mode"] is ours.autoreset_mode is mode
     for space in ("observation_space", "action_space", "single_observation_space"):
         assert getattr(ours, space) == getattr(theirs, space)
     rng = np.random.default_rng(0)
@@ -71,6 +73,21 @@ def test_same_as_sync_vector_env(env_id, limit, mode):
     ours.close()
     theirs.close()
     assert np.sum(ends, axis=0).min() >= 3
+
+
+def test_torchrl_wraps_it_as_sync_vector_env():
+    rollouts = []
+    for env in make_pair("PandaReach-v3", AutoresetMode.DISABLED, None):
+        wrapped = GymWrapper(env)
+        check_env_specs(wrapped)
+        wrapped.set_seed(0)
+        torch.manual_seed(0)
+        rollouts.append(wrapped.rollout(60, break_when_any_done=False))
+        wrapped.close()
+    ours, theirs = rollouts
+    assert ours["next", "done"].any()
+    for key in ("observation", "desired_goal", "action", "done"):
+        assert torch.equal(ours[key], theirs[key])
 
 
 def test_environments_draw_as_the_torch_environment_of_their_seed():

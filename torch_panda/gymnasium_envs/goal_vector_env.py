@@ -46,6 +46,7 @@ class GoalVectorEnv(
 
     Attributes:
         torch_env: the environment behind it.
+        autoreset_mode: the same.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class GoalVectorEnv(
         **arguments: Any,  # noqa: ANN401 (of GoalEnv)
     ) -> None:
         self.closed = True  # there is nothing to close until all is built
-        self._autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         check_render_mode(render_mode)
         camera, arguments = take_camera(render_camera, arguments)
         self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
@@ -70,7 +71,7 @@ class GoalVectorEnv(
         self.torch_env = env
         self.num_envs = env.num_envs
         self.render_mode = render_mode
-        self.metadata = {**GoalEnv.metadata, "autoreset_mode": self._autoreset_mode}
+        self.metadata = {**GoalEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = arrays.observation_space(env)
         self.single_action_space = arrays.action_space(env)
         self._keys = arrays.observed_keys(env)
@@ -132,7 +133,7 @@ class GoalVectorEnv(
             ResetNeeded: before the first `reset`, or, in the mode DISABLED, when an
                 environment whose episode has ended was not reset.
         """
-        mode, ended = self._autoreset_mode, self._ended
+        mode, ended = self.autoreset_mode, self._ended
         if not self._was_reset or (mode is AutoresetMode.DISABLED and ended.any()):
             raise ResetNeeded(
                 f"reset environments {_indices(ended)} before they are stepped"
