@@ -123,6 +123,20 @@ def test_outputs_are_not_overwritten():
         assert not np.array_equal(first["observation"], second["observation"])
 
 
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_default_device_changes_nothing(mode):
+    with torch.device("meta"):
+        env = GoalVectorEnv(
+            "PandaReach-v1", num_envs=2, max_episode_steps=2, autoreset_mode=mode
+        )
+        env.reset(seed=0)
+        env.step(np.zeros((2, 3)))
+        ended = env.step(np.zeros((2, 3)))[3]
+        observation, _ = env.reset(options={"reset_mask": ended})
+        env.close()
+    assert observation["observation"].shape == (2, 6)
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [

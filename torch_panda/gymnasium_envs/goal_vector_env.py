@@ -79,7 +79,7 @@ class GoalVectorEnv(
             self.single_observation_space, self.num_envs
         )
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._all = torch.ones(self.num_envs, dtype=torch.bool)
+        self._all = torch.ones(self.num_envs, dtype=torch.bool, device="cpu")
         # Which environments have to be reset: (num_envs,).
         self._ended = self._all
         self._was_reset = False
