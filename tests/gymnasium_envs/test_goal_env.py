@@ -131,9 +131,13 @@ def test_pixels_and_sensors_are_observed():
         env.close()
 
 
-def test_time_limit_is_gymnasiums():
-    for limit in (3, 60):
-        env = gymnasium.make("torch_panda/PandaReach-v1", max_episode_steps=limit)
+@pytest.mark.parametrize("limit", [3, 60])
+def test_time_limit_is_gymnasiums_or_ones_own(limit):
+    env_id = "PandaReach-v1"
+    for env in (
+        gymnasium.make(f"torch_panda/{env_id}", max_episode_steps=limit),
+        GoalEnv(env_id, max_episode_steps=limit),
+    ):
         env.reset(seed=0)
         ends = [env.step(np.zeros(3, np.float32))[2:4] for _ in range(limit)]
         env.close()
@@ -187,6 +191,11 @@ def test_own_task():
         pytest.raises(ValueError, match=r"must be \[\], got \[2\]"),
     ):
         GoalEnv(batched)
+    with (
+        torch_panda.make("PandaReach-v1") as made,
+        pytest.raises(TypeError, match=r"\['from_pixels', 'sed'\] are for an id"),
+    ):
+        GoalEnv(made, sed=3, from_pixels=True, render_width=8)
 
 
 def test_render(monkeypatch):

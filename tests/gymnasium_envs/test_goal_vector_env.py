@@ -169,6 +169,11 @@ def test_bad_arguments():
         pytest.raises(ValueError, match=r"must be \[num_envs\], got \[\]"),
     ):
         GoalVectorEnv(single)
+    with torch_panda.make("PandaReach-v1", num_envs=2) as batched:
+        for arguments in ({"num_envs": 2}, {"reward_type": "dense"}):
+            (name,) = arguments
+            with pytest.raises(TypeError, match=f"{name}.* are for an id"):
+                GoalVectorEnv(batched, **arguments)
     gc.collect()
 
 

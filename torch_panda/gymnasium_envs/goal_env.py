@@ -39,6 +39,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Raises:
         ValueError: the environment is batched, or the render mode is unknown.
+        TypeError: there are arguments of an id, but an environment was given.
 
     Attributes:
         torch_env: the environment behind it.
@@ -61,7 +62,9 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         camera, arguments = take_camera(render_camera, arguments)
         self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
         if isinstance(env, str):
-            env = make(env, max_episode_steps=sys.maxsize, **arguments)
+            env = make(env, **{"max_episode_steps": sys.maxsize, **arguments})
+        else:
+            check_no_arguments(arguments)
         if env.batch_size:
             raise ValueError(f"the batch size must be [], got {list(env.batch_size)}")
         self.torch_env = env
@@ -117,3 +120,13 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _observation(self, observed: Observed) -> Observation:
         return {key: observed[key][0].numpy() for key in self._keys}
+
+
+def check_no_arguments(arguments: dict[str, Any]) -> None:
+    """Make sure that no arguments of an id come with an environment.
+
+    Raises:
+        TypeError: some do.
+    """
+    if arguments:
+        raise TypeError(f"{sorted(arguments)} are for an id, not for an environment")

@@ -15,7 +15,7 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.observer import Observed
 from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
-from torch_panda.gymnasium_envs.goal_env import GoalEnv
+from torch_panda.gymnasium_envs.goal_env import GoalEnv, check_no_arguments
 from torch_panda.gymnasium_envs.rendering import check_render_mode, take_camera
 from torch_panda.registry import make
 from torch_panda.rendering import Camera
@@ -32,7 +32,7 @@ class GoalVectorEnv(
 
     Args:
         env: an id of `torch_panda.ENV_IDS`, or an environment of batch size [num_envs].
-        num_envs: number of environments, for an id.
+        num_envs: number of environments, for an id; None means 1.
         autoreset_mode: when an environment whose episode has ended is reset: instead of
             its next step (NEXT_STEP), within the last one (SAME_STEP, with
             ``final_obs`` and ``final_info`` in the infos), or only by `reset` with
@@ -43,6 +43,7 @@ class GoalVectorEnv(
 
     Raises:
         ValueError: the environment is not batched, or a mode is unknown.
+        TypeError: there are arguments of an id, but an environment was given.
 
     Attributes:
         torch_env: the environment behind it.
@@ -53,7 +54,7 @@ class GoalVectorEnv(
         self,
         env: str | RobotTaskEnv,
         *,
-        num_envs: int = 1,
+        num_envs: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         render_camera: Camera | None = None,
@@ -65,7 +66,10 @@ class GoalVectorEnv(
         camera, arguments = take_camera(render_camera, arguments)
         self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
         if isinstance(env, str):
-            env = make(env, num_envs=num_envs, **arguments)
+            env = make(env, num_envs=1 if num_envs is None else num_envs, **arguments)
+        else:
+            given = {} if num_envs is None else {"num_envs": num_envs}
+            check_no_arguments({**arguments, **given})
         if env.num_envs is None:
             raise ValueError("the batch size must be [num_envs], got []")
         self.torch_env = env
