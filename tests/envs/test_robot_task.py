@@ -1,11 +1,13 @@
 """The environment's contract beyond single ids."""
 
 import gc
+import io
 import pickle
 import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -105,6 +107,16 @@ def test_a_pickle_keeps_the_last_seed(env):
     env.set_seed(5)
     with pickle.loads(pickle.dumps(env)) as copy:
         assert torch.equal(env.reset()["desired_goal"], copy.reset()["desired_goal"])
+
+
+@pytest.mark.parametrize("kind", [np.int64, torch.tensor])
+def test_a_state_dict_holds_plain_numbers(kind):
+    file = io.BytesIO()
+    with torch_panda.make("PandaReach-v1", seed=kind(5)) as env:
+        torch.save(env.state_dict(), file)
+        file.seek(0)
+        env.load_state_dict(torch.load(file, weights_only=True))
+        assert env.state_dict()["_extra_state"]["seed"] == 5
 
 
 def test_default_dtype_and_device_change_nothing():

@@ -34,7 +34,7 @@ class EpisodeSeeds:
             TypeError: it is no integer.
         """
         number = secrets.randbits(63) if seed is None else check_seed(seed)
-        self.seed = seed
+        self.seed = None if seed is None else number
         self._streams = [(number, env) for env in range(len(self._episodes))]
         self._episodes = [0] * len(self._episodes)
 
