@@ -125,6 +125,29 @@ def test_mass_is_changed_and_can_be_given():
         assert client.mass(cube) == 3.0
 
 
+@pytest.mark.parametrize(
+    ("key", "name", "factor"),
+    [
+        ("physics_parameters", "object_mass", -1.0),
+        ("physics_parameters", "object_mass", 0.0),
+        ("physics_parameters", "gravity", -0.5),
+        ("start_physics_parameters", "object_friction", -1.0),
+    ],
+)
+def test_impossible_physics_change_nothing(key, name, factor):
+    with make() as env:
+        env.reset()
+        before = env.get_state(exact=True)
+        state = before.clone()
+        state[key][1, PARAMETERS.index(name)] = factor
+        with pytest.raises(ValueError, match="physics_parameters of environment 1 mus"):
+            env.reset(state, set_state=True)
+        assert (env.get_state(exact=True) == before).all()
+        state = env.get_state()
+        state["physics_parameters"][:, PARAMETERS.index("gravity")] = 0.0
+        env.reset(state, set_state=True)
+
+
 def test_joint_positions_start_around_neutral():
     with make(Randomization(joint_position=0.1)) as env:
         env.reset()

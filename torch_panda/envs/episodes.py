@@ -174,6 +174,8 @@ class Episodes(Closing):
                     envs=envs,
                     action_dim=self.robot.action_dim,
                 )
+                self._starts.check_physics(given.values, envs)
+                self._starts.check_physics(given.start, envs)
                 if self.simulation.scene.markers and "desired_goal" in given.values:
                     self._starts.check_goal(given.values["desired_goal"], envs)
             # Until that is done: what fails leaves a world that is of no episode.

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch_panda.bullet import VectorSimulation
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.envs.seeds import EpisodeSeeds
-from torch_panda.envs.state import QUATERNION_TOLERANCE, check_rotations
-from torch_panda.envs.variation import Variation
+from torch_panda.envs.state import QUATERNION_TOLERANCE, check_rotations, check_rows
+from torch_panda.envs.variation import PHYSICS_PARAMETERS, Variation
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 
@@ -106,6 +106,19 @@ class EpisodeStarts:
         if type(self._task).marker_pose is not Task.marker_pose:
             check_rotations("desired_goal", pose, envs)
         return pose
+
+    def check_physics(self, values: dict[str, Tensor], envs: list[int]) -> None:
+        """Make sure that a state of these environments, (k, ...), has possible physics.
+
+        Raises:
+            ValueError: a factor is negative, or one of a mass is 0: what weighs 0 never
+                moves.
+        """
+        if PHYSICS_PARAMETERS in values:
+            factors = values[PHYSICS_PARAMETERS]
+            is_possible = (factors > 0) | (factors == 0) & ~self._variation.is_mass
+            wanted = "at least 0, of a mass above 0"
+            check_rows(PHYSICS_PARAMETERS, is_possible, envs, wanted)
 
     def mark(self, envs: list[int]) -> None:
         """Say where markers are to be put: where the goals are; see `check_goal`."""

@@ -160,9 +160,9 @@ def read_state(
     count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
     state.start = read(START)
     state.actions = _read(ACTIONS, given[ACTIONS], batch_shape, actions, envs)
-    _check_rows(ACTIONS, state.actions.abs() <= 1, envs, "in [-1, 1]")
+    check_rows(ACTIONS, state.actions.abs() <= 1, envs, "in [-1, 1]")
     state.num_actions = _read(NUM_ACTIONS, given[NUM_ACTIONS], batch_shape, count, envs)
-    _check_rows(NUM_ACTIONS, state.num_actions <= most, envs, f"at most {most}")
+    check_rows(NUM_ACTIONS, state.num_actions <= most, envs, f"at most {most}")
     return state
 
 
@@ -174,7 +174,7 @@ def check_rotations(name: str, pose: Tensor, envs: list[int]) -> None:
     """
     norm = torch.linalg.vector_norm(pose[..., 3:], dim=-1)
     is_unit = (norm - 1).abs() < QUATERNION_TOLERANCE
-    _check_rows(name, is_unit, envs, "a position and a unit quaternion")
+    check_rows(name, is_unit, envs, "a position and a unit quaternion")
 
 
 def _read(
@@ -190,15 +190,20 @@ def _read(
     value = value.detach().to("cpu", own.dtype).reshape(own.shape)[envs]
     if value.is_floating_point():
         is_small = value.abs() <= _LARGEST  # false for NaN
-        _check_rows(key, is_small, envs, f"finite and at most {_LARGEST:g}")
+        check_rows(key, is_small, envs, f"finite and at most {_LARGEST:g}")
     else:
-        _check_rows(key, value >= 0, envs, "at least 0")
+        check_rows(key, value >= 0, envs, "at least 0")
     if key.endswith("object_pose"):
         check_rotations(key, value, envs)
     return value
 
 
-def _check_rows(key: str, is_right: Tensor, envs: list[int], wanted: str) -> None:
+def check_rows(key: str, is_right: Tensor, envs: list[int], wanted: str) -> None:
+    """Make sure that entries of a state, (k, ...), are right.
+
+    Raises:
+        ValueError: one is not; it names ``key`` and the environment.
+    """
     if not is_right.all():
         wrong = envs[int((~is_right).flatten(1).any(dim=1).nonzero()[0])]
         raise ValueError(f"{key} of environment {wrong} must be {wanted}")

@@ -33,6 +33,7 @@ class Variation:
     Attributes:
         state: by key, (n, ...): what the physics of the present episodes depend on.
         entries: what is observed of it.
+        is_mass: (k,) bool, which of the ``physics_parameters`` are of masses.
     """
 
     def __init__(
@@ -53,6 +54,8 @@ class Variation:
         names = self._randomization.names
         self._bodies = Bodies(scene.objects, scene.markers)
         self._factors: PhysicsFactors | None = None
+        is_mass = [name == "object_mass" for name in names]
+        self.is_mass = torch.tensor(is_mass, dtype=torch.bool, device="cpu")
         self.state: dict[str, Tensor] = {}
         self.entries: dict[str, Entry] = {}
         if has_hook:
