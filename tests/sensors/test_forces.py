@@ -148,3 +148,7 @@ def test_unknown_sensors_are_named():
         robot=make_kuka(), task=Reach(), seed=0, sensors=("joint_torque",)
     ) as env:
         assert env.rollout(2)["next", "joint_torque"].shape == (2, 7)
+    # Bullet reports no torques that are applied: the sensor would read 0.
+    robot = make_kuka(control_type="joint_torque", wrist_joint=6)
+    with pytest.raises(ValueError, match=r"\('wrist_force_torque',\).*'joint_torque'"):
+        RobotTaskEnv(robot=robot, task=Reach(), sensors=("joint_torque",))

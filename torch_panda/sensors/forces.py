@@ -107,13 +107,18 @@ class FingerContact(ForceSensor):
 
 @dataclass(frozen=True)
 class JointTorque(ForceSensor):
-    """What the motor of each movable joint exerts [N m], of a sliding one [N]."""
+    """What the motor of each movable joint exerts [N m], of a sliding one [N].
+
+    Not for a robot of the control type "joint_torque": Bullet reports what its motors
+    exert, not the torques that actions apply.
+    """
 
     name = "joint_torque"
 
     def shape(self, robot: Robot) -> tuple[int, ...] | None:
         """(n_joints,)."""
-        return (len(robot.joint_forces),)
+        is_torque = robot.control_type == "joint_torque"
+        return None if is_torque else (len(robot.joint_forces),)
 
     def read(
         self, client: PhysicsClient, scene: Scene, robot: Robot
