@@ -123,6 +123,32 @@ def test_markers_are_seen_where_a_urdf_was_built(marker_first):
     assert changed.sum() > 20
 
 
+class Housing(torch_panda.Sensor):
+    """A sensor that stands in the scene, and senses nothing."""
+
+    entries = {}  # noqa: RUF012 (as its own reading)
+
+    def build(self, client, body, robot):
+        client.create_box((0.05,) * 3, mass=0.0, position=(0.0, 0.0, 0.0))
+
+    def attach(self, simulation, renderer, robot):
+        return self
+
+    def after_reset(self, envs):
+        pass
+
+    after_step = after_reset
+
+
+def test_what_a_sensor_builds_is_drawn_beside_markers():
+    pictures = []
+    for sensors in ((), (Housing(),)):
+        with torch_panda.make("PandaReach-v1", seed=0, sensors=sensors) as env:
+            env.reset()
+            pictures.append(env.render(camera=CLOSE))
+    assert (pictures[0] != pictures[1]).any()
+
+
 def test_shadows_only_darken():
     bright = Camera(width=180, height=120, shadows=False)
     with torch_panda.make("PandaPush-v1", seed=0) as env:
