@@ -145,6 +145,22 @@ def test_functions_of_a_task(name, function, error, message):
         make(task_with(name, function), num_envs=2)
 
 
+@pytest.mark.parametrize(
+    "key",
+    ["joint_position", "physics_seed", "actions", "success", "next", "_reset", "_step"],
+)
+def test_names_that_mean_something_else(key):
+    task = task_with("extra_observation", lambda s, sim: {key: sim.joint_position})
+    with pytest.raises(ValueError, match=rf"\['{key}'\] are the environment's own"):
+        make(task)
+
+
+def test_names_of_observations_are_text():
+    task = task_with("extra_observation", lambda s, sim: {("a", "b"): sim.ee_position})
+    with pytest.raises(ValueError, match=r"must be text, got \('a', 'b'\)"):
+        make(task)
+
+
 # ---- rotations ---------------------------------------------------------------
 
 

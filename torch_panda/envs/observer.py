@@ -7,7 +7,8 @@ from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.envs.hooks import TaskHooks
-from torch_panda.envs.variation import Variation
+from torch_panda.envs.state import EXACT_KEYS, PHYSICAL
+from torch_panda.envs.variation import PHYSICS, Variation
 from torch_panda.rendering import VectorRenderer
 from torch_panda.robots import Robot
 from torch_panda.sensors import Observer, Sensor, join_entries
@@ -31,7 +32,7 @@ class EpisodeObserver:
         terminate_on_success: whether success ends an episode.
 
     Raises:
-        ValueError: two observe the same entry.
+        ValueError: two observe the same entry, or one an entry of the state.
 
     Attributes:
         entries: what is observed beyond state and goals, by key.
@@ -57,9 +58,10 @@ class EpisodeObserver:
         self._readings = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]
-        observers: list[Observer] = [*self._readings, hooks, variation]
-        self.entries = join_entries(observers)
-        self._observers = [each for each in observers if each.entries]
+        observers: list[Observer] = [*self._readings, hooks]
+        reserved = (*PHYSICAL, *PHYSICS, *EXACT_KEYS)
+        self.entries = join_entries(observers, reserved) | variation.entries
+        self._observers = [each for each in (*observers, variation) if each.entries]
 
     def after_reset(self, envs: Sequence[int]) -> None:
         """Tell the sensors that episodes have started in these environments."""

@@ -1,7 +1,7 @@
 """What an environment can observe beyond the state of robot and task."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -74,20 +74,30 @@ class Observer(Protocol):
         """What is observed now in all environments, by entry: (n, ...), new tensors."""
 
 
-# What an environment observes and returns in any case.
+# What an environment observes and returns in any case, and torchrl's.
 _OWN = {"observation", "achieved_goal", "desired_goal", "success", "action", "reward"}
-_OWN |= {"terminated", "truncated", "done"}
+_OWN |= {"terminated", "truncated", "done", "next", "_reset", "_step"}
 
 
-def join_entries(observers: Sequence[Observer]) -> dict[str, Entry]:
+def join_entries(
+    observers: Sequence[Observer], reserved: Collection[str] = ()
+) -> dict[str, Entry]:
     """The entries of all observers.
 
+    Args:
+        observers: what observes.
+        reserved: names that have another meaning.
+
     Raises:
-        ValueError: two observe the same, or one what the environment does.
+        ValueError: two observe the same, or one what the environment does; or a name is
+            reserved, or no text.
     """
     entries: dict[str, Entry] = {}
     for observer in observers:
-        if own := _OWN & observer.entries.keys():
+        for key in observer.entries:
+            if not isinstance(key, str):
+                raise ValueError(f"the name of an entry must be text, got {key!r}")
+        if own := (_OWN | set(reserved)) & observer.entries.keys():
             raise ValueError(f"{sorted(own)} are the environment's own, not a sensor's")
         if twice := entries.keys() & observer.entries.keys():
             raise ValueError(f"two sensors observe {sorted(twice)}")
