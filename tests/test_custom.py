@@ -40,12 +40,14 @@ class PushBall(Task):
 
 def make_kuka(**arguments):
     return Robot(
-        urdf="kuka_iiwa/model.urdf",
-        neutral_joint_position=(0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
-        joint_forces=(200.0,) * 7,
-        ee_link=6,
-        ee_orientation=(0.0, 1.0, 0.0, 0.0),
-        **arguments,
+        **{
+            "urdf": "kuka_iiwa/model.urdf",
+            "neutral_joint_position": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
+            "joint_forces": (200.0,) * 7,
+            "ee_link": 6,
+            "ee_orientation": (0.0, 1.0, 0.0, 0.0),
+            **arguments,
+        }
     )
 
 
@@ -105,6 +107,38 @@ def test_own_robot_with_joint_control():
         moved = (env.get_state()["joint_position"] - before).abs()
         assert moved.argmax() == 1
         assert np.isclose(moved[1], 0.05, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"ee_link": 7},
+        {"wrist_joint": 7},
+        {"wrist_joint": -1},
+        {"finger_links": (3, 99)},
+    ],
+)
+def test_links_and_joints_are_those_of_the_urdf(options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"{name} must be a .* 0 to 6, got"):
+        RobotTaskEnv(robot=make_kuka(**options), task=Reach())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_arm_joints": 0},
+        {"num_arm_joints": -1},
+        {"num_arm_joints": 8},
+        {"base_position": (0.0, 0.0)},
+        {"base_position": (0.0, 0.0, float("nan"))},
+        {"neutral_joint_position": (float("nan"),) * 7},
+    ],
+)
+def test_numbers_out_of_range(options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        make_kuka(**options)
 
 
 def test_wrong_joint_count_is_named():

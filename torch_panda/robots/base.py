@@ -102,6 +102,14 @@ class Robot:
                 f"neutral_joint_position and joint_forces must name the same joints, "
                 f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
             )
+        if not np.isfinite(neutral_joint_position).all():
+            raise ValueError(
+                f"neutral_joint_position must be finite, got {neutral_joint_position}"
+            )
+        if len(base_position) != 3 or not np.isfinite(base_position).all():
+            raise ValueError(
+                f"base_position must be three finite numbers, got {base_position}"
+            )
         check_quaternion("ee_orientation", ee_orientation)
         check_quaternion("base_orientation", base_orientation)
         if action_scale is None:
@@ -115,7 +123,14 @@ class Robot:
         x, y, z, w = ee_orientation
         self.ee_orientation = (float(x), float(y), float(z), float(w))
         num_fingers = 0 if gripper is None else gripper.num_joints
-        self.num_arm_joints = num_arm_joints or len(joint_forces) - num_fingers
+        if num_arm_joints is None:
+            num_arm_joints = len(joint_forces) - num_fingers
+        if not 1 <= num_arm_joints <= len(joint_forces):
+            raise ValueError(
+                f"num_arm_joints must be from 1 to the number of joints, "
+                f"{len(joint_forces)}, got {num_arm_joints}"
+            )
+        self.num_arm_joints = num_arm_joints
         if gripper is not None and self.num_arm_joints + num_fingers != len(
             joint_forces
         ):
@@ -167,7 +182,8 @@ class Robot:
 
         Raises:
             FileNotFoundError: the URDF does not exist.
-            ValueError: the URDF has another number of movable joints.
+            ValueError: the URDF has another number of movable joints, or lacks a link
+                or joint.
         """
         body = client.load_urdf(
             self.urdf,
@@ -183,11 +199,19 @@ class Robot:
                 f"{self.urdf} has {len(movable)} movable joints {movable}, but "
                 f"joint_forces has {len(self.joint_forces)} values"
             )
-        if not 0 <= self.ee_link < len(joints):
-            raise ValueError(
-                f"ee_link must be a link of {self.urdf}, 0 to {len(joints) - 1}, "
-                f"got {self.ee_link}"
-            )
+        wrist = () if self.wrist_joint is None else (self.wrist_joint,)
+        for name, indices in (
+            ("ee_link", (self.ee_link,)),
+            ("wrist_joint", wrist),
+            ("finger_links", self.finger_links),
+        ):
+            for index in indices:
+                if not 0 <= index < len(joints):
+                    kind = "joint" if name == "wrist_joint" else "link"
+                    raise ValueError(
+                        f"{name} must be a {kind} of {self.urdf}, 0 to "
+                        f"{len(joints) - 1}, got {index}"
+                    )
         return body
 
     def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
