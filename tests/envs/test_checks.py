@@ -111,6 +111,34 @@ def test_markers_that_differ_from_what_is_drawn():
             env.render(size=8)
 
 
+class Markers(Reach):
+    """Two markers, unless a test says otherwise, for one position."""
+
+    count = 2
+
+    def build(self, client):
+        markers = [client.create_marker((0.0, 0.0, 0.0)) for _ in range(self.count)]
+        return Bodies(markers=tuple(markers))
+
+
+class FlatGoal(Markers):
+    goal_dim, count = 2, 1
+
+    def sample_goal(self, rng):
+        return (0.0, 0.0)
+
+    def achieved_goal(self, simulation):
+        return simulation.ee_position[:, :2]
+
+
+def test_markers_and_goals_that_do_not_fit_together():
+    message = r"Markers.marker_pose must return shape \(3, 2, 7\), got \(3, 1, 7\)"
+    with pytest.raises(ValueError, match=message):
+        make(Markers(), num_envs=3)
+    with pytest.raises(ValueError, match="FlatGoal needs a marker_pose of its own"):
+        make(FlatGoal())
+
+
 # ---- functions ---------------------------------------------------------------
 
 

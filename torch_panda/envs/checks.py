@@ -75,6 +75,9 @@ def check_functions(
         (task, "achieved_goal", task.goal_dim),
     ):
         check_result(owner, name, getattr(owner, name)(simulation), (n, size))
+    if simulation.scene.markers:
+        shape = (n, len(simulation.scene.markers), 7)
+        check_result(task, "marker_pose", task.marker_pose(goal), shape)
     goals = task.achieved_goal(simulation).float(), goal.float()
     check_result(task, "compute_reward", task.compute_reward(*goals), (n, 1))
     check_result(task, "is_success", task.is_success(*goals), (n, 1), torch.bool)

@@ -192,7 +192,15 @@ class Task(ABC):
         """Where goals put the markers: (..., goal_dim) -> (..., n_markers, 7).
 
         By default a goal is one position for each marker. Unused without markers.
+
+        Raises:
+            ValueError: by default: a goal is not made of positions.
         """
+        if goal.shape[-1] % 3:
+            raise ValueError(
+                f"{type(self).__name__} needs a marker_pose of its own: its goals of "
+                f"{goal.shape[-1]} numbers are no positions for markers"
+            )
         positions = goal.unflatten(-1, (-1, 3))
         rotation = goal.new_tensor(NO_ROTATION).expand(*positions.shape[:-1], 4)
         return torch.cat((positions, rotation), dim=-1)
