@@ -79,6 +79,12 @@ def test_seed_restarts_the_episodes(env):
     assert not torch.equal(env.reset()["desired_goal"], first[0])
 
 
+@pytest.mark.parametrize("index", [-1, 3])
+def test_only_environments_that_exist_are_seeded(env, index):
+    with pytest.raises(ValueError, match=f"env must be from 0 to 2, got {index}"):
+        env.set_env_seed(index, 0)
+
+
 def test_across_processes():
     code = (
         "import torch, torch_panda; torch.manual_seed(0);"

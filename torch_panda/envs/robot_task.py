@@ -146,6 +146,10 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         """Let environment ``env`` draw what the first one draws under ``seed``.
 
         For interfaces that seed environments one by one, such as Gymnasium's.
+
+        Raises:
+            ValueError: there is no such environment, or the seed is negative.
+            TypeError: the seed is no integer.
         """
         self.episodes.seeds.restart_one(env, seed)
 

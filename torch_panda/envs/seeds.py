@@ -39,7 +39,16 @@ class EpisodeSeeds:
         self._episodes = [0] * len(self._episodes)
 
     def restart_one(self, env: int, seed: int) -> None:
-        """Let an environment draw what the first one draws under a seed."""
+        """Let an environment draw what the first one draws under a seed.
+
+        Raises:
+            ValueError: there is no such environment, or the seed is negative.
+            TypeError: the seed is no integer.
+        """
+        if not 0 <= env < len(self._episodes):
+            raise ValueError(
+                f"env must be from 0 to {len(self._episodes) - 1}, got {env}"
+            )
         self._streams[env] = (check_seed(seed), 0)
         self._episodes[env] = 0
 
