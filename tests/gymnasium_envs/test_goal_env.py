@@ -99,6 +99,8 @@ def test_start_from_a_state(env):
     assert_equal(*steps)
     with pytest.raises(ValueError, match=r"options are state, got .*speed"):
         env.reset(options={"speed": 1})
+    with pytest.raises(ValueError, match="must have entries, got none"):
+        env.reset(options={"state": TensorDict()})
 
 
 @pytest.mark.filterwarnings(NO_BOUNDS)

@@ -143,6 +143,8 @@ def test_the_default_device_changes_nothing(mode):
         ({"seed": [1, 2]}, ValueError, "3 seeds, got 2"),
         ({"seed": [1, -2, 3]}, ValueError, "non-negative"),
         ({"options": {"mask": 1}}, ValueError, "accepted options are state"),
+        ({"options": {"state": {}}}, ValueError, "must have entries, got none"),
+        ({"options": {"state": None}}, TypeError, "must be a mapping to arrays"),
         ({"options": {"reset_mask": [True] * 3}}, TypeError, "array of bool"),
         ({"options": {"reset_mask": np.ones(3)}}, TypeError, "array of bool"),
         ({"options": {"reset_mask": np.zeros(3, bool)}}, ValueError, "and a True"),

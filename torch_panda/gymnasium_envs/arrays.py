@@ -51,18 +51,22 @@ def action(values: ArrayLike) -> Tensor:
     return torch.from_numpy(np.asarray(values).astype(np.float64))
 
 
-def read_state(options: Mapping[str, Any], env: RobotTaskEnv) -> dict[str, Tensor]:
-    """The state to start from that the options of a reset give: maybe empty.
+def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
+    """The state to start from that the options of a reset give; None: they give none.
 
     Raises:
-        ValueError: there are other options, or a value is not for all environments.
+        ValueError: there are other options, or the state has no entries.
         TypeError: the state is no mapping of names to arrays of numbers.
     """
     if unknown := set(options) - {"state"}:
         raise ValueError(f"accepted options are state, got {sorted(map(str, unknown))}")
-    given = options.get("state", {})
+    if "state" not in options:
+        return None
+    given = options["state"]
     if not isinstance(given, Mapping | TensorDictBase):
         raise TypeError(f"the state must be a mapping to arrays, got {given!r}")
+    if not given.keys():
+        raise ValueError("the state must have entries, got none")
     return {
         key: torch.from_numpy(np.asarray(value).copy()) for key, value in given.items()
     }

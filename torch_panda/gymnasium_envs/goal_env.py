@@ -88,11 +88,11 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
             TypeError: the state is no mapping of names to arrays of numbers.
             gymnasium.error.Error: the seed is negative.
         """
-        state = arrays.read_state(options or {}, self.torch_env)
+        state = arrays.read_state(options or {})
         super().reset(seed=seed)
         if seed is not None:
             self.torch_env.set_env_seed(0, seed)
-        start = self.torch_env.episodes.reset(state=state or None)
+        start = self.torch_env.episodes.reset(state=state)
         return self._observation(start), {"is_success": start["success"].item()}
 
     def step(

@@ -110,14 +110,14 @@ class GoalVectorEnv(
         """
         rest = dict(options or {})
         mask = self._read_mask(rest.pop("reset_mask", None))
-        state = arrays.read_state(rest, self.torch_env)
+        state = arrays.read_state(rest)
         seeds = self._read_seeds(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         for index in _indices(mask):
             own_seed = seeds[index]
             if own_seed is not None:
                 self.torch_env.set_env_seed(index, own_seed)
-        begun = self.torch_env.episodes.reset(_indices(mask), state or None)
+        begun = self.torch_env.episodes.reset(_indices(mask), state)
         self._ended = self._ended & ~mask
         self._was_reset = True
         return self._observation(begun), self._infos(begun, mask)
