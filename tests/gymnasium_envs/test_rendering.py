@@ -8,6 +8,7 @@ import pytest
 import torch_panda
 from torch_panda import Camera
 from torch_panda.gymnasium_envs import GoalEnv, GoalVectorEnv
+from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
 
 VIEW = {
     "render_width": 60,
@@ -27,6 +28,17 @@ def test_unknown_modes(mode):
             kind("PandaReach-v1", render_mode=mode)
     with pytest.raises(ValueError, match="render_mode must be None or one of"):
         gymnasium.make_vec("torch_panda/PandaReach-v1", num_envs=2, render_mode=mode)
+
+
+@pytest.mark.parametrize("substeps", [20, 10])
+def test_videos_are_as_fast_as_the_simulation(substeps):
+    physics = torch_panda.PhysicsParams(n_substeps=substeps)
+    for kind in (GoalEnv, GoalVectorEnv, SB3VecEnv):
+        env = kind("PandaReach-v1", physics=physics, render_mode="rgb_array")
+        env.close()
+        assert env.metadata["render_fps"] == 500 / substeps
+        assert env.metadata["render_modes"] == ["rgb_array"]
+    assert GoalEnv.metadata["render_fps"] == 25
 
 
 def test_the_view_of_panda_gym():

@@ -68,6 +68,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         if env.batch_size:
             raise ValueError(f"the batch size must be [], got {list(env.batch_size)}")
         self.torch_env = env
+        self.metadata = metadata_of(env)
         self.render_mode = render_mode
         self.observation_space = arrays.observation_space(env)
         self.action_space = arrays.action_space(env)
@@ -120,6 +121,11 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _observation(self, observed: Observed) -> Observation:
         return {key: observed[key][0].numpy() for key in self._keys}
+
+
+def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:
+    """Gymnasium's metadata, with as many frames a second as there are steps."""
+    return {**GoalEnv.metadata, "render_fps": round(1 / env.physics.ctrl_dt)}
 
 
 def check_no_arguments(arguments: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.observer import Observed
 from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
-from torch_panda.gymnasium_envs.goal_env import GoalEnv, check_no_arguments
+from torch_panda.gymnasium_envs.goal_env import check_no_arguments, metadata_of
 from torch_panda.gymnasium_envs.rendering import check_render_mode, take_camera
 from torch_panda.registry import make
 from torch_panda.rendering import Camera
@@ -75,7 +75,7 @@ class GoalVectorEnv(
         self.torch_env = env
         self.num_envs = env.num_envs
         self.render_mode = render_mode
-        self.metadata = {**GoalEnv.metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**metadata_of(env), "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = arrays.observation_space(env)
         self.single_action_space = arrays.action_space(env)
         self._keys = arrays.observed_keys(env)

@@ -48,6 +48,7 @@ class SB3VecEnv(VecEnv):
             self.vector_env.single_observation_space,
             self.vector_env.single_action_space,
         )
+        self.metadata = self.vector_env.metadata
 
     def reset(self) -> Observation:
         """Start an episode in each environment, with the seeds given to `seed`.
