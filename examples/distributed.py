@@ -16,13 +16,11 @@ have torch_panda and the same Ray (this folder's files are brought along):
     ray start --address=FIRST:6379     # on the others
 """
 
-import json
 import logging
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -36,9 +34,15 @@ import torch_panda
 from agents import Hyperparameters, make_agent
 from limits import Positive, Seed, Weight, check_limits
 from training.buffers import STORED_KEYS, make_buffer
-from training.checkpoint import Progress, StopSignal, check_folder, crossed
+from training.checkpoint import (
+    Progress,
+    StopSignal,
+    check_folder,
+    crossed,
+    write_options,
+)
 from training.curve import Curve
-from training.recipes import find_changes
+from training.options import check_exploration
 
 try:
     import ray
@@ -221,30 +225,6 @@ def draw_seed() -> int:
     return int(torch.randint(2**62, ()))
 
 
-def check(args: Args) -> None:
-    """Refuse options that would end the training later, or teach nothing.
-
-    Raises:
-        ValueError: says which, and what is accepted.
-    """
-    check_limits(args)
-    explores = args.noise_eps or any(args.random_eps)
-    if args.algo in ("ddpg", "td3") and not explores:
-        raise ValueError(
-            f"algo {args.algo} explores by noise_eps and random_eps: one of them must "
-            "be above 0"
-        )
-
-
-def options(args: Args) -> dict[str, Any]:
-    """What args.json holds, for plots; where a run is made is no way to train."""
-    default = Args(
-        env_id=args.env_id, address=args.address, cpus_per_worker=args.cpus_per_worker
-    )
-    changed = find_changes(args, default)
-    return {"preset": "distributed", **asdict(args), "changed": changed}
-
-
 def connect(args: Args) -> None:
     """Join the cluster, or start one.
 
@@ -277,12 +257,18 @@ def main(args: Args) -> None:
     """Train, and say where the policy is."""
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
-        check(args)
+        check_limits(args)
+        check_exploration(args, args.num_envs)
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "args.json").write_text(json.dumps(options(args), default=str, indent=2))
+        # Where a run is made is no way to train.
+        default = Args(
+            env_id=args.env_id,
+            address=args.address,
+            cpus_per_worker=args.cpus_per_worker,
+        )
+        write_options(out, args, default, preset="distributed")
         learner.train(StopSignal())
         learner.close()
     except (OSError, ValueError) as error:

@@ -8,9 +8,8 @@ goal-conditioned supervised learning (arXiv 1912.06088), from where reinforcemen
 learning stopped. There are no rewards, no demonstrations and no noise.
 """
 
-import json
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -33,11 +32,11 @@ from training.checkpoint import (
     StopSignal,
     check_folder,
     crossed,
+    write_options,
 )
 from training.curve import Curve, reseed
 from training.demonstrations import pretrain
 from training.policies import load_agent, read_checkpoint
-from training.recipes import find_changes
 
 LEARNING_RATE = 0.3  # at first, of that of training
 
@@ -184,11 +183,9 @@ def main(args: Args) -> None:
         check_limits(args)
         check_folder(args.out, resume=args.resume)
         run = Refinement(args)
-        args.out.mkdir(parents=True, exist_ok=True)
         default = Args(args.policy, args.out, env_id=args.env_id)
-        options = {"algo": run.agent.hp.algo, "preset": "refined", **asdict(args)}
-        options["changed"] = find_changes(args, default)
-        (args.out / "args.json").write_text(json.dumps(options, default=str, indent=2))
+        more = {"algo": run.agent.hp.algo, "preset": "refined"}
+        write_options(args.out, args, default, **more)
         stop = StopSignal()
         finished = run.run(stop)
     except (ValueError, OSError) as error:

@@ -12,11 +12,9 @@ that between two iterations a run is its weights, its buffer and its random numb
 OMP_NUM_THREADS says, or one.
 """
 
-import json
 import os
 import time
 from collections import defaultdict
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -38,11 +36,11 @@ from training.checkpoint import (
     StopSignal,
     check_folder,
     crossed,
+    write_options,
 )
 from training.curve import Curve, reseed
 from training.demonstrations import make_demo_buffer, pretrain, read_demos
 from training.options import Args, check, default_args, parse
-from training.recipes import find_changes
 from training.starts import StartFrom, states_at_objects
 from video import record
 
@@ -206,10 +204,7 @@ def main(args: Args) -> None:
         check(args)
         check_folder(out, resume=args.resume)
         run = Run(args, out)
-        out.mkdir(parents=True, exist_ok=True)
-        default = default_args(args.preset, args.env_id)
-        options = {**asdict(args), "changed": find_changes(args, default)}
-        (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
+        write_options(out, args, default_args(args.preset, args.env_id))
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
     stop = StopSignal()
@@ -217,9 +212,10 @@ def main(args: Args) -> None:
     stop.release()
     run.close()
     if finished and args.video:
-        options = {"num_envs": 6, "seed": args.seed, "device": args.device}
         try:
-            with torch_panda.make(args.env_id, **options) as env:
+            with torch_panda.make(
+                args.env_id, num_envs=6, seed=args.seed, device=args.device
+            ) as env:
                 record(env, run.agent.policy, out / "video.mp4")
         except KeyboardInterrupt:
             print("no video")

@@ -48,10 +48,10 @@ class Agent(nn.Module, ABC):
         if hp.fine_fingers:
             check_fingers(env)
         geometry = read_geometry(env)
+        sizes = [env.observation_spec[key].shape[-1] for key in STATE_KEYS]
         if (hp.relative_inputs, hp.augmentation) != ("none", "none"):
-            check_layout(geometry, env)
-        size = sum(env.observation_spec[key].shape[-1] for key in STATE_KEYS)
-        self.normalizer = Normalizer(size, geometry, hp.relative_inputs)
+            check_layout(geometry, sizes)
+        self.normalizer = Normalizer(sum(sizes), geometry, hp.relative_inputs)
         self.augmentation = Augmentation(geometry, hp.augmentation)
         self.state_size = len(self.normalizer.mean)
         self.action_size = env.action_spec.shape[-1]

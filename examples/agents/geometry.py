@@ -121,15 +121,16 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
     )
 
 
-def check_layout(geometry: Geometry, env: RobotTaskEnv) -> None:
+def check_layout(geometry: Geometry, sizes: list[int]) -> None:
     """Make sure that a task, perhaps one's own, observes what the geometry says.
 
+    Args:
+        geometry: of the task.
+        sizes: of its observation and its goal.
+
     Raises:
-        ValueError: it does not.
+        ValueError: they are others.
     """
-    sizes = [
-        env.observation_spec[key].shape[-1] for key in ("observation", "desired_goal")
-    ]
     known = [len(geometry.observation), len(geometry.goal)]
     if sizes != known:
         raise ValueError(

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from agents import Agent
 from training import files
 from training.policies import save_policy
+from training.recipes import find_changes
 
 RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
 SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
@@ -111,6 +112,25 @@ def fixed(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
     """The options that a continuation must share."""
     every = json.loads(json.dumps(asdict(args), default=str))
     return {key: value for key, value in every.items() if key not in FREE_OPTIONS}
+
+
+def write_options(
+    out: Path,
+    args: Any,  # noqa: ANN401 (a dataclass)
+    default: Any,  # noqa: ANN401 (of the same)
+    **more: str,
+) -> None:
+    """Make a run's folder, with its options in args.json, for plots.
+
+    Args:
+        out: the folder.
+        args: the options.
+        default: what they are compared with, for ``changed``.
+        **more: what the folder is to say besides.
+    """
+    options = {**more, **asdict(args), "changed": find_changes(args, default)}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
 
 
 def check_folder(out: Path, *, resume: bool) -> None:

@@ -73,6 +73,20 @@ class Args(Hyperparameters):
     """record 6 episodes at the end"""
 
 
+def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
+    """Refuse to explore in none of so many environments.
+
+    Raises:
+        ValueError: the algorithm explores by options that are all 0 there.
+    """
+    explores = hp.noise_eps or any(hp.random_eps[:num_envs])
+    if hp.algo in ("ddpg", "td3") and not explores:
+        raise ValueError(
+            f"algo {hp.algo} explores by noise_eps and random_eps: one of them must "
+            "be above 0"
+        )
+
+
 def check(args: Args) -> None:
     """Refuse options that would end the training later.
 
@@ -80,12 +94,7 @@ def check(args: Args) -> None:
         ValueError: says which, and what is accepted.
     """
     check_limits(args)
-    explores = args.noise_eps or any(args.random_eps[: args.num_envs])
-    if args.algo in ("ddpg", "td3") and not explores:
-        raise ValueError(
-            f"algo {args.algo} explores by noise_eps and random_eps: one of them must "
-            "be above 0"
-        )
+    check_exploration(args, args.num_envs)
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demos to imitate")
     if not args.total_steps and not args.pretrain_updates:

@@ -71,16 +71,21 @@ def make_driven():
     return RobotTaskEnv(robot=robot, task=Push(), num_envs=2, **options)
 
 
+def fail_and_diverge(env):
+    """A step in which the first environment's motor fails, and the second diverges."""
+    simulation = env.episodes.simulation
+    scene = simulation.scene
+    env.robot.broken = simulation.clients[0]
+    simulation.clients[1].set_joint(scene.robot, scene.joints[0], 0.0, 1e300)
+    with pytest.raises(WorkerError, match="environment 0: RuntimeError: motor"):
+        env.step(env.rand_action())
+    env.robot.broken = None
+
+
 def test_a_reset_of_others_leaves_a_divergence_to_be_found():
     with make_driven() as env:
         env.reset()
-        simulation = env.episodes.simulation
-        scene = simulation.scene
-        env.robot.broken = simulation.clients[0]
-        simulation.clients[1].set_joint(scene.robot, scene.joints[0], 0.0, 1e300)
-        with pytest.raises(WorkerError, match="environment 0: RuntimeError: motor"):
-            env.step(env.rand_action())
-        env.robot.broken = None
+        fail_and_diverge(env)
         env.reset(env.rand_action().set("_reset", torch.tensor([[True], [False]])))
         with pytest.raises(BulletError, match=r"environments \[1\] diverged"):
             env.step(env.rand_action())
@@ -90,13 +95,7 @@ def test_divergence_beside_another_failure():
     """The next reset cures what the error did not tell of."""
     with make_driven() as env, make_driven() as fresh:
         env.reset(), fresh.reset()
-        simulation = env.episodes.simulation
-        scene = simulation.scene
-        env.robot.broken = simulation.clients[0]
-        simulation.clients[1].set_joint(scene.robot, scene.joints[0], 0.0, 1e300)
-        with pytest.raises(WorkerError, match="environment 0: RuntimeError: motor"):
-            env.step(env.rand_action())
-        env.robot.broken = None
+        fail_and_diverge(env)
         actions = torch.ones(2, 3)
         found = [
             e.step(e.reset().set("action", actions))["next", "observation"]

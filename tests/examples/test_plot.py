@@ -1,8 +1,6 @@
 """The plotting example: what it draws, and what it cannot."""
 
 import csv
-import json
-from dataclasses import asdict
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -10,16 +8,14 @@ import pytest
 
 import plot
 from train import Args, default_args
+from training.checkpoint import write_options
 from training.recipes import find_changes
 
 POINT = {"step": 0.5, "success": 0.5, "ever_success": 0.5, "return": -40.0}
 
 
 def write_run(folder, args, rows=(POINT,)):
-    folder.mkdir(parents=True)
-    default = default_args(args.preset, args.env_id)
-    options = {**asdict(args), "changed": find_changes(args, default)}
-    (folder / "args.json").write_text(json.dumps(options, default=str))
+    write_options(folder, args, default_args(args.preset, args.env_id))
     with (folder / "curve.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, [*rows[-1]])
         writer.writeheader()
