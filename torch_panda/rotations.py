@@ -1,6 +1,7 @@
-"""Rotations: quaternions are xyzw."""
+"""Rotations by quaternions, which are xyzw throughout the package."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -35,3 +36,15 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     b, v = second[..., :3], second[..., 3:]
     vector = w * b + v * a + torch.linalg.cross(a, b)
     return torch.cat((vector, w * v - (a * b).sum(-1, keepdim=True)), dim=-1)
+
+
+def rotate_vector(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:
+    """Rotate one vector by one quaternion xyzw, without tensors: (3,)."""
+    x, y, z, w = quaternion
+    a, b, c = vector
+    p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return [
+        a + w * p + y * r - z * q,
+        b + w * q + z * p - x * r,
+        c + w * r + x * q - y * p,
+    ]

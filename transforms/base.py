@@ -12,7 +12,7 @@ from torchrl.data import ReplayBuffer, SliceSampler
 from torchrl.data.replay_buffers.sample_units import Sequence
 from typing_extensions import Self
 
-from torch_panda.transforms.checks import N_STEP, DataCheck
+from torch_panda.transforms.data_checks import N_STEP, DataCheck
 from torch_panda.transforms.goal_memory import GoalMemory
 from torch_panda.transforms.rewrite import GoalFunction, Rewriter
 from torch_panda.transforms.strategies import DESIRED, Integers, Weighted, parse

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from torch_panda.bullet import capi, native
 from torch_panda.bullet.client import PhysicsClient
-from torch_panda.bullet.rotations import rotate
+from torch_panda.rotations import rotate_vector
 
 # [m]; so much farther than the world is wide that a box put back lands beside those
 # that are back already, never among those that still wait.
@@ -122,7 +122,7 @@ class BroadPhase:
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):
             snapshot = self._built
-            offset = rotate(pose[3:], client.centre_of_mass(body, link))
+            offset = rotate_vector(pose[3:], client.centre_of_mass(body, link))
             if any(offset):
                 x, y, z = (x - dx for x, dx in zip(base[:3], offset, strict=True))
                 client.set_base(body, (x, y, z), base[3:])

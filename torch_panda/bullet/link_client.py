@@ -4,8 +4,8 @@ from ctypes import byref
 from dataclasses import dataclass
 
 from torch_panda.bullet import capi
-from torch_panda.bullet.checks import check_not_negative
 from torch_panda.bullet.connection import Connection
+from torch_panda.checks import check_not_negative
 
 # What was built, one command after the other: its name and its arguments.
 Blueprint = tuple[tuple[object, ...], ...]

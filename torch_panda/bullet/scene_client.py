@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torch_panda.bullet import capi
-from torch_panda.bullet.checks import check_not_negative, check_quaternion
 from torch_panda.bullet.connection import doubles
 from torch_panda.bullet.link_client import LinkClient
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
@@ -15,6 +14,7 @@ from torch_panda.bullet.urdf import (
     find_urdf,
     urdf_with_tool,
 )
+from torch_panda.checks import check_not_negative, check_quaternion
 
 ORIGIN = (0.0, 0.0, 0.0)
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)

@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from torch_panda.bullet.checks import all_finite
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.euler import euler_angles
 from torch_panda.bullet.scene import Scene
+from torch_panda.checks import all_finite
 
 
 class SceneState:

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torch_panda.bullet.checks import all_finite
+from torch_panda.checks import all_finite
 
 
 def read_action(action: object, shape: tuple[int, ...]) -> Tensor:

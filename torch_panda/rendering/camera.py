@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from torch_panda.bullet.rotations import rotate
+from torch_panda.rotations import rotate_vector
 
 # The depth of a pixel in which nothing is seen, up to rounding.
 _BACKGROUND_DEPTH = np.float32(1 - 1e-6)
@@ -108,10 +108,13 @@ class HandCamera(Camera):
         """
         position, rotation = hand[:3], hand[3:]
         eye, target = (
-            [x + dx for x, dx in zip(position, rotate(rotation, point), strict=True)]
+            [
+                x + dx
+                for x, dx in zip(position, rotate_vector(rotation, point), strict=True)
+            ]
             for point in (self.eye, self.target)
         )
-        return eye, target, rotate(rotation, self.up)
+        return eye, target, rotate_vector(rotation, self.up)
 
 
 def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:

@@ -16,8 +16,8 @@ from torch_panda.bullet import (
     PhysicsClient,
     VectorSimulation,
 )
-from torch_panda.bullet.checks import check_quaternion
 from torch_panda.bullet.urdf import Tool
+from torch_panda.checks import check_quaternion
 from torch_panda.robots.control_type import ACTION_SCALES, ARM_MODES, ControlType
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (

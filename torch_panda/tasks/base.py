@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.bullet.checks import check_not_negative
+from torch_panda.checks import check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
 
