@@ -12,7 +12,7 @@ import torch_panda
 PACKAGE = Path(torch_panda.__file__).parent
 # Rooms from the ground up: each imports from those above it in this list.
 ROOMS = (
-    ("closing", "rotations"),
+    ("arguments", "checks", "closing", "rotations"),
     ("bullet",),
     ("rendering", "robots", "tasks", "randomization"),
     ("sensors",),

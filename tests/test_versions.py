@@ -31,8 +31,6 @@ def test_ids_have_their_version_of_every_argument(task, version):
             (ROBOT_ARGUMENTS[task], env.robot),
         ):
             for name, value in arguments_of(pairs, version).items():
-                if name == "lower_color":
-                    name, value = "lower_visual", torch_panda.bullet.Visual(value)
                 assert getattr(made, name) == value, name
 
 

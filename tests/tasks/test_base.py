@@ -1,6 +1,8 @@
 """Rewards by hand."""
 
 import math
+import pickle
+from dataclasses import dataclass
 
 import pybullet
 import pytest
@@ -8,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torch_panda import Flip, Push, Stack
+from torch_panda import Flip, Panda, PickAndPlace, Push, RobotTaskEnv, Stack
 from torch_panda.rotations import rotate
 
 angle = st.floats(-math.pi, math.pi)
@@ -49,43 +51,97 @@ def test_flip_takes_opposite_quaternions_for_one_orientation():
     assert Flip(reward_type="dense").compute_reward(quaternion, other) == -1.0
 
 
-class FromBothSides(Push):
-    """Success is a matter of x alone."""
+class WholeNumbers(Push):
+    """Pays 10 for a success along x, in whole numbers."""
 
     def is_success(self, achieved_goal, desired_goal):
         return (achieved_goal - desired_goal)[..., :1].abs() < 0.01
-
-
-class Bonus(Push):
-    """Success pays 10, in whole numbers."""
 
     def compute_reward(self, achieved_goal, desired_goal):
         return 10 * self.is_success(achieved_goal, desired_goal).int()
 
 
 @pytest.mark.parametrize("reward_type", ["sparse", "dense"])
-@pytest.mark.parametrize("kind", [Push, Stack, Flip, FromBothSides, Bonus])
-def test_a_step_is_judged_by_what_a_task_overrides(kind, reward_type):
-    task = kind(reward_type=reward_type)
-    goal, offset = torch.rand(2, 100, task.goal_dim)
-    achieved = goal + 0.1 * (offset - 0.5)
-    # One at the threshold: neither a success nor unrewarded.
-    achieved[0], goal[0], goal[0, 0] = 0.0, 0.0, task.distance_threshold
-    success, reward = task.judge(achieved, goal)
-    assert 0 < success.sum() < 100 or kind is Flip
-    assert torch.equal(success, task.is_success(achieved, goal))
-    expected = task.compute_reward(achieved, goal)
-    assert torch.equal(reward, expected.float())
-    assert reward.dtype == torch.float32
+def test_a_step_calls_the_overridden_reward_and_success(reward_type):
+    task = WholeNumbers(reward_type=reward_type)
+    with RobotTaskEnv(robot=Panda(block_gripper=True), task=task, num_envs=2) as env:
+        state = env.reset().update(env.get_state())
+        # The goals of the two environments are beside their cubes along y and along x.
+        offset = torch.tensor([[0.0, 0.1, 0.0], [0.1, 0.0, 0.0]])
+        state["desired_goal"] = state["object_pose"][:, 0, :3] + offset
+        td = env.reset(state, set_state=True)
+        td = env.step(td.set("action", env.action_spec.zero()))["next"]
+    assert td["success"].tolist() == [[True], [False]]
+    assert td["reward"].tolist() == [[10.0], [0.0]]
+    assert td["reward"].dtype == torch.float32
 
 
-def test_a_step_is_judged_by_what_one_task_has_of_its_own():
+def test_a_distance_at_the_threshold_is_neither_success_nor_punished():
+    task, goal = Push(), torch.zeros(3, dtype=torch.float64)
+    achieved = torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64)
+    assert not task.is_success(achieved, goal)
+    assert task.compute_reward(achieved, goal) == 0.0
+
+
+def test_a_repr_shows_the_arguments():
+    task = PickAndPlace(distance_threshold=0.02)
+    assert repr(task) == (
+        "PickAndPlace(reward_type='sparse', distance_threshold=0.02, "
+        "goal_xy_range=0.3, obj_xy_range=0.3, object_mass=2.0, object_friction=5.0, "
+        "table_friction=0.1, goal_z_range=0.2)"
+    )
+
+
+class Bonus(Push):
+    """A task with arguments of its own, and an ``__init__``."""
+
+    def __init__(self, *, bonus=1.0, **options):
+        super().__init__(**options)
+        self.bonus = bonus
+
+
+@dataclass(kw_only=True)
+class Penalty(Push):
+    """A task with arguments of its own, as a dataclass."""
+
+    penalty: float = 1.0
+
+
+def test_a_repr_shows_the_arguments_of_a_users_task():
+    shown = repr(Bonus(bonus=2.0, object_mass=1.0))
+    assert shown.startswith("Bonus(bonus=2.0, reward_type='sparse', ")
+    assert "object_mass=1.0" in shown
+    assert "penalty=1.0" in repr(Penalty())
+
+
+@pytest.mark.parametrize("task", [Push(object_mass=1.0), Bonus(object_mass=1.0)])
+def test_tasks_are_pickled_with_their_arguments(task):
+    copy = pickle.loads(pickle.dumps(task))
+    assert type(copy) is type(task)
+    assert vars(copy) == vars(task)
+
+
+def test_tasks_are_compared_and_hashed_by_identity():
     task = Push()
-    task.compute_reward = lambda achieved, desired: torch.full((4, 1), 5.0)
-    goal = torch.rand(4, 3)
-    success, reward = task.judge(goal, goal)
-    assert success.all()
-    assert (reward == 5).all()
+    assert task != Push()
+    assert {task: 1}[task] == 1
+
+
+@pytest.mark.parametrize("task_class", [Push, Penalty])
+def test_an_unknown_argument_is_named_with_the_accepted_ones(task_class):
+    message = (
+        f"{task_class.__name__} has no argument 'threshold'; did you mean "
+        r"'distance_threshold'\?; accepted are reward_type, distance_threshold, "
+    )
+    with pytest.raises(TypeError, match=message):
+        task_class(threshold=0.02)
+    with pytest.raises(TypeError, match="argument 'threshold'"):
+        Bonus(threshold=0.02)
+
+
+def test_reward_types_are_named():
+    with pytest.raises(ValueError, match=r"reward_type must be .* got 'shaped'"):
+        Push(reward_type="shaped")
 
 
 @pytest.mark.parametrize("threshold", [math.nan, -0.01, math.inf])

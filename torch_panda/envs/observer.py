@@ -92,12 +92,9 @@ class EpisodeObserver:
         achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
         desired_goal = goal.float()
         observed: Observed = {}
-        if action is None:
-            success = task.is_success(achieved_goal, desired_goal)
-        else:
-            success, observed["reward"] = self._judge(
-                action, achieved_goal, desired_goal
-            )
+        success = task.is_success(achieved_goal, desired_goal)
+        if action is not None:
+            observed["reward"] = self._reward(action, achieved_goal, desired_goal)
         truncated = step_count >= self._max_episode_steps
         if self._terminate_on_success:
             terminated = success.logical_and(step_count)  # not before the first step
@@ -118,15 +115,14 @@ class EpisodeObserver:
             "done": terminated.logical_or(truncated),
         }
 
-    def _judge(
+    def _reward(
         self, action: Tensor, achieved_goal: Tensor, desired_goal: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Success and reward of a step, (n, 1) each, after what it led to."""
+    ) -> Tensor:
+        """Reward of a step from the state after it, (n, 1) float32."""
         if self._hooks.reward is None:
-            return self._task.judge(achieved_goal, desired_goal)
-        success = self._task.is_success(achieved_goal, desired_goal)
+            return self._task.compute_reward(achieved_goal, desired_goal).float()
         reward = self._hooks.reward(action.clone(), achieved_goal, desired_goal)
-        return success, reward.to(torch.float32, copy=True)
+        return reward.to(torch.float32, copy=True)
 
     def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
         """What a viewer says of the environments as they are, (n, ...)."""

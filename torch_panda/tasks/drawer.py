@@ -1,5 +1,6 @@
 """Drawer: open or close a drawer to a position."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.bullet.shapes import Box
 from torch_panda.rotations import NO_ROTATION, rotate
-from torch_panda.tasks.base import Bodies, RewardType, Start, Task
+from torch_panda.tasks.base import Bodies, Start, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
 URDF = Path(__file__).with_name("drawer.urdf")
@@ -24,6 +25,7 @@ TABLE_X_OFFSET = -0.15
 CABINET_X = 0.15  # of its front, in the middle of its range [m]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Drawer(Task):
     """Open or close a drawer, by its handle, until that is at a point.
 
@@ -44,29 +46,19 @@ class Drawer(Task):
     goal_dim = 3
     observation_dim = 5
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.05,
-        cabinet_x_range: float = 0.06,
-        cabinet_y_range: float = 0.2,
-        min_change: float = 0.1,
-        drawer_mass: float = 1.0,
-        drawer_friction: float = 5.0,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        if not 0 <= min_change <= TRAVEL / 2:  # else none may be left to draw
+    cabinet_x_range: float = 0.06
+    cabinet_y_range: float = 0.2
+    min_change: float = 0.1
+    drawer_mass: float = 1.0
+    drawer_friction: float = 5.0
+    table_friction: float = TABLE_FRICTION
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.min_change <= TRAVEL / 2:  # else none may be left to draw
             raise ValueError(
-                f"min_change must be from 0 to {TRAVEL / 2} [m], got {min_change}"
+                f"min_change must be from 0 to {TRAVEL / 2} [m], got {self.min_change}"
             )
-        self.cabinet_x_range = cabinet_x_range
-        self.cabinet_y_range = cabinet_y_range
-        self.min_change = min_change
-        self.drawer_mass = drawer_mass
-        self.drawer_friction = drawer_friction
-        self.table_friction = table_friction
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the drawer and the marker, a handle."""

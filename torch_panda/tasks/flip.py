@@ -1,6 +1,7 @@
 """Flip: turn a cube to an orientation."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,7 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.rotations import NO_ROTATION, rotation_distance
-from torch_panda.tasks.base import (
-    Bodies,
-    RewardType,
-    Task,
-)
+from torch_panda.tasks.base import Bodies, Task
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -29,6 +26,7 @@ MARKER_POSITION = (0.0, 0.0, 3 * CUBE_SIZE / 2)  # [m]
 VISUAL = Visual(texture=Path(__file__).with_name("flip_cube.png"), opacity=0.5)
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Flip(Task):
     """Turn a cube to an orientation, wherever it lies.
 
@@ -47,21 +45,11 @@ class Flip(Task):
     goal_dim = 4
     observation_dim = 13
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.2,
-        obj_xy_range: float = 0.3,
-        object_mass: float = 1.0,
-        object_friction: float = 0.5,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        self.obj_xy_range = obj_xy_range
-        self.object_mass = object_mass
-        self.object_friction = object_friction
-        self.table_friction = table_friction
+    distance_threshold: float = 0.2
+    obj_xy_range: float = 0.3
+    object_mass: float = 1.0
+    object_friction: float = 0.5
+    table_friction: float = TABLE_FRICTION
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cube and the marker."""

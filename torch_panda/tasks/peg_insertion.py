@@ -1,5 +1,6 @@
 """PegInsertion: put a peg that the hand holds into a hole."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import RED, Box
 from torch_panda.rotations import NO_ROTATION, rotate
-from torch_panda.tasks.base import Bodies, RewardType, Start, Task, object_observation
+from torch_panda.tasks.base import Bodies, Start, Task, object_observation
 from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_table
 
 URDF = Path(__file__).with_name("hole.urdf")
@@ -24,6 +25,7 @@ GRASP_WIDTH = 0.0198
 PEG_POSITION = (0.0384, 0.0, 0.1774)
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class PegInsertion(Task):
     """Put a square peg into a square hole.
 
@@ -45,32 +47,25 @@ class PegInsertion(Task):
     goal_dim = 3
     observation_dim = 15
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.01,
-        depth: float = 0.03,
-        play: float = 0.001,
-        hole_xy_range: float = 0.2,
-        peg_mass: float = 0.1,
-        peg_friction: float = 0.5,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        if not 0 < play < HOLE_WIDTH:
-            raise ValueError(f"play must be between 0 and {HOLE_WIDTH} [m], got {play}")
-        if not distance_threshold <= depth <= HOLE_DEPTH:
+    distance_threshold: float = 0.01
+    depth: float = 0.03
+    play: float = 0.001
+    hole_xy_range: float = 0.2
+    peg_mass: float = 0.1
+    peg_friction: float = 0.5
+    table_friction: float = TABLE_FRICTION
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.play < HOLE_WIDTH:
             raise ValueError(
-                f"depth must be from distance_threshold, {distance_threshold}, to "
-                f"{HOLE_DEPTH} [m], got {depth}"
+                f"play must be between 0 and {HOLE_WIDTH} [m], got {self.play}"
             )
-        self.depth = depth
-        self.play = play
-        self.hole_xy_range = hole_xy_range
-        self.peg_mass = peg_mass
-        self.peg_friction = peg_friction
-        self.table_friction = table_friction
+        if not self.distance_threshold <= self.depth <= HOLE_DEPTH:
+            raise ValueError(
+                f"depth must be from distance_threshold, {self.distance_threshold}, to "
+                f"{HOLE_DEPTH} [m], got {self.depth}"
+            )
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the peg, the block with the hole, and the marker, a peg."""

@@ -1,18 +1,14 @@
 """Push: move a cube over the table."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import (
-    Bodies,
-    RewardType,
-    Task,
-    object_observation,
-)
+from torch_panda.tasks.base import Bodies, Task, object_observation
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -23,6 +19,7 @@ from torch_panda.tasks.table import (
 )
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Push(Task):
     """Push a cube to a point of the table.
 
@@ -41,23 +38,11 @@ class Push(Task):
     # Where panda-gym creates the marker, before it moves to the first goal [m].
     marker_height = CUBE_SIZE / 2
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.05,
-        goal_xy_range: float = 0.3,
-        obj_xy_range: float = 0.3,
-        object_mass: float = 2.0,
-        object_friction: float = 0.5,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        self.goal_xy_range = goal_xy_range
-        self.obj_xy_range = obj_xy_range
-        self.object_mass = object_mass
-        self.object_friction = object_friction
-        self.table_friction = table_friction
+    goal_xy_range: float = 0.3
+    obj_xy_range: float = 0.3
+    object_mass: float = 2.0
+    object_friction: float = 0.5
+    table_friction: float = TABLE_FRICTION
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cube and the marker."""

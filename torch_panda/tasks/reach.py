@@ -1,24 +1,19 @@
 """Reach: bring the end-effector to a point."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation
-from torch_panda.tasks.base import (
-    Bodies,
-    RewardType,
-    Task,
-)
-from torch_panda.tasks.table import (
-    TABLE_FRICTION,
-    create_table,
-)
+from torch_panda.tasks.base import Bodies, Task
+from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
 MARKER = Sphere(0.02)
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Reach(Task):
     """Bring the end-effector to a point in a cube above the table.
 
@@ -32,17 +27,8 @@ class Reach(Task):
     goal_dim = 3
     observation_dim = 0
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.05,
-        goal_range: float = 0.3,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        self.goal_range = goal_range
-        self.table_friction = table_friction
+    goal_range: float = 0.3
+    table_friction: float = TABLE_FRICTION
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table and the marker."""

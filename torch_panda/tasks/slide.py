@@ -1,23 +1,15 @@
 """Slide: send a puck to a point out of reach."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import (
-    Bodies,
-    RewardType,
-    Task,
-    object_observation,
-)
-from torch_panda.tasks.table import (
-    TABLE_FRICTION,
-    create_table,
-    sample_on_table,
-)
+from torch_panda.tasks.base import Bodies, Task, object_observation
+from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_table
 
 PUCK_RADIUS = 0.03  # [m]
 PUCK_HEIGHT = 0.03  # [m]
@@ -25,6 +17,7 @@ PUCK_HEIGHT = 0.03  # [m]
 PUCK_START_HEIGHT = 0.03  # [m]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Slide(Task):
     """Hit a puck so that it slides to a point and stops there.
 
@@ -47,29 +40,14 @@ class Slide(Task):
     goal_dim = 3
     observation_dim = 12
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.05,
-        goal_xy_range: float = 0.5,
-        goal_x_offset: float = 0.51,
-        obj_xy_range: float = 0.3,
-        table_length: float = 1.9,
-        table_x_offset: float = 0.15,
-        object_mass: float = 2.0,
-        object_friction: float = 0.5,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        self.goal_xy_range = goal_xy_range
-        self.goal_x_offset = goal_x_offset
-        self.obj_xy_range = obj_xy_range
-        self.table_length = table_length
-        self.table_x_offset = table_x_offset
-        self.object_mass = object_mass
-        self.object_friction = object_friction
-        self.table_friction = table_friction
+    goal_xy_range: float = 0.5
+    goal_x_offset: float = 0.51
+    obj_xy_range: float = 0.3
+    table_length: float = 1.9
+    table_x_offset: float = 0.15
+    object_mass: float = 2.0
+    object_friction: float = 0.5
+    table_friction: float = TABLE_FRICTION
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the puck and the marker."""

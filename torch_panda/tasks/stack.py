@@ -1,6 +1,7 @@
 """Stack: put one cube on another."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,11 +10,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import GREEN, RED, Color
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import (
-    Bodies,
-    RewardType,
-    Task,
-)
+from torch_panda.tasks.base import Bodies, Task
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -27,6 +24,7 @@ LOWER_HEIGHT = CUBE_SIZE / 2  # [m], of the centre
 UPPER_HEIGHT = 3 * CUBE_SIZE / 2  # [m]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Stack(Task):
     """Stack two cubes at a point of the table.
 
@@ -51,46 +49,29 @@ class Stack(Task):
     observation_dim = 24
     max_episode_steps = 100
 
-    def __init__(
-        self,
-        *,
-        reward_type: RewardType = "sparse",
-        distance_threshold: float = 0.05,
-        per_object: bool = True,
-        goal_xy_range: float = 0.3,
-        obj_xy_range: float = 0.3,
-        lower_color: Color = RED,
-        upper_color: Color = GREEN,
-        object_mass: tuple[float, float] = (2.0, 2.0),
-        object_friction: float = 5.0,
-        table_friction: float = TABLE_FRICTION,
-    ) -> None:
-        super().__init__(reward_type=reward_type, distance_threshold=distance_threshold)
-        self.per_object = per_object
-        self.goal_xy_range = goal_xy_range
-        self.obj_xy_range = obj_xy_range
-        self.lower_visual, self.upper_visual = Visual(lower_color), Visual(upper_color)
-        self.object_mass = object_mass
-        self.object_friction = object_friction
-        self.table_friction = table_friction
+    per_object: bool = True
+    goal_xy_range: float = 0.3
+    obj_xy_range: float = 0.3
+    lower_color: Color = RED
+    upper_color: Color = GREEN
+    object_mass: tuple[float, float] = (2.0, 2.0)
+    object_friction: float = 5.0
+    table_friction: float = TABLE_FRICTION
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cubes, the lower one first, and their markers."""
         create_table(client, friction=self.table_friction)
         lower_mass, upper_mass = self.object_mass
         friction = self.object_friction
+        lower_visual, upper_visual = Visual(self.lower_color), Visual(self.upper_color)
         lower = create_cube(
-            client, mass=lower_mass, friction=friction, visual=self.lower_visual
+            client, mass=lower_mass, friction=friction, visual=lower_visual
         )
-        lower_marker = client.create_marker(
-            (0.0, 0.0, 0.05), CUBE, visual=self.lower_visual
-        )
+        lower_marker = client.create_marker((0.0, 0.0, 0.05), CUBE, visual=lower_visual)
         upper = create_cube(
-            client, mass=upper_mass, friction=friction, x=0.5, visual=self.upper_visual
+            client, mass=upper_mass, friction=friction, x=0.5, visual=upper_visual
         )
-        upper_marker = client.create_marker(
-            (0.5, 0.0, 0.05), CUBE, visual=self.upper_visual
-        )
+        upper_marker = client.create_marker((0.5, 0.0, 0.05), CUBE, visual=upper_visual)
         return Bodies(objects=(lower, upper), markers=(lower_marker, upper_marker))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
