@@ -16,20 +16,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("info", help="versions, environments, threads, renderers")
-    bench = commands.add_parser(
+    commands.add_parser(
         "bench",
-        help="steps per second beside those of others, in turns in one run",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        add_help=False,
+        help="steps per second beside other vector environments, in turns",
     )
-    if "bench" not in arguments:
-        parser.parse_args(arguments)
+    command, rest = parser.parse_known_args(arguments)
+    if command.command == "info":
         print(describe())
         return
-    # Here: it imports what nothing else in the package needs.
-    from torch_panda.bench import command
+    # Here: it imports libraries of the extra `learning`.
+    from torch_panda.bench import main as run_bench
 
-    command.add_options(bench)
-    command.run(parser.parse_args(arguments))
+    run_bench(rest)
 
 
 if __name__ == "__main__":

@@ -33,8 +33,7 @@ _EXTRAS = {
     "minari": ("Minari data sets of demonstrations", "minari"),
     "lerobot": ("LeRobot data sets; see examples/README.md", "lerobot"),
     "ray": ("training on many machines", "ray"),
-    "bench": ("python -m torch_panda bench", "tqdm"),
-    "fetch": ("bench beside the Fetch robot on MuJoCo", "gymnasium_robotics"),
+    "bench": ("what `bench` compares with", "gymnasium_robotics"),
 }
 # Where their libraries take no older Python.
 _OLDEST_PYTHON = {"minari": (3, 11), "lerobot": (3, 12)}

@@ -1,1 +1,0 @@
-"""``python -m torch_panda bench``: steps per second beside those of others."""
