@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from torch_panda import Randomization
-from torch_panda.randomization import PARAMETERS
+from torch_panda.envs.randomization import PARAMETERS
 
 ALL = Randomization(
     object_mass=(0.5, 2.0),

@@ -2,7 +2,7 @@
 
 from torch_panda.bullet import BulletError, PhysicsName, PhysicsParams, WorkerError
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.randomization import Randomization
+from torch_panda.envs.randomization import Randomization
 from torch_panda.registry import (
     ENV_IDS,
     make,

@@ -1,33 +1,257 @@
-"""Numbers that Bullet would take without a word."""
+"""Argument checks. Every module may import this one; it imports none of the package."""
 
 import math
-from collections.abc import Sequence
+import operator
+import os
+import sys
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 
+import torch
 from torch import Tensor
 
+# Largest deviation of a quaternion's length from 1.
+QUATERNION_TOLERANCE = 1e-3
 
-def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
-    """Make sure that a quaternion xyzw stands for a rotation.
+_GIGABYTE = 1e9
+
+
+# ---- numbers and names -------------------------------------------------------
+
+
+def check_integer(name: str, value: int) -> int:
+    """Return an integer of any type as an ``int``.
 
     Raises:
-        ValueError: it has no length, or is not finite.
+        TypeError: ``value`` is a boolean or not an integer.
     """
-    length = math.hypot(*quaternion)
-    if not (len(quaternion) == 4 and 0 < length < math.inf):
-        raise ValueError(f"{name} must be a quaternion xyzw, got {tuple(quaternion)}")
+    if not isinstance(value, bool):  # torch does not take a boolean as a size either
+        with suppress(TypeError):
+            return operator.index(value)
+    raise TypeError(f"{name} must be an integer, got {value!r}")
+
+
+def check_positive(**arguments: int | None) -> None:
+    """Check that arguments are integers of at least 1, or None.
+
+    Raises:
+        ValueError: An argument is below 1 or does not fit into 64 bits.
+        TypeError: An argument is not an integer.
+    """
+    for name, value in arguments.items():
+        if value is not None and not 1 <= check_integer(name, value) <= sys.maxsize:
+            raise ValueError(
+                f"{name} must be None or from 1 to {sys.maxsize}, got {value}"
+            )
+
+
+def check_seed(seed: int) -> int:
+    """Return a seed as an ``int``.
+
+    Raises:
+        ValueError: The seed is negative.
+        TypeError: The seed is not an integer.
+    """
+    number = check_integer("seed", seed)
+    if number < 0:
+        raise ValueError(f"seed must be a non-negative integer, got {seed}")
+    return number
 
 
 def check_not_negative(**values: float | None) -> None:
-    """Make sure that numbers are finite and not negative, or None.
+    """Check that arguments are finite numbers of at least 0, or None.
 
     Raises:
-        ValueError: one is not.
+        ValueError: An argument is negative or not finite.
     """
     for name, value in values.items():
         if value is not None and not 0 <= value < math.inf:
             raise ValueError(f"{name} must be finite and at least 0, got {value}")
 
 
+def check_range(name: str, value: Sequence[float]) -> None:
+    """Check that an argument is a pair (lowest, highest) of non-negative numbers.
+
+    Raises:
+        ValueError: It is not such a pair.
+    """
+    try:
+        low, high = map(float, value)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not 0 <= low <= high < math.inf:
+        raise ValueError(
+            f"{name} must be (lowest, highest), finite and at least 0, got {value!r}"
+        )
+
+
+def check_choice(name: str, value: object, choices: Collection[object]) -> None:
+    """Check that an argument is one of several values.
+
+    Raises:
+        ValueError: It is another value.
+    """
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {tuple(choices)}, got {value!r}")
+
+
+def check_instance(name: str, value: object, expected: type) -> None:
+    """Check that an argument is an instance of a class.
+
+    Raises:
+        TypeError: It is an instance of another class, or it is a class.
+    """
+    if not isinstance(value, expected):
+        got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+        raise TypeError(f"{name} must be an instance of {expected.__name__}, got {got}")
+
+
+# ---- the machine -------------------------------------------------------------
+
+
+def check_device(device: torch.device | str | int | None) -> torch.device:
+    """Return a device on which tensors can be allocated; None means the CPU.
+
+    Raises:
+        RuntimeError: torch does not know the device or cannot use it.
+    """
+    device = torch.device("cpu" if device is None else device)
+    try:
+        torch.empty(0, device=device)
+    except AssertionError as error:  # torch was built without support for it
+        raise RuntimeError(f"device {device} does not work: {error}") from None
+    return device
+
+
+def check_memory(num_envs: int, bytes_per_env: float) -> None:
+    """Check that the machine has the memory for a number of environments.
+
+    Raises:
+        ValueError: The environments would take more than the physical memory.
+    """
+    if sys.platform == "win32":  # without os.sysconf
+        return
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    needed = num_envs * bytes_per_env
+    if needed > memory:
+        raise ValueError(
+            f"num_envs={num_envs} would take about {needed / _GIGABYTE:,.0f} GB of "
+            f"memory, {bytes_per_env / 1e6:.0f} MB each; this machine has "
+            f"{memory / _GIGABYTE:,.0f} GB"
+        )
+
+
+# ---- tensors -----------------------------------------------------------------
+
+
 def all_finite(values: Tensor) -> bool:
-    """Whether all numbers are finite; one operation where their sum is, too."""
+    """Whether all numbers are finite. One operation suffices if their sum is."""
     return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
+
+
+def check_action(action: object, shape: tuple[int, ...]) -> Tensor:
+    """Return an action as a tensor (n, action_dim) on the CPU.
+
+    Args:
+        action: The action, (*batch_shape, action_dim), of a floating-point dtype.
+        shape: The shape that it must have.
+
+    Raises:
+        ValueError: The action is not a tensor, has another shape, or is not finite.
+        TypeError: The action has an integer dtype.
+    """
+    if not isinstance(action, Tensor):
+        raise ValueError(
+            f"the action must be a tensor of shape {shape}, got {action!r}"
+        )
+    if tuple(action.shape) != shape:
+        raise ValueError(
+            f"the action must have shape {shape}, got {tuple(action.shape)}"
+        )
+    if not action.dtype.is_floating_point:
+        raise TypeError(f"the action must be float32, got {action.dtype}")
+    action = action.detach().to("cpu").reshape(-1, shape[-1])
+    if not all_finite(action):
+        env = int((~action.isfinite()).any(dim=1).nonzero()[0])
+        raise ValueError(
+            f"the action of environment {env} is not finite: {action[env].tolist()}"
+        )
+    return action
+
+
+def check_output(
+    function: str,
+    value: object,
+    shape: tuple[int, ...],
+    dtype: torch.dtype | None = None,
+) -> None:
+    """Check the tensor that a function of a robot or task returned.
+
+    Args:
+        function: Name of the function, for the error.
+        value: The returned value.
+        shape: The shape that the tensor must have.
+        dtype: The dtype that it must have; None accepts any.
+
+    Raises:
+        ValueError: The tensor has another shape or dtype.
+        TypeError: The value is not a tensor.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{function} must return a tensor, got {value!r}")
+    if tuple(value.shape) != shape:
+        raise ValueError(
+            f"{function} must return shape {shape}, got {tuple(value.shape)}"
+        )
+    if dtype is not None and value.dtype != dtype:
+        name = str(dtype).removeprefix("torch.")
+        raise ValueError(f"{function} must return {name}, got {value.dtype}")
+
+
+def check_rows(
+    name: str, is_valid: Tensor, envs: Sequence[int], requirement: str
+) -> None:
+    """Check that a tensor with one row per environment has only valid entries.
+
+    Args:
+        name: Name of the tensor, for the error.
+        is_valid: Whether each entry is valid, (len(envs), ...) bool.
+        envs: The environments of the rows.
+        requirement: Completes the error "... must be".
+
+    Raises:
+        ValueError: An entry is not valid. The error names the first such environment.
+    """
+    if not is_valid.all():
+        env = envs[int((~is_valid).flatten(1).any(dim=1).nonzero()[0])]
+        raise ValueError(f"{name} of environment {env} must be {requirement}")
+
+
+# ---- rotations ---------------------------------------------------------------
+
+
+def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
+    """Check that four numbers are a quaternion xyzw of any positive length.
+
+    Raises:
+        ValueError: They are not four numbers, are all 0, or are not finite.
+    """
+    length = math.hypot(*quaternion)
+    if not (len(quaternion) == 4 and 0 < length < math.inf):
+        raise ValueError(f"{name} must be a quaternion xyzw, got {tuple(quaternion)}")
+
+
+def check_rotations(name: str, pose: Tensor, envs: Sequence[int]) -> None:
+    """Check that poses end in unit quaternions.
+
+    Args:
+        name: Name of the tensor, for the error.
+        pose: Positions [m] and quaternions xyzw, (len(envs), ..., 7).
+        envs: The environments of the rows.
+
+    Raises:
+        ValueError: A quaternion is not a unit quaternion.
+    """
+    norm = torch.linalg.vector_norm(pose[..., 3:], dim=-1)
+    is_unit = (norm - 1).abs() < QUATERNION_TOLERANCE
+    check_rows(name, is_unit, envs, "a position and a unit quaternion")

@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium
 import torch
 
+from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.envs.checks import check_positive
 from torch_panda.ids import ENV_IDS, SHIPPED_ENVS, Registration, describe_ids
 from torch_panda.rendering import Camera
 from torch_panda.robots import Robot

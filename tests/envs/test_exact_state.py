@@ -136,7 +136,7 @@ def test_what_is_no_exact_state(change, message):
 
 
 def test_episodes_without_end_are_forgotten(monkeypatch):
-    monkeypatch.setattr(history, "_MOST", 10)
+    monkeypatch.setattr(history, "_MAX_STEPS", 10)
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
         td = env.reset().set("action", torch.zeros(2, 3))
         for _ in range(10):

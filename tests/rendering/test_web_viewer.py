@@ -134,7 +134,7 @@ def test_bad_calls_are_named(env, monkeypatch):
             viewer.update()
         # The page is at the address that it names.
         assert viewer.url.startswith("http://127.0.0.1:87")
-    monkeypatch.setattr("torch_panda.envs.pictures.find_spec", lambda name: None)
+    monkeypatch.setattr("torch_panda.envs.robot_task.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"pip install .* -e '\.\[viewer\]'"):
         env.open_viewer()
     env.close()

@@ -1,4 +1,4 @@
-"""Episodes of a robot at a task: start, act, observe. Plain torch, without torchrl."""
+"""Runs the episodes of a robot at a task. Plain torch, without torchrl."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,18 +15,21 @@ from torch_panda.bullet import (
     VectorSimulation,
     read_physics,
 )
-from torch_panda.closing import Closing
-from torch_panda.envs.action import read_action
-from torch_panda.envs.checks import check_functions, check_kinds, check_positive
+from torch_panda.checks import (
+    check_action,
+    check_choice,
+    check_instance,
+    check_integer,
+    check_memory,
+    check_positive,
+)
+from torch_panda.envs.builder import RobotTaskBuilder
 from torch_panda.envs.history import History
-from torch_panda.envs.hooks import TaskHooks
 from torch_panda.envs.observer import EpisodeObserver, Observed
-from torch_panda.envs.scene import TaskScene
-from torch_panda.envs.seeds import EpisodeSeeds, integer
+from torch_panda.envs.randomization import DomainRandomizer, Randomization
+from torch_panda.envs.seeds import EpisodeSeeds
 from torch_panda.envs.start import EpisodeStarts
-from torch_panda.envs.state import GivenState, read_state
-from torch_panda.envs.variation import Variation
-from torch_panda.randomization import Randomization
+from torch_panda.envs.state import StartState, read_state
 from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
 from torch_panda.sensors import Sensor, read_sensors
@@ -34,24 +37,28 @@ from torch_panda.tasks import Task
 
 OnDivergence = Literal["raise", "reset"]
 
+# Measured with the Panda and a cube.
+_BYTES_PER_ENV = 44e6
 
-class Episodes(Closing):
+
+class Episodes:
     """n environments of one robot and one task; see `RobotTaskEnv` for the arguments.
 
-    Tensors are on the CPU and have n rows, also where ``num_envs`` is None: then n = 1,
-    and only actions and states that are given have the batch shape ().
+    All tensors are on the CPU and have n rows. If ``num_envs`` is None, then n is 1,
+    and only the actions and states that a caller passes have the batch shape ().
 
-    A call while another thread is in it raises `BulletError`.
+    A call while another thread is inside raises `BulletError`.
 
     Attributes:
-        simulation: the clients and their state.
-        build_scene: builds a scene as they hold it.
-        renderer: draws them.
-        seeds: of the episodes.
-        entries: what is observed beyond state and goals, by key.
+        simulation: The Bullet clients and their state.
+        build_scene: Builds the scene in a client.
+        renderer: Draws the environments.
+        seeds: Seeds of the episodes.
+        entries: Observed entries beside ``observation`` and the goals, by key.
     """
 
-    @torch.inference_mode(False)  # or its tensors could only be changed in that mode
+    # Tensors that are made in inference mode could be changed in that mode only.
+    @torch.inference_mode(False)
     def __init__(
         self,
         *,
@@ -68,21 +75,19 @@ class Episodes(Closing):
         on_divergence: OnDivergence = "raise",
         randomize: Randomization | None = None,
     ) -> None:
-        check_kinds(robot, task)
-        if not isinstance(randomize, Randomization | None):
-            raise TypeError(f"randomize must be a Randomization, got {randomize!r}")
+        check_instance("robot", robot, Robot)
+        check_instance("task", task, Task)
+        if randomize is not None:
+            check_instance("randomize", randomize, Randomization)
         check_positive(
             num_envs=num_envs,
             num_threads=num_threads,
             max_episode_steps=max_episode_steps,
         )
         check_renderer(renderer)
-        if on_divergence not in get_args(OnDivergence):
-            raise ValueError(
-                f"on_divergence must be one of {get_args(OnDivergence)}, "
-                f"got {on_divergence!r}"
-            )
+        check_choice("on_divergence", on_divergence, get_args(OnDivergence))
         n = num_envs or 1
+        check_memory(n, _BYTES_PER_ENV)
         self.robot, self.task = robot, task
         self._control = robot.controller
         self.batch_shape = () if num_envs is None else (n,)
@@ -93,29 +98,19 @@ class Episodes(Closing):
         self.seeds = EpisodeSeeds(n, seed)
         self.is_closed = False
         self._guard = ThreadGuard()
-        self._never_reset = set(range(n))
-        goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
+        # Environments that need a reset: new ones, and those whose last reset failed.
+        self._needs_reset = set(range(n))
         sensors = read_sensors(sensors, robot)
-        self.build_scene = TaskScene(robot, task, sensors)
+        self.build_scene = RobotTaskBuilder(robot, task, sensors)
         self.simulation = VectorSimulation(
             self.build_scene, n, num_threads=num_threads, physics=self.physics
         )
         try:
-            check_functions(robot, task, self.simulation, goal)
             self.renderer = VectorRenderer(
                 self.simulation, self.build_scene, renderer=renderer
             )
-            hooks = TaskHooks(task, self.simulation, robot.action_dim)
-            variation = Variation(
-                randomize,
-                robot,
-                task,
-                self.simulation,
-                self.physics,
-                has_hook=hooks.randomizes,
-            )
-            self._starts = EpisodeStarts(
-                robot, task, self.simulation, variation, self.seeds, goal
+            randomizer = DomainRandomizer(
+                randomize, robot, task, self.simulation, self.physics
             )
             self._observer = EpisodeObserver(
                 robot,
@@ -123,12 +118,15 @@ class Episodes(Closing):
                 self.simulation,
                 self.renderer,
                 sensors=sensors,
-                hooks=hooks,
-                variation=variation,
+                randomizer=randomizer,
                 max_episode_steps=self.max_episode_steps,
                 terminate_on_success=terminate_on_success,
             )
             self.entries = self._observer.entries
+            self._randomizer = randomizer
+            self._starts = EpisodeStarts(
+                robot, task, self.simulation, randomizer, self.seeds
+            )
             self._history = History(self._starts.state(), robot.action_dim)
         except BaseException:
             self.simulation.close()
@@ -149,52 +147,41 @@ class Episodes(Closing):
         """Start episodes.
 
         Args:
-            envs: in which environments, and in those that were never reset; None means
-                in all.
-            state: what `get_state` returned or some of its entries, to start from:
-                tensors of shape (*batch_shape, ...).
+            envs: Environments that start an episode; None means all. Environments that
+                still need a reset start one too.
+            state: The state to start from, as `get_state` returns it, or some of its
+                entries: tensors of shape (*batch_shape, ...).
 
         Returns:
             What all environments observe.
 
         Raises:
-            ValueError: the state cannot be one.
-            BulletError: the environment is closed, or another thread is in it.
+            ValueError: The state is wrong.
+            BulletError: The environment is closed, or another thread is inside.
         """
         with self._guard:
             self._check_open()
             chosen = range(self.num_envs) if envs is None else envs
-            envs = sorted({*chosen, *self._never_reset})
-            given = GivenState({})
-            if state is not None:
-                given = read_state(
-                    state,
-                    batch_shape=self.batch_shape,
-                    like=self._starts.state(),
-                    envs=envs,
-                    action_dim=self.robot.action_dim,
-                )
-                self._starts.check_physics(given.values, envs)
-                self._starts.check_physics(given.start, envs)
-                if self.simulation.scene.markers and "desired_goal" in given.values:
-                    self._starts.check_goal(given.values["desired_goal"], envs)
-            # Until that is done: what fails leaves a world that is of no episode.
-            self._never_reset.update(envs)
-            # A step that failed elsewhere has told of no divergence.
+            envs = sorted({*chosen, *self._needs_reset})
+            start_state = None if state is None else self._read_state(state, envs)
+            # If anything below raises, these environments need another reset.
+            self._needs_reset.update(envs)
+            # A step that raised did not report which clients diverged, so check now.
             for env in set(envs).intersection(self.simulation.diverged()):
                 self.simulation.rebuild(env)
             for env in envs:
                 self._starts.draw(env)
-            tensors = self._starts.state()
-            for key, value in (given.start or given.values).items():
-                tensors[key][envs] = value
+            if start_state is not None:
+                tensors = self._starts.state()
+                for key, value in (start_state.start or start_state.values).items():
+                    tensors[key][envs] = value
             self._place(envs)
-            if given.start:
-                self._replay(envs, given)
-            self._never_reset.difference_update(envs)
+            if start_state is not None and start_state.start:
+                self._repeat_actions(envs, start_state)
+            self._needs_reset.difference_update(envs)
             observed = self._observe()
-            if state is not None:
-                # It may be an episode's last; the next step ends that again.
+            if start_state is not None:
+                # The state may be the last of its episode. The next step ends it again.
                 for key in ("terminated", "truncated", "done"):
                     observed[key][envs] = False
             return observed
@@ -203,32 +190,34 @@ class Episodes(Closing):
         """Act for one step.
 
         Args:
-            action: (*batch_shape, action_dim), floating point; it is clipped to
+            action: (*batch_shape, action_dim), floating point. It is clipped to
                 [-1, 1].
-            stepped: which environments take it, (n, 1) bool; None means all.
+            stepped: Environments that take the step, (n, 1) bool; None means all.
 
         Returns:
             What all environments observe, and ``reward``, (n, 1) float32.
 
         Raises:
-            BulletError: the environment is closed, was never reset, has diverged, or
-                another thread is in it.
-            ValueError: the action has a wrong shape, or is not finite.
-            TypeError: it is not of floating point.
+            BulletError: The environment is closed, needs a reset, or has diverged; or
+                another thread is inside.
+            ValueError: The action has a wrong shape or is not finite.
+            TypeError: The action has an integer dtype.
         """
         with self._guard:
             self._check_was_reset()
-            action = read_action(action, (*self.batch_shape, self.robot.action_dim))
+            action = check_action(action, (*self.batch_shape, self.robot.action_dim))
+            # Clip before the conversion: a large float64 is infinite in float32.
+            action = action.clamp(-1.0, 1.0).float()
             envs = None if stepped is None else indices(stepped)
             self._starts.step_count += 1 if stepped is None else stepped
-            self._history.append(action, stepped)
-            if diverged := self._act(action, envs):
+            self._history.record(action, stepped)
+            if diverged := self._advance(action, envs):
                 self._recover(diverged)
             self._observer.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe(action)
             if stepped is not None:
                 observed["reward"] = observed["reward"] * stepped
-            if diverged:  # what is observed there is the next episode's start
+            if diverged:  # these environments observe the start of their next episode
                 observed["success"][diverged] = observed["terminated"][diverged] = False
             return observed
 
@@ -240,34 +229,34 @@ class Episodes(Closing):
             return {**state, **self._history.export()} if exact else state
 
     def watch(self) -> Observed:
-        """What a viewer says of the environments as they are: goals and success.
+        """Goals, success and number of steps, (n, ...), for a viewer.
 
         Raises:
-            BulletError: the environment is closed or was never reset.
+            BulletError: The environment is closed or needs a reset.
         """
         self._check_was_reset()
         return self._observer.watch(self._starts.goal, self._starts.step_count)
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep other threads out, as from `reset` and `step`.
+    def exclusive(self) -> Iterator[None]:
+        """Context manager that keeps other threads out, as `reset` and `step` do.
 
         Raises:
-            BulletError: the environment is closed, or another thread is in it.
+            BulletError: The environment is closed, or another thread is inside.
         """
         with self._guard:
             self._check_open()
             yield
 
-    def check_picture(self, env: int) -> None:
-        """Make sure that there is an environment to be drawn.
+    def check_was_reset(self, env: int) -> None:
+        """Check that an environment exists and was reset, so that it can be drawn.
 
         Raises:
-            ValueError: an index is out of range, or its environment was never reset.
-            TypeError: it is no integer.
+            ValueError: The index is out of range, or the environment needs a reset.
+            TypeError: The index is not an integer.
         """
-        known = integer("an index", env) in range(self.num_envs)
-        if not known or env in self._never_reset:
+        exists = check_integer("an index", env) in range(self.num_envs)
+        if not exists or env in self._needs_reset:
             raise ValueError(f"there is no environment {env} that was reset")
 
     def close(self) -> None:
@@ -278,11 +267,11 @@ class Episodes(Closing):
                 self.renderer.close()
                 self.simulation.close()
 
-    # ---- parts -------------------------------------------------------------------
+    # ---- parts of a step and of a reset --------------------------------------------
 
     def _place(self, envs: list[int]) -> None:
-        """Put environments where the state tensors say."""
-        self._starts.mark(envs)
+        """Start episodes from the state tensors."""
+        self._starts.place_markers(envs)
         self._history.begin(envs, self._starts.state())
         self._starts.place(envs)
         self._observer.after_reset(envs)
@@ -291,24 +280,39 @@ class Episodes(Closing):
         starts = self._starts
         return self._observer.observe(starts.goal, starts.step_count, action)
 
-    def _act(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
-        """Advance physics by a step; return where it has diverged."""
+    def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
+        """Advance the physics by one step; return the environments that diverged."""
         setpoint = self.robot.setpoint(action, self.simulation).numpy()
         return self.simulation.step(self._control, setpoint, envs)
 
-    def _replay(self, envs: list[int], given: GivenState) -> None:
-        """Take the actions of an exact state, and make sure that they lead there."""
-        for action, acting, last in given.steps(envs, self.num_envs):
+    def _read_state(self, state: Mapping[str, Any], envs: list[int]) -> StartState:
+        """Check a state to start from before anything is changed."""
+        start_state = read_state(
+            state,
+            batch_shape=self.batch_shape,
+            present=self._starts.state(),
+            envs=envs,
+            action_dim=self.robot.action_dim,
+        )
+        self._randomizer.check_state(start_state.values, envs)
+        self._randomizer.check_state(start_state.start, envs)
+        if self.simulation.scene.markers and "desired_goal" in start_state.values:
+            self._starts.marker_pose(start_state.values["desired_goal"], envs)
+        return start_state
+
+    def _repeat_actions(self, envs: list[int], start_state: StartState) -> None:
+        """Repeat the actions of an exact state and check that they lead to it."""
+        for action, acting, last in start_state.steps(envs, self.num_envs):
             stepped = torch.zeros(self.num_envs, 1, dtype=torch.bool, device="cpu")
             stepped[acting] = True
-            self._history.append(action, stepped)
-            self._act(action, acting)
+            self._history.record(action, stepped)
+            self._advance(action, acting)
             self._observer.after_step(last)
-        self._starts.step_count[envs] = given.values["step_count"]
-        given.check_arrival(envs, self._starts.state())
+        self._starts.step_count[envs] = start_state.values["step_count"]
+        start_state.check_arrival(envs, self._starts.state())
 
     def _recover(self, envs: list[int]) -> None:
-        """Start the next episode of environments whose physics has diverged."""
+        """Start the next episode of environments whose physics diverged."""
         for env in envs:
             self.simulation.rebuild(env)
             self._starts.draw(env)
@@ -328,13 +332,13 @@ class Episodes(Closing):
 
     def _check_was_reset(self) -> None:
         self._check_open()
-        if self._never_reset:
+        if self._needs_reset:
             raise BulletError(
-                f"environments {sorted(self._never_reset)} were never reset, or their "
+                f"environments {sorted(self._needs_reset)} were never reset, or their "
                 f"last reset failed: call reset first"
             )
 
 
 def indices(mask: Tensor) -> list[int]:
-    """Where a mask, (n, 1) or (n,), is true."""
+    """Indices at which a mask, (n, 1) or (n,), is true."""
     return mask.flatten().nonzero().flatten().tolist()

@@ -1,4 +1,4 @@
-"""What is observed of episodes: state, goals, sensors, success and how they end."""
+"""Observes episodes: state, goals, sensors, reward, success, and how episodes end."""
 
 from collections.abc import Sequence
 
@@ -6,36 +6,38 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
-from torch_panda.envs.hooks import TaskHooks
+from torch_panda.checks import check_output
+from torch_panda.envs.randomization import PHYSICS, DomainRandomizer
 from torch_panda.envs.state import EXACT_KEYS, PHYSICAL
-from torch_panda.envs.variation import PHYSICS, Variation
 from torch_panda.rendering import VectorRenderer
 from torch_panda.robots import Robot
-from torch_panda.sensors import Observer, Sensor, join_entries
+from torch_panda.sensors import Entry, Observer, Sensor, join_entries
 from torch_panda.tasks import Task
 
-Observed = dict[str, Tensor]  # by entry, (n, ...), in new tensors
+Observed = dict[str, Tensor]
+"""Observed entries of all environments, (n, ...) by key, in new tensors."""
 
 
 class EpisodeObserver:
-    """Reads n environments of one robot and one task.
+    """Observes n environments of one robot and one task.
 
     Args:
-        robot: the robot.
-        task: the task, with its hooks.
-        simulation: the environments.
-        renderer: draws them for cameras.
-        sensors: what is observed beyond state and goals.
-        hooks: what the task has overridden.
-        variation: what varies from episode to episode, and may be observed.
-        max_episode_steps: steps until ``truncated``.
-        terminate_on_success: whether success ends an episode.
+        robot: The robot.
+        task: The task.
+        simulation: The environments.
+        renderer: Draws the pictures of camera sensors.
+        sensors: The sensors.
+        randomizer: Varies the physics, which may be observed.
+        max_episode_steps: Number of steps after which an episode is ``truncated``.
+        terminate_on_success: Whether success ends an episode.
 
     Raises:
-        ValueError: two observe the same entry, or one an entry of the state.
+        ValueError: A function of the robot or the task returns a wrong shape or dtype,
+            or two sensors observe the same entry.
+        TypeError: A function of the robot or the task does not return a tensor.
 
     Attributes:
-        entries: what is observed beyond state and goals, by key.
+        entries: Entries beside ``observation`` and the goals, by key.
     """
 
     def __init__(
@@ -46,22 +48,28 @@ class EpisodeObserver:
         renderer: VectorRenderer,
         *,
         sensors: Sequence[Sensor],
-        hooks: TaskHooks,
-        variation: Variation,
+        randomizer: DomainRandomizer,
         max_episode_steps: int,
         terminate_on_success: bool,
     ) -> None:
         self._robot, self._task, self._simulation = robot, task, simulation
-        self._hooks = hooks
         self._max_episode_steps = max_episode_steps
         self._terminate_on_success = terminate_on_success
+        # Hooks that the task leaves out are never called.
+        self._has_reward = type(task).reward is not Task.reward
+        self._has_failure = type(task).failure is not Task.failure
+        self._check_functions()
         self._readings = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]
-        observers: list[Observer] = [*self._readings, hooks]
+        observers: list[Observer] = [
+            *self._readings,
+            ExtraObserver(task, simulation),
+        ]
         reserved = (*PHYSICAL, *PHYSICS, *EXACT_KEYS)
-        self.entries = join_entries(observers, reserved) | variation.entries
-        self._observers = [each for each in (*observers, variation) if each.entries]
+        self.entries = join_entries(observers, reserved) | randomizer.entries
+        observers.append(randomizer)
+        self._observers = [observer for observer in observers if observer.entries]
 
     def after_reset(self, envs: Sequence[int]) -> None:
         """Tell the sensors that episodes have started in these environments."""
@@ -76,56 +84,41 @@ class EpisodeObserver:
     def observe(
         self, goal: Tensor, step_count: Tensor, action: Tensor | None = None
     ) -> Observed:
-        """Observation, goals, success and ends, (n, ...), in new tensors.
+        """Observe all environments.
 
         Args:
-            goal: the desired goals, (n, goal_dim).
-            step_count: steps of the present episodes, (n, 1).
-            action: the one that led here, (n, action_dim): its ``reward``, (n, 1)
-                float32, is observed, too.
+            goal: Desired goals, (n, goal_dim).
+            step_count: Number of steps of the present episodes, (n, 1).
+            action: The action that led to the present state, (n, action_dim); None
+                after a reset.
+
+        Returns:
+            Observation, goals, success and ends, and after a step ``reward``, (n, 1)
+            float32.
         """
-        simulation, task, failure = self._simulation, self._task, self._hooks.failure
+        task, simulation = self._task, self._simulation
         observation = torch.cat(
             (self._robot.observation(simulation), task.observation(simulation)), dim=1
         )
-        # Copied in any case: a task may use its own tensor again.
+        # A copy, because a task may return a tensor that the next step overwrites.
         achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
         desired_goal = goal.float()
-        observed: Observed = {}
         success = task.is_success(achieved_goal, desired_goal)
-        if action is not None:
-            observed["reward"] = self._reward(action, achieved_goal, desired_goal)
-        truncated = step_count >= self._max_episode_steps
-        if self._terminate_on_success:
-            terminated = success.logical_and(step_count)  # not before the first step
-        else:
-            terminated = torch.zeros_like(success)
-        if failure is not None:
-            terminated = terminated | failure() & (step_count > 0)
-        for observer in self._observers:
-            observed |= observer.observe()
-        return {
-            **observed,
+        observed = {
             "observation": observation.float(),
             "achieved_goal": achieved_goal,
             "desired_goal": desired_goal,
             "success": success,
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated.logical_or(truncated),
+            **self._ends(success, step_count),
         }
-
-    def _reward(
-        self, action: Tensor, achieved_goal: Tensor, desired_goal: Tensor
-    ) -> Tensor:
-        """Reward of a step from the state after it, (n, 1) float32."""
-        if self._hooks.reward is None:
-            return self._task.compute_reward(achieved_goal, desired_goal).float()
-        reward = self._hooks.reward(action.clone(), achieved_goal, desired_goal)
-        return reward.to(torch.float32, copy=True)
+        if action is not None:
+            observed["reward"] = self._reward(action, achieved_goal, desired_goal)
+        for observer in self._observers:
+            observed |= observer.observe()
+        return observed
 
     def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
-        """What a viewer says of the environments as they are, (n, ...)."""
+        """Goals, success and number of steps, (n, ...), for a viewer."""
         achieved_goal = self._task.achieved_goal(self._simulation).float()
         desired_goal = goal.float()
         return {
@@ -134,3 +127,110 @@ class EpisodeObserver:
             "desired_goal": desired_goal,
             "success": self._task.is_success(achieved_goal, desired_goal),
         }
+
+    def _reward(
+        self, action: Tensor, achieved_goal: Tensor, desired_goal: Tensor
+    ) -> Tensor:
+        """The reward of a step, (n, 1) float32."""
+        if not self._has_reward:
+            return self._task.compute_reward(achieved_goal, desired_goal).float()
+        reward = self._task.reward(
+            self._simulation, action.clone(), achieved_goal, desired_goal
+        )
+        return reward.to(torch.float32, copy=True)
+
+    def _ends(self, success: Tensor, step_count: Tensor) -> Observed:
+        """``terminated``, ``truncated`` and ``done``, (n, 1) bool."""
+        has_stepped = step_count > 0  # a start does not end an episode
+        terminated = torch.zeros_like(success)
+        if self._terminate_on_success:
+            terminated = success & has_stepped
+        if self._has_failure:
+            terminated = terminated | self._task.failure(self._simulation) & has_stepped
+        truncated = step_count >= self._max_episode_steps
+        return {
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+
+    def _check_functions(self) -> None:
+        """Check that robot and task return the shapes that they declare."""
+        robot, task, simulation = self._robot, self._task, self._simulation
+        n = simulation.num_envs
+        goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
+        for owner, name, size in (
+            (robot, "observation", robot.observation_dim),
+            (task, "observation", task.observation_dim),
+            (task, "achieved_goal", task.goal_dim),
+        ):
+            value = getattr(owner, name)(simulation)
+            check_output(f"{type(owner).__name__}.{name}", value, (n, size))
+        function = type(task).__name__
+        if simulation.scene.markers:
+            shape = (n, len(simulation.scene.markers), 7)
+            check_output(f"{function}.marker_pose", task.marker_pose(goal), shape)
+        goals = task.achieved_goal(simulation).float(), goal.float()
+        check_output(f"{function}.compute_reward", task.compute_reward(*goals), (n, 1))
+        check_output(
+            f"{function}.is_success", task.is_success(*goals), (n, 1), torch.bool
+        )
+        if self._has_reward:
+            action = torch.zeros(n, robot.action_dim, dtype=torch.float32, device="cpu")
+            reward = task.reward(simulation, action, goals[1], goals[1].clone())
+            check_output(f"{function}.reward", reward, (n, 1))
+        if self._has_failure:
+            failure = task.failure(simulation)
+            check_output(f"{function}.failure", failure, (n, 1), torch.bool)
+
+
+class ExtraObserver:
+    """Observes the entries of `Task.extra_observation`.
+
+    Args:
+        task: The task.
+        simulation: The environments.
+
+    Raises:
+        ValueError: An entry does not have n rows.
+        TypeError: The task does not return a dict of tensors.
+
+    Attributes:
+        entries: The entries, by key; none if the task leaves the hook out.
+    """
+
+    def __init__(self, task: Task, simulation: VectorSimulation) -> None:
+        self._task, self._simulation = task, simulation
+        self._function = f"{type(task).__name__}.extra_observation"
+        self.entries: dict[str, Entry] = {}
+        if type(task).extra_observation is Task.extra_observation:
+            return
+        observed = task.extra_observation(simulation)
+        if not isinstance(observed, dict):
+            raise TypeError(
+                f"{self._function} must return a dict of tensors, got {observed!r}"
+            )
+        for key, value in observed.items():
+            shape = tuple(value.shape[1:]) if isinstance(value, Tensor) else ()
+            rows = simulation.num_envs
+            check_output(f"{self._function}[{key!r}]", value, (rows, *shape))
+            self.entries[key] = Entry(shape, _float32_copy(value).dtype)
+
+    def observe(self) -> Observed:
+        """The entries of all environments, (n, ...), in new tensors.
+
+        Raises:
+            ValueError: The task returns other keys than it did at first.
+        """
+        observed = self._task.extra_observation(self._simulation)
+        if observed.keys() != self.entries.keys():
+            raise ValueError(
+                f"{self._function} must always return {sorted(self.entries)}, "
+                f"got {sorted(observed)}"
+            )
+        return {key: _float32_copy(value) for key, value in observed.items()}
+
+
+def _float32_copy(value: Tensor) -> Tensor:
+    """A new tensor, with float64 converted to float32."""
+    return value.float() if value.dtype == torch.float64 else value.clone()

@@ -1,83 +1,110 @@
-"""A robot and a task, as one batched TorchRL environment."""
+"""One robot and one task as a batched TorchRL environment."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.modules import RandomPolicy
+from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsName, PhysicsParams
-from torch_panda.closing import Closing
-from torch_panda.envs.checks import check_device
+from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
 from torch_panda.envs.observer import Observed
-from torch_panda.envs.persistence import PersistentEnv
-from torch_panda.envs.pictures import PicturedEnv
+from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, means_state
-from torch_panda.randomization import Randomization
-from torch_panda.rendering import RendererName
+from torch_panda.envs.state import EXACT_KEYS, is_state
+from torch_panda.rendering import Camera, RendererName, Window, segmentation_ids
+from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
 from torch_panda.sensors import Sensor
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
 
+if TYPE_CHECKING:  # needs an extra
+    from torch_panda.rendering.web_viewer import WebViewer
 
-class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
+
+class RobotTaskEnv(EnvBase):
     """Goal-conditioned environments of one robot and one task, stepped in parallel.
 
-    What an environment draws depends on (``seed``, its index, the number of its
-    episode) only, and an episode on what is drawn and on the actions only.
+    The random draws of an environment depend on (``seed``, index of the environment,
+    number of the episode) only. An episode depends on these draws and on the actions
+    only.
 
-    A step takes ``action``, float32 in [-1, 1] (values beyond are clipped), and gives
-    under ``next``: ``observation``, ``achieved_goal``, ``desired_goal`` (float32),
-    ``success``, ``terminated``, ``truncated`` and ``done`` (bool) and ``reward``
-    (float32), the last five of shape (*batch, 1). A step or reset that fails in one
-    environment raises `WorkerError`, which names it; the others have gone on. Those of
-    a reset that failed must be reset again.
+    A step takes ``action``, float32, which is clipped to [-1, 1]. It writes under
+    ``next``: ``observation``, ``achieved_goal``, ``desired_goal`` (float32),
+    ``reward`` (*batch, 1) float32, and ``success``, ``terminated``, ``truncated`` and
+    ``done`` (*batch, 1) bool.
 
-    It serves one thread at a time: a call while another thread is in it raises
-    `BulletError`. ``state_dict`` holds seeds and numbers of episodes, so that a run can
-    be resumed at the next reset.
+    If a step or reset fails in one environment, `WorkerError` names it. The other
+    environments have finished the step. After a reset that failed, its environments
+    need another reset.
+
+    An environment belongs to one thread at a time: a call while another thread is
+    inside raises `BulletError`.
+
+    It pickles as its class and its arguments, because the state of Bullet cannot be
+    copied. A copy builds its own clients and continues with the last seed of all
+    environments. ``state_dict`` holds the seeds and the episode numbers: a run that
+    loads it continues with the episodes that would have followed, from the next reset
+    on. It does not hold the state of the running episodes.
 
     Args:
-        robot: the robot.
-        task: the task.
-        num_envs: number of environments: the batch size is [num_envs]; None makes one
-            environment of batch size [].
-        num_threads: threads that step them; None means one per core, at most
+        robot: The robot.
+        task: The task.
+        num_envs: Number of environments stepped in parallel; the batch size is
+            [num_envs]. None makes one environment of batch size [].
+        num_threads: Number of threads that step them; None means one per core, at most
             ``num_envs``.
-        seed: of all random draws; None takes one from the operating system.
-        device: where the outputs are placed; None means the CPU. Physics and states
-            stay on the CPU.
-        max_episode_steps: steps until ``truncated``; None means the task's number.
-        terminate_on_success: whether success ends an episode, as in panda-gym 3; the
+        seed: Seed of all random draws; None draws one from the operating system.
+        device: Device of the outputs; None means the CPU. Physics and states stay on
+            the CPU.
+        max_episode_steps: Number of steps after which an episode is ``truncated``;
+            None means the task's number.
+        terminate_on_success: Whether success ends an episode, as in panda-gym 3. The
             paper's episodes go on.
-        physics: how Bullet integrates: "exact" (as panda-gym), "fast", or parameters.
-        sensors: what to observe beside the state, each under its own keys: cameras
-            (`CameraSensor`) and force sensors, these also by name.
-        observe_state: observe ``observation``; the goals are there in any case.
+        physics: How Bullet integrates: "exact" as in panda-gym, "fast", or parameters.
+        sensors: What to observe beside the state, each under its own keys: sensors, or
+            the names of force sensors.
+        observe_state: Whether to observe ``observation``. The goals are always
+            observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
-        on_divergence: what happens when a step leaves an environment in a state that is
-            not finite. It is put at the start of its next episode; then "raise" raises
-            `BulletError`, while "reset" lets the step end there, ``truncated`` and no
-            success; its reward is that of the start.
-        randomize: physics that are drawn for every episode; None: they are the task's.
+        on_divergence: What happens when a step leaves an environment in a state that
+            is not finite. The environment always starts its next episode. "raise" then
+            raises `BulletError`. "reset" ends the step ``truncated`` and without
+            success, with the reward of the new start.
+        randomize: Ranges from which the physics of every episode are drawn; None keeps
+            the physics of the task.
 
     Raises:
-        ValueError: an argument is out of range.
-        TypeError: an argument has a wrong type.
-        RuntimeError: torch knows no such device, or EGL is asked for and does not work.
+        ValueError: An argument is out of range.
+        TypeError: An argument has a wrong type.
+        RuntimeError: torch does not know the device, or EGL does not work.
 
     Attributes:
-        episodes: what runs the environments, without torchrl.
+        episodes: Runs the environments, without torchrl.
     """
 
     _supports_set_state = True
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
-    @torch.inference_mode(False)  # or specs could not be used outside that mode
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:  # noqa: ANN401 (a subclass's)
+        """Remember the arguments, also those of a subclass, for pickles and repr."""
+        env = super().__new__(cls, *args, **kwargs)
+        env._arguments = (args, kwargs)
+        return env
+
+    # Specs that are made in inference mode could be used in that mode only.
+    @torch.inference_mode(False)
     def __init__(
         self,
         *,
@@ -140,46 +167,22 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         """The task's pure success function; see `Task.is_success`."""
         return self.task.is_success
 
-    # ---- what users call ---------------------------------------------------------
+    def __repr__(self) -> str:
+        """The class with the arguments that differ from their defaults."""
+        args, kwargs = self._arguments
+        defaults = {
+            name: parameter.default
+            for name, parameter in inspect.signature(type(self)).parameters.items()
+        }
+        arguments = [repr(value) for value in args]
+        arguments += [
+            f"{name}={value!r}"
+            for name, value in kwargs.items()
+            if value is not defaults.get(name) and value != defaults.get(name)
+        ]
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
-    def set_env_seed(self, env: int, seed: int) -> None:
-        """Let environment ``env`` draw what the first one draws under ``seed``.
-
-        For interfaces that seed environments one by one, such as Gymnasium's.
-
-        Raises:
-            ValueError: there is no such environment, or the seed is negative.
-            TypeError: the seed is no integer.
-        """
-        self.episodes.seeds.restart_one(env, seed)
-
-    def get_state(self, *, exact: bool = False) -> TensorDict:
-        """The physical state, from which ``reset(state, set_state=True)`` starts.
-
-        Args:
-            exact: add the starts of the episodes and the actions since (``start_...``,
-                ``actions``, ``num_actions``). Bullet remembers more than poses and
-                velocities; from an exact state, which plays the actions once more,
-                episodes go on bit for bit.
-
-        Returns:
-            ``joint_position`` and ``joint_velocity`` (*batch, n_joints),
-            ``object_pose`` (*batch, n_objects, 7), ``object_velocity`` (*batch,
-            n_objects, 6), ``desired_goal`` (*batch, goal_dim), all float64, and
-            ``step_count`` (*batch, 1), int64. Where objects have joints, also
-            ``object_joint_position`` and ``object_joint_velocity`` (*batch,
-            n_object_joints); where physics vary, what they depend on:
-            ``physics_parameters`` (*batch, k) float64, ``physics_seed`` (*batch, 1).
-
-        Raises:
-            BulletError: the environment is closed or was never reset.
-        """
-        return self._emit(self.episodes.get_state(exact=exact))
-
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free all clients and threads. Closing again does nothing."""
-        self.episodes.close()
-        self.is_closed = True
+    # ---- start and act -------------------------------------------------------------
 
     def reset(
         self,
@@ -191,61 +194,38 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         """Start new episodes, as in torchrl.
 
         Args:
-            tensordict: which environments, under ``_reset``; and a state to start from:
-                what `get_state` returned, or some of its entries. It is left as it is.
-            set_state: start from that state. What is left out is neutral (joints), zero
-                (velocities) or sampled (objects, goal). None: if there is one.
-            **kwargs: torchrl's other options.
+            tensordict: The environments to reset, under ``_reset``, and a state to
+                start from, as `get_state` returns it, or some of its entries. It is not
+                changed.
+            set_state: Whether to start from this state. Joints that it leaves out are
+                neutral, velocities zero, objects and goals sampled. None starts from
+                the state if the tensordict holds one.
+            **kwargs: Other options of torchrl.
 
         Returns:
-            What the environments observe, and the state that was given, without what
+            What the environments observe, and the given state without the entries that
             only an exact state has.
 
         Raises:
-            ValueError: there is no state, or it cannot be one; or ``set_state`` is not
-                given and the tensordict holds a state beside observations. torchrl's
-                `TransformedEnv` and `ParallelEnv` do not pass states on.
+            ValueError: The state is missing or wrong; or ``set_state`` is None and the
+                tensordict holds observations and a state. torchrl's `TransformedEnv`
+                and `ParallelEnv` do not pass states on.
         """
-        # Within a rollout torchrl resets with what was observed, and says so.
+        # torchrl also resets within a rollout, with observations, and says so.
         if set_state is None and not kwargs.get("select_reset_only", False):
-            set_state = means_state(tensordict)
+            set_state = is_state(tensordict)
         if set_state and tensordict is not None:
-            # torchrl writes what is observed into it, the goal as float32.
+            # torchrl writes the observations into it, the goal as float32.
             tensordict = tensordict.copy()
         start = super().reset(tensordict, set_state=set_state, **kwargs)
         return start.exclude(*EXACT_KEYS) if set_state else start
-
-    def rollout(
-        self,
-        max_steps: int,
-        policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
-        callback: Callable[..., Any] | None = None,
-        **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
-    ) -> TensorDictBase:
-        """Take steps and collect them, as in torchrl.
-
-        Args:
-            max_steps: how many, at most.
-            policy: writes ``action``; None draws the actions that `rand_action` draws.
-            callback: is called with the environment and each step.
-            **kwargs: torchrl's other options.
-
-        Returns:
-            the steps, (*batch, time).
-        """
-        if policy is None and kwargs.get("actions") is None:
-            # At every `rand_action` tensordict looks for pandas; where that is not
-            # installed it takes 0.1 ms, of 0.3 between two steps.
-            policy, kwargs["trust_policy"] = RandomPolicy(self.action_spec), True
-        return super().rollout(max_steps, policy, callback, **kwargs)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act for one step, as in torchrl.
 
         Args:
-            tensordict: of the environment's batch size, with ``action``; and, optional,
-                which environments step, under ``_step``, and entries that are to stand
-                under ``next`` beside what they observe.
+            tensordict: Holds ``action``. It may hold the environments that take the
+                step, under ``_step``, and entries that are kept under ``next``.
 
         Returns:
             The same tensordict, with ``next``.
@@ -254,10 +234,222 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
         is_plain = tensordict.batch_size == self.batch_size
         if not is_plain or "_step" in keys or "next" in keys:
             return super().step(tensordict)
-        # torchrl would complete and reshape what `_step` returns: it is as it must be.
+        # torchrl's own step would complete and reshape the result, which is complete.
         return tensordict.set("next", self._step(tensordict))
 
-    # ---- what torchrl calls ------------------------------------------------------
+    def rollout(
+        self,
+        max_steps: int,
+        policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        callback: Callable[..., Any] | None = None,
+        **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
+    ) -> TensorDictBase:
+        """Collect steps, as in torchrl.
+
+        Args:
+            max_steps: Largest number of steps.
+            policy: Writes ``action``; None draws the random actions of `rand_action`.
+            callback: Called with the environment and the tensordict of each step.
+            **kwargs: Other options of torchrl.
+
+        Returns:
+            The steps, (*batch, time).
+        """
+        if policy is None and kwargs.get("actions") is None:
+            # `rand_action` makes tensordict look for pandas at every call. Where pandas
+            # is not installed, this takes 0.1 of the 0.3 ms between two steps.
+            policy, kwargs["trust_policy"] = RandomPolicy(self.action_spec), True
+        return super().rollout(max_steps, policy, callback, **kwargs)
+
+    def set_env_seed(self, env: int, seed: int) -> None:
+        """Give environment ``env`` the episodes of environment 0 under ``seed``.
+
+        For interfaces that seed environments one by one, such as Gymnasium's.
+
+        Raises:
+            ValueError: The index is out of range, or the seed is negative.
+            TypeError: The seed is not an integer.
+        """
+        self.episodes.seeds.restart_one(env, seed)
+
+    # ---- states, saving and pickling -----------------------------------------------
+
+    def get_state(self, *, exact: bool = False) -> TensorDict:
+        """The physical state, from which ``reset(state, set_state=True)`` starts.
+
+        Args:
+            exact: Add the starts of the episodes and the actions since, under
+                ``start_...``, ``actions`` and ``num_actions``. A reset to an exact
+                state repeats these actions, and the episode then continues bit for
+                bit. Bullet remembers more than poses and velocities, so that a plain
+                state continues only approximately.
+
+        Returns:
+            ``joint_position`` and ``joint_velocity`` (*batch, n_joints),
+            ``object_pose`` (*batch, n_objects, 7), ``object_velocity`` (*batch,
+            n_objects, 6) and ``desired_goal`` (*batch, goal_dim), all float64, and
+            ``step_count`` (*batch, 1), int64. If objects have joints, also
+            ``object_joint_position`` and ``object_joint_velocity`` (*batch,
+            n_object_joints). If the physics vary, also ``physics_parameters`` (*batch,
+            k) float64, or ``physics_seed`` (*batch, 1) int64.
+
+        Raises:
+            BulletError: The environment is closed or needs a reset.
+        """
+        return self._emit(self.episodes.get_state(exact=exact))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Seeds and episode numbers, which ``state_dict`` holds."""
+        return self.episodes.seeds.state()
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Continue with the episodes that follow those of a ``state_dict``."""
+        self.episodes.seeds.load(state)
+
+    def load_state_dict(
+        self,
+        state_dict: Mapping[str, Any],
+        *args: Any,  # noqa: ANN401 (torch's signature)
+        **kwargs: Any,  # noqa: ANN401
+    ) -> object:
+        """Load a ``state_dict``. An empty one changes nothing.
+
+        torchrl's collectors leave the state of the environment out of their own.
+
+        Raises:
+            ValueError: The ``state_dict`` holds another number of environments.
+        """
+        if not state_dict:
+            return None
+        return super().load_state_dict(state_dict, *args, **kwargs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        seed = self.episodes.seeds.seed
+        return _rebuild, (type(self), *self._arguments, seed, self.device)
+
+    # ---- pictures ------------------------------------------------------------------
+
+    @functools.cached_property
+    def segmentation_ids(self) -> dict[str, int]:
+        """The numbers in segmentations, by name.
+
+        The names are ``nothing`` (-1), ``robot``, ``ground``, ``table``, and
+        ``object``, or ``object1`` and ``object2``, unless the visuals of the task name
+        their bodies.
+        """
+        return segmentation_ids(self.episodes.build_scene)
+
+    def render(
+        self,
+        envs: int | Sequence[int] | None = None,
+        *,
+        camera: Camera | None = None,
+        size: int | tuple[int, int] | None = None,
+    ) -> Tensor:
+        """Draw the environments as they are now.
+
+        Args:
+            envs: Index or indices of the environments; None means all.
+            camera: The camera; None means `Camera`'s defaults, which are panda-gym's.
+            size: Height and width of the picture [pixels], or both in one number; None
+                means the camera's.
+
+        Returns:
+            uint8, (number of environments, height, width, 3); (height, width, 3) for
+            one index or an environment of batch size [].
+
+        Raises:
+            BulletError: The environment is closed, or another thread is inside.
+            ValueError: An index is out of range, or its environment needs a reset.
+            TypeError: An index is not an integer.
+        """
+        camera, episodes = resized(camera or Camera(), size), self.episodes
+        if envs is None:
+            chosen, is_single = range(episodes.num_envs), self.num_envs is None
+        else:
+            chosen, is_single = np.atleast_1d(envs).tolist(), np.ndim(envs) == 0
+        with episodes.exclusive():
+            for env in chosen:
+                episodes.check_was_reset(env)
+            pixels = episodes.renderer.picture(chosen, camera).to(self.device)
+        return pixels[0] if is_single else pixels
+
+    def open_window(self, camera: Camera | None = None) -> Window:
+        """Open pybullet's GUI. ``show(i)`` of the result shows environment i.
+
+        It needs a display. Close it, or use it as a context manager.
+
+        Args:
+            camera: The camera with which the view starts; None means `Camera`'s
+                defaults.
+
+        Raises:
+            BulletError: There is no display, or the environment is closed.
+        """
+        episodes = self.episodes
+        with episodes.exclusive():
+            return Window(episodes.simulation, episodes.build_scene, camera or Camera())
+
+    def open_viewer(
+        self,
+        camera: Camera | None = None,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> "WebViewer":
+        """Serve the scene to browsers, in three dimensions; needs the extra ``viewer``.
+
+        Call ``update()`` of the result after each reset and step, so that the page
+        shows the present state. The slider of the page goes back over the episode.
+        Close the viewer, or use it as a context manager.
+
+        Args:
+            camera: The camera with which the view starts; None means `Camera`'s
+                defaults.
+            host: Address at which it serves; "0.0.0.0" lets other machines in.
+            port: First port to try; the viewer takes the next free one, see ``url``.
+
+        Raises:
+            ImportError: viser is not installed.
+            BulletError: The environment is closed.
+        """
+        if find_spec("viser") is None:
+            raise ImportError(
+                "viewers need viser: pip install -c .ci/constraints.txt -e '.[viewer]'"
+            )
+        from torch_panda.rendering.web_viewer import WebViewer
+
+        episodes = self.episodes
+        with episodes.exclusive():
+            return WebViewer(
+                episodes.simulation,
+                episodes.watch,
+                max_episode_steps=episodes.max_episode_steps,
+                title=type(episodes.task).__name__,
+                camera=camera or Camera(),
+                host=host,
+                port=port,
+            )
+
+    # ---- closing -------------------------------------------------------------------
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free all clients and threads. Closing again does nothing."""
+        self.episodes.close()
+        self.is_closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # ---- called by torchrl ---------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict.get("action", None)
@@ -277,29 +469,49 @@ class RobotTaskEnv(PicturedEnv, PersistentEnv, Closing):
     ) -> TensorDict:
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = None if mask is None else indices(mask)
-        given = {} if tensordict is None else tensordict
-        return self._emit(self.episodes.reset(envs, given if set_state else None))
+        state = {} if tensordict is None else tensordict
+        return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)
 
-    # ---- tensors in and out ------------------------------------------------------
+    def _create_done_specs(self) -> None:
+        """Do nothing, because the done specs are complete.
+
+        torchrl's method leaves a cycle of references behind, which keeps a forgotten
+        environment alive until the garbage collector finds it.
+        """
+
+    # ---- tensors in and out ----------------------------------------------------------
 
     def _read_mask(self, tensordict: TensorDictBase, key: str) -> Tensor | None:
-        """A mask of environments, (n, 1) bool; None where there is none."""
+        """A mask of environments, (n, 1) bool, or None if there is none."""
         mask = tensordict.get(key, None)
         if mask is None:
             return None
         return mask.to("cpu").reshape(self.episodes.num_envs, 1)
 
     def _emit(self, values: Observed) -> TensorDict:
-        """Shapes (n, ...) to (*batch, ...), on the environment's device."""
+        """Convert entries (n, ...) to (*batch, ...), on the environment's device."""
         if not self._observe_state:
             values.pop("observation", None)
         if self.num_envs is None:
             values = {key: value.squeeze(0) for key, value in values.items()}
         if self.device.type != "cpu":
             values = {key: value.to(self.device) for key, value in values.items()}
-        # As torchrl makes its own: all that is checked otherwise is known to be right,
-        # and takes ten times as long.
+        # As torchrl makes its own tensordicts: the checks of the public constructor
+        # take ten times as long.
         return TensorDict._new_unsafe(values, self.batch_size, self.device)
+
+
+def _rebuild(
+    env_class: type[RobotTaskEnv],
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+    seed: int | None,
+    device: torch.device,
+) -> RobotTaskEnv:
+    """Rebuild a pickled environment."""
+    env = env_class(*args, **kwargs)
+    env.episodes.seeds.restart(seed)
+    return env.to(device)

@@ -1,4 +1,4 @@
-"""The starts of episodes, and the tensors of the state that they are put into."""
+"""Draws the starts of episodes and holds the tensors of the state."""
 
 import math
 
@@ -8,27 +8,26 @@ from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.bullet.body_state import Doubles
+from torch_panda.checks import QUATERNION_TOLERANCE, check_rotations
+from torch_panda.envs.randomization import DomainRandomizer
 from torch_panda.envs.seeds import EpisodeSeeds
-from torch_panda.envs.state import QUATERNION_TOLERANCE, check_rotations, check_rows
-from torch_panda.envs.variation import PHYSICS_PARAMETERS, Variation
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 
 
 class EpisodeStarts:
-    """Draws the starts of n environments' episodes, and puts these there.
+    """Draws the starts of n environments' episodes and resets the simulation to them.
 
     Args:
-        robot: starts neutral.
-        task: draws goal, objects and their joints.
-        simulation: the environments.
-        variation: draws their physics.
-        seeds: of the episodes.
-        goal: (n, goal_dim) float64, the desired goals of the present episodes.
+        robot: The robot, which starts in its neutral pose.
+        task: The task, which draws the goal, the objects and their joints.
+        simulation: The environments.
+        randomizer: Draws the physics.
+        seeds: Seeds of the episodes.
 
     Attributes:
-        goal: the same.
-        step_count: (n, 1) int64, steps of the present episodes.
+        goal: Desired goals of the present episodes, (n, goal_dim) float64.
+        step_count: Number of steps of the present episodes, (n, 1) int64.
     """
 
     def __init__(
@@ -36,19 +35,18 @@ class EpisodeStarts:
         robot: Robot,
         task: Task,
         simulation: VectorSimulation,
-        variation: Variation,
+        randomizer: DomainRandomizer,
         seeds: EpisodeSeeds,
-        goal: Tensor,
     ) -> None:
         self._robot, self._task, self._simulation = robot, task, simulation
-        self._variation = variation
+        self._randomizer = randomizer
         self._seeds = seeds
-        self._own = type(task).sample_start is not Task.sample_start
-        self.goal = goal
-        self.step_count = torch.zeros(len(goal), 1, dtype=torch.int64, device="cpu")
+        n = simulation.num_envs
+        self.goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
+        self.step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
 
     def state(self) -> dict[str, Tensor]:
-        """The tensors that hold the physical state, (n, ...); not copies."""
+        """The tensors of the state, (n, ...) by key. They are not copies."""
         simulation = self._simulation
         state = {
             "joint_position": simulation.joint_position,
@@ -57,7 +55,7 @@ class EpisodeStarts:
             "object_velocity": simulation.object_velocity,
             "desired_goal": self.goal,
             "step_count": self.step_count,
-            **self._variation.state,
+            **self._randomizer.state,
         }
         if any(simulation.scene.object_joints):
             state["object_joint_position"] = simulation.object_joint_position
@@ -65,21 +63,21 @@ class EpisodeStarts:
         return state
 
     def draw(self, env: int) -> None:
-        """Put the start of an environment's next episode into the state tensors.
+        """Write the start of an environment's next episode into the state tensors.
 
         Raises:
-            ValueError: the task draws a wrong shape, or what is not finite or no
-                rotation.
+            ValueError: The task draws numbers of a wrong shape, numbers that are not
+                finite, or quaternions that are not unit quaternions.
         """
         start = self._task.sample_start(self._seeds.next_generator(env))
-        # As arrays: to index tensors takes three times as long.
+        # Rows of arrays: indexing tensors takes three times as long.
         row = {key: value.numpy()[env] for key, value in self.state().items()}
         row["step_count"][:] = 0
-        _fill(row["desired_goal"], start.goal, self._drawn_by("sample_goal"))
+        _fill(row["desired_goal"], start.goal, self._function("sample_goal"))
         row["joint_position"][:] = self._robot.neutral_joint_position
         row["joint_velocity"][:] = 0.0
         if len(row["object_pose"]):
-            function = self._drawn_by("sample_objects")
+            function = self._function("sample_objects")
             _fill(row["object_pose"], start.object_pose, function)
             for *_, x, y, z, w in row["object_pose"].tolist():
                 if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
@@ -91,51 +89,51 @@ class EpisodeStarts:
             joints = row["object_joint_position"]
             drawn = np.asarray(start.object_joint_position)
             drawn = np.broadcast_to(drawn, joints.shape) if drawn.size == 1 else drawn
-            _fill(joints, drawn, self._drawn_by("sample_object_joints"))
+            _fill(joints, drawn, self._function("sample_object_joints"))
             row["object_joint_velocity"][:] = 0.0
-        if self._variation.is_on:
-            self._variation.draw(env, self._seeds.physics_seed(env))
+        if self._randomizer.is_active:
+            self._randomizer.draw(env, self._seeds.physics_seed(env))
 
-    def check_goal(self, goal: Tensor, envs: list[int]) -> Tensor:
-        """Where markers show goals (k, goal_dim) of these environments, (k, m, 7).
+    def marker_pose(self, goal: Tensor, envs: list[int]) -> Tensor:
+        """Poses of the markers that show goals.
+
+        Args:
+            goal: Goals of these environments, (len(envs), goal_dim).
+            envs: The environments of the rows.
+
+        Returns:
+            (len(envs), n_markers, 7).
 
         Raises:
-            ValueError: a goal turns its marker by what is no rotation.
+            ValueError: `Task.marker_pose` returns a quaternion that is not a unit
+                quaternion.
         """
         pose = self._task.marker_pose(goal)
         if type(self._task).marker_pose is not Task.marker_pose:
             check_rotations("desired_goal", pose, envs)
         return pose
 
-    def check_physics(self, values: dict[str, Tensor], envs: list[int]) -> None:
-        """Make sure that a state of these environments, (k, ...), has possible physics.
-
-        Raises:
-            ValueError: a factor is negative, or one of a mass is 0: what weighs 0 never
-                moves.
-        """
-        if PHYSICS_PARAMETERS in values:
-            factors = values[PHYSICS_PARAMETERS]
-            is_possible = (factors > 0) | (factors == 0) & ~self._variation.is_mass
-            wanted = "at least 0, of a mass above 0"
-            check_rows(PHYSICS_PARAMETERS, is_possible, envs, wanted)
-
-    def mark(self, envs: list[int]) -> None:
-        """Say where markers are to be put: where the goals are; see `check_goal`."""
+    def place_markers(self, envs: list[int]) -> None:
+        """Write the poses of the markers into their tensor; see `marker_pose`."""
         if self._simulation.scene.markers:
-            self._simulation.marker_pose[envs] = self.check_goal(self.goal[envs], envs)
+            self._simulation.marker_pose[envs] = self.marker_pose(self.goal[envs], envs)
 
     def place(self, envs: list[int]) -> None:
-        """Put robots, objects and markers where the state tensors say."""
-        varies = self._variation.changes_physics
-        self._simulation.reset(envs, self._variation.apply if varies else None)
+        """Reset the simulation to the state tensors."""
+        randomizer = self._randomizer
+        self._simulation.reset(
+            envs, randomizer.apply if randomizer.changes_physics else None
+        )
 
-    def _drawn_by(self, function: str) -> str:
-        return "sample_start" if self._own else function
+    def _function(self, name: str) -> str:
+        """The function of the task that draws, for errors."""
+        if type(self._task).sample_start is not Task.sample_start:
+            return "sample_start"
+        return name
 
 
 def _fill(row: Doubles, values: object, function: str) -> None:
-    """Take what a task has drawn for one environment, (...)."""
+    """Write into a row of a state tensor what the task drew."""
     drawn = np.asarray(values, dtype=np.float64)
     if drawn.shape != row.shape or not np.isfinite(drawn).all():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A robot, a task and sensors, built in a client."""
+"""Builds the scene of a robot, a task and sensors."""
 
 from collections.abc import Sequence
 
@@ -8,16 +8,16 @@ from torch_panda.sensors import Sensor
 from torch_panda.tasks import Bodies, Task
 
 
-class TaskScene:
+class RobotTaskBuilder:
     """Builds the same scene in any client; see `rendering.SceneBuilder`.
 
-    It holds descriptions only: an environment that held its simulation, which held
-    the environment as what builds its scene, would outlive its last reference.
+    It holds descriptions only. If it held the simulation, which holds the builder, the
+    cycle of references would keep a forgotten environment alive.
 
     Args:
-        robot: the robot.
-        task: the task.
-        sensors: what the robot's clients are to sense.
+        robot: The robot.
+        task: The task.
+        sensors: The sensors for which the clients are prepared.
     """
 
     def __init__(self, robot: Robot, task: Task, sensors: Sequence[Sensor]) -> None:
@@ -26,10 +26,11 @@ class TaskScene:
         self._sensors = sensors
 
     def __call__(self, client: PhysicsClient) -> Scene:
-        """Build all of it.
+        """Build the scene in a client.
 
         Raises:
-            TypeError: the robot or the task does not say what it has built.
+            TypeError: `Robot.build` or `Task.build` returns something else than the
+                ids of the bodies.
         """
         robot = self._robot
         body = robot.build(client)
@@ -52,7 +53,7 @@ class TaskScene:
         )
 
     def build_markers(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the task alone, and return the body ids of its markers."""
+        """Build the task alone and return the body ids of its markers."""
         return tuple(self._build_task(client).markers)
 
     def _build_task(self, client: PhysicsClient) -> Bodies:

@@ -1,0 +1,285 @@
+"""Domain randomization: physics that are drawn anew for every episode.
+
+`Randomization` holds the ranges. `PhysicsFactors` multiplies the physics of one client
+by factors. `DomainRandomizer` draws the factors of n environments and applies them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, PhysicsParams, Scene, VectorSimulation
+from torch_panda.checks import check_not_negative, check_range, check_rows
+from torch_panda.robots import Robot
+from torch_panda.sensors import Entry
+from torch_panda.tasks import Bodies, Task
+
+Range = tuple[float, float]
+
+# The factors of ``physics_parameters``, in this order.
+PARAMETERS = (
+    "object_mass",
+    "object_friction",
+    "table_friction",
+    "finger_friction",
+    "object_restitution",
+    "joint_damping",
+    "gravity",
+)
+# Parameters whose drawn number is the value itself where the nominal value is 0.
+_ABSOLUTE_AT_ZERO = ("object_restitution", "joint_damping")
+
+# Entries of a state that determine the physics of an episode.
+PHYSICS_SEED = "physics_seed"
+PHYSICS_PARAMETERS = "physics_parameters"
+PHYSICS = (PHYSICS_SEED, PHYSICS_PARAMETERS)
+
+# Index of the constant factor 1, behind the drawn factors.
+_CONSTANT = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomization:
+    """Ranges from which the physics of every episode are drawn.
+
+    A range is (lowest, highest) of a factor on the nominal value, the number of the
+    task, the robot or the URDF. Each environment draws the factors uniformly before
+    each of its episodes, from (seed, environment, episode number) only. None keeps the
+    nominal value. A range for something that the scene lacks has no effect.
+
+    Attributes:
+        object_mass: Mass and inertia of all objects.
+        object_friction: Lateral friction of all objects and their links. Bullet
+            multiplies the friction of the two bodies in contact.
+        table_friction: Lateral friction of the table and all other fixed bodies.
+        finger_friction: Lateral friction of the robot's ``finger_links``.
+        object_restitution: Restitution of all objects. Where the nominal value is 0,
+            Bullet's default, the drawn number is the restitution itself. The table
+            then gets a restitution of 1, because Bullet multiplies both.
+        joint_damping: Damping of the robot's joints. Where the nominal value is 0, as
+            in the Panda, the drawn number is the damping itself [N m s/rad].
+        gravity: Gravity of the world.
+        joint_position: The arm's joints start up to this far from neutral [rad].
+        observe: Observe ``physics_parameters``, float32 (*batch, k): the drawn
+            factors, in the order above.
+
+    Raises:
+        ValueError: A range is not (lowest, highest), finite and at least 0.
+    """
+
+    object_mass: Range | None = None
+    object_friction: Range | None = None
+    table_friction: Range | None = None
+    finger_friction: Range | None = None
+    object_restitution: Range | None = None
+    joint_damping: Range | None = None
+    gravity: Range | None = None
+    joint_position: float = 0.0
+    observe: bool = False
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in PARAMETERS and value is not None:
+                check_range(field.name, value)
+        if self.object_mass is not None and not min(self.object_mass) > 0:
+            raise ValueError(f"object_mass must be above 0, got {self.object_mass}")
+        check_not_negative(joint_position=self.joint_position)
+        if self.observe and not self.names:
+            raise ValueError(f"observe=True needs a range of one of {PARAMETERS}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the drawn factors, in the order of ``physics_parameters``."""
+        return tuple(name for name in PARAMETERS if getattr(self, name) is not None)
+
+    def bounds(self) -> npt.NDArray[np.float64]:
+        """The lowest and the highest factors, (2, k)."""
+        return np.array([getattr(self, name) for name in self.names]).T
+
+
+class PhysicsFactors:
+    """Multiplies the physics of a client by factors.
+
+    Args:
+        names: Names of the factors, from `PARAMETERS`.
+        client: A client whose physics are still nominal.
+        scene: The scene that all clients hold.
+        finger_links: The robot's ``finger_links``.
+        physics: The integration parameters of the clients.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        client: PhysicsClient,
+        scene: Scene,
+        finger_links: Sequence[int],
+        physics: PhysicsParams,
+    ) -> None:
+        movable = {scene.robot, *scene.objects, *scene.markers}
+        fixed = [(body, -1) for body in client.bodies if body not in movable]
+        objects = [
+            (body, link)
+            for body in scene.objects
+            for link in range(-1, len(client.joints(body)))  # -1 is the base
+        ]
+        fingers = [(scene.robot, link) for link in finger_links]
+        joints = [(scene.robot, joint) for joint in scene.joints]
+        damping = {joint.index: joint.damping for joint in client.joints(scene.robot)}
+        # Argument of `set_dynamics`, (body, link) pairs, and their nominal value.
+        targets: dict[
+            str, tuple[str, list[tuple[int, int]], Callable[[int, int], float]]
+        ] = {
+            "object_mass": ("mass", objects, client.mass),
+            "object_friction": ("lateral_friction", objects, client.friction),
+            "table_friction": ("lateral_friction", fixed, client.friction),
+            "finger_friction": ("lateral_friction", fingers, client.friction),
+            "object_restitution": ("restitution", objects, client.restitution),
+            "joint_damping": ("joint_damping", joints, lambda _, link: damping[link]),
+        }
+        self._gravity: tuple[int, float] | None = None
+        # (argument of `set_dynamics`, index of the factor, nominal value) by link.
+        self._changes: dict[tuple[int, int], list[tuple[str, int, float]]] = {}
+        for index, name in enumerate(names):
+            if name == "gravity":
+                self._gravity = (index, physics.gravity)
+                continue
+            argument, links, nominal_value = targets[name]
+            value_at_zero = 1.0 if name in _ABSOLUTE_AT_ZERO else 0.0
+            for link in links:
+                if value := nominal_value(*link) or value_at_zero:
+                    self._changes.setdefault(link, []).append((argument, index, value))
+            if name == "object_restitution":
+                for link in fixed:
+                    change = ("restitution", _CONSTANT, 1.0)
+                    self._changes.setdefault(link, []).append(change)
+
+    def apply(self, client: PhysicsClient, factors: Sequence[float]) -> None:
+        """Set the physics of a client to the nominal values times k factors."""
+        factors = (*factors, 1.0)
+        for (body, link), changes in self._changes.items():
+            values = {name: factors[index] * value for name, index, value in changes}
+            client.set_dynamics(body, link, **values)
+        if self._gravity is not None:
+            index, value = self._gravity
+            client.set_gravity(factors[index] * value)
+
+
+class DomainRandomizer:
+    """Draws the physics of n environments and changes their clients.
+
+    Two sources vary the physics: a `Randomization`, and the hook `Task.randomize`. The
+    numbers on which the physics depend are part of the state of an environment, so
+    that resetting to a state restores the physics too.
+
+    Args:
+        randomization: Ranges of the factors; None draws no factors.
+        robot: The robot.
+        task: The task.
+        simulation: The environments.
+        physics: The integration parameters of the clients.
+
+    Attributes:
+        state: Entries of the state that determine the physics of the present episodes,
+            (n, ...) by key.
+        entries: Observed entries, by key.
+        changes_physics: Whether `apply` changes anything.
+        is_active: Whether `draw` draws anything.
+    """
+
+    def __init__(
+        self,
+        randomization: Randomization | None,
+        robot: Robot,
+        task: Task,
+        simulation: VectorSimulation,
+        physics: PhysicsParams,
+    ) -> None:
+        self._randomization = randomization or Randomization()
+        self._task = task
+        self._simulation = simulation
+        self._num_arm_joints = robot.num_arm_joints
+        self._bodies = Bodies(simulation.scene.objects, simulation.scene.markers)
+        self._factors: PhysicsFactors | None = None
+        self.state: dict[str, Tensor] = {}
+        self.entries: dict[str, Entry] = {}
+        n, names = simulation.num_envs, self._randomization.names
+        if type(task).randomize is not Task.randomize:
+            self.state[PHYSICS_SEED] = torch.zeros(
+                n, 1, dtype=torch.int64, device="cpu"
+            )
+        if names:
+            k = len(names)
+            self._bounds = self._randomization.bounds()
+            self._is_mass = torch.tensor(
+                [name == "object_mass" for name in names], device="cpu"
+            )
+            self._factors = PhysicsFactors(
+                names,
+                simulation.clients[0],
+                simulation.scene,
+                robot.finger_links,
+                physics,
+            )
+            self.state[PHYSICS_PARAMETERS] = torch.ones(
+                n, k, dtype=torch.float64, device="cpu"
+            )
+            if self._randomization.observe:
+                self.entries[PHYSICS_PARAMETERS] = Entry((k,), torch.float32)
+        self.changes_physics = bool(self.state)
+        self.is_active = self.changes_physics or self._randomization.joint_position > 0
+
+    def draw(self, env: int, seed: np.random.SeedSequence) -> None:
+        """Draw the physics and the joint offsets of an environment's next episode.
+
+        Args:
+            env: The environment. Its ``joint_position`` already holds the neutral pose.
+            seed: Seed of the physics of this episode.
+        """
+        if PHYSICS_SEED in self.state:
+            number = int(seed.generate_state(1, np.uint64)[0])
+            self.state[PHYSICS_SEED][env] = number >> 1  # fits into int64
+        rng = np.random.default_rng(seed)
+        if PHYSICS_PARAMETERS in self.state:
+            factors = rng.uniform(*self._bounds)
+            self.state[PHYSICS_PARAMETERS][env] = torch.from_numpy(factors)
+        if limit := self._randomization.joint_position:
+            arm = self._simulation.joint_position[env, : self._num_arm_joints]
+            arm += torch.from_numpy(rng.uniform(-limit, limit, size=len(arm)))
+
+    def apply(self, env: int) -> None:
+        """Change the physics of an environment's client to those of its state."""
+        client = self._simulation.clients[env]
+        if self._factors is not None:
+            self._factors.apply(client, self.state[PHYSICS_PARAMETERS][env].tolist())
+        if PHYSICS_SEED in self.state:
+            rng = np.random.default_rng(int(self.state[PHYSICS_SEED][env]))
+            self._task.randomize(client, self._bodies, rng)
+
+    def observe(self) -> dict[str, Tensor]:
+        """The observed entries of all environments, (n, ...), in new tensors."""
+        if not self.entries:
+            return {}
+        return {PHYSICS_PARAMETERS: self.state[PHYSICS_PARAMETERS].float()}
+
+    def check_state(self, values: dict[str, Tensor], envs: Sequence[int]) -> None:
+        """Check the physics of a state to start from.
+
+        Args:
+            values: Entries of the state, (len(envs), ...) by key.
+            envs: The environments of the rows.
+
+        Raises:
+            ValueError: A factor is negative, or the factor of a mass is 0: Bullet
+                treats a body without mass as fixed.
+        """
+        if PHYSICS_PARAMETERS in values:
+            factors = values[PHYSICS_PARAMETERS]
+            is_valid = (factors > 0) | (factors == 0) & ~self._is_mass
+            requirement = "at least 0, and above 0 for a mass"
+            check_rows(PHYSICS_PARAMETERS, is_valid, envs, requirement)
