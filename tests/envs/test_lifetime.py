@@ -164,6 +164,6 @@ def test_a_state_dict_of_other_environments():
     with (
         make() as env,
         torch_panda.make("PandaReach-v1", num_envs=3) as other,
-        pytest.raises(ValueError, match="of 2 environments, there are 3"),
+        pytest.raises(ValueError, match="holds 2 environments, but this one has 3"),
     ):
         other.load_state_dict(env.state_dict())

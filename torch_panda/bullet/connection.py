@@ -5,16 +5,16 @@ from ctypes import Array, c_double
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import Self
 
 from torch_panda.bullet import capi
-from torch_panda.closing import Closing
 
 
 class BulletError(RuntimeError):
     """Bullet refused a command, or a simulation was used as it must not be."""
 
 
-class Connection(Closing):
+class Connection:
     """The owner of a client's handle.
 
     A client must be used by one thread at a time. Clients of one process are
@@ -44,6 +44,12 @@ class Connection(Closing):
         if self._handle is not None:
             capi.disconnect(self._handle)
             self._handle = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def __reduce__(self) -> "tuple[object, ...]":
         raise TypeError("a PhysicsClient owns native memory and cannot be pickled")

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import viser
 from torch import Tensor
+from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.closing import Closing
 from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.web_scene import WebScene
 
@@ -32,7 +32,7 @@ class Frame(NamedTuple):
     status: str
 
 
-class WebViewer(Closing):
+class WebViewer:
     """Serves a page that shows one environment of a simulation.
 
     See `RobotTaskEnv.open_viewer`. Call `update` after each reset and step, in the
@@ -141,6 +141,12 @@ class WebViewer(Closing):
         """Stop the server. Closing again does nothing."""
         self._resumed.set()
         self._server.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     # ---- the page's controls -----------------------------------------------------
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from ctypes import c_char_p, c_float
 
+from typing_extensions import Self
+
 from torch_panda.bullet import (
     BulletError,
     PhysicsClient,
@@ -10,7 +12,6 @@ from torch_panda.bullet import (
     VectorSimulation,
     capi,
 )
-from torch_panda.closing import Closing
 from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.egl import probe
 from torch_panda.rendering.scene_renderer import pose_bodies, pose_solids
@@ -65,7 +66,7 @@ class WindowClient(VisualClient):
         return handle
 
 
-class Window(Closing):
+class Window:
     """pybullet's GUI on a copy of the scene; see `RobotTaskEnv.open_window`.
 
     Args:
@@ -106,6 +107,12 @@ class Window(Closing):
     def close(self) -> None:
         """Close the window. Closing again does nothing."""
         self._client.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
 
 def _check_display() -> None:
