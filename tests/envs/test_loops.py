@@ -173,7 +173,8 @@ def break_client(env, index):
     """Take the robot out of a client, so that Bullet refuses its commands."""
     simulation = env.episodes.simulation
     client = simulation.clients[index]
-    capi.submit(client._handle, remove_body(client._handle, simulation.scene.robot))
+    handle = client.connection.handle
+    capi.submit(handle, remove_body(handle, simulation.scene.robot))
 
 
 def step(env):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import find_urdf
 from torch_panda.rendering import Camera
 from torch_panda.rendering.mesh_decimation import decimated_urdf, merge_vertices
@@ -74,9 +75,10 @@ def test_the_arm_looks_the_same_from_afar():
     camera = Camera(target=(0, 0, 0.4), distance=1.4, width=64, height=64)
     images = []
     for cell in (0.0, 0.013):
-        with VisualClient(mesh_cell=cell) as client:
-            arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
-            client.set_joints(arm, (1, 3, 5), (0.41, -1.85, 2.26), (0.0,) * 3)
+        with PhysicsClient() as physics:
+            arm = physics.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+            physics.set_joints(arm, (1, 3, 5), (0.41, -1.85, 2.26), (0.0,) * 3)
+        with VisualClient(physics.blueprint, mesh_cell=cell) as client:
             image = client.draw(camera, segmentation=True)
             images.append((image.rgb.astype(int), image.segmentation == arm))
     (fine, is_arm), (coarse, is_coarse_arm) = images
@@ -106,6 +108,7 @@ def test_coarse_files_are_made_once_and_small():
 
 def test_other_robots_load():
     camera = Camera(target=(0, 0, 0.5), width=32, height=32)
-    with VisualClient(mesh_cell=0.02) as client:
-        arm = client.load_urdf("kuka_iiwa/model.urdf", fixed_base=True)
+    with PhysicsClient() as physics:
+        arm = physics.load_urdf("kuka_iiwa/model.urdf", fixed_base=True)
+    with VisualClient(physics.blueprint, mesh_cell=0.02) as client:
         assert (client.draw(camera, segmentation=True).segmentation == arm).sum() > 50

@@ -23,6 +23,13 @@ CAMERA = Camera(
 )
 
 
+def visual_client(build, layer="solids"):
+    """A visual client of the scene that a function builds."""
+    with PhysicsClient() as client:
+        build(client)
+        return VisualClient(client.blueprint, layer)
+
+
 def build(client):
     client.create_box((1, 1, 0.1), mass=0, position=(0, 0, -0.1), visual=Visual(BLUE))
     client.create_cylinder(
@@ -55,8 +62,7 @@ def test_as_pybullet_draws(shadow):
         93, 61, view, projection, shadow=shadow
     )
     pybullet.disconnect(reference)
-    with VisualClient() as client:
-        build(client)
+    with visual_client(build) as client:
         image = client.draw(CAMERA, segmentation=True, shadow=shadow)
         assert image.rgb.shape == (61, 93, 3)
         np.testing.assert_array_equal(image.rgb, np.reshape(rgba, (61, 93, 4))[..., :3])
@@ -66,23 +72,48 @@ def test_as_pybullet_draws(shadow):
         assert set(np.unique(ids)) == {-1, 0, 1, 2}
 
 
-def test_layers_hold_the_same_bodies_and_draw_their_own():
-    with PhysicsClient() as physics, VisualClient("markers") as markers:
-        build(physics)
-        build(markers)
-        assert physics.blueprint == markers.blueprint
-        for client in (physics, markers):
-            assert client.state(3).base_pose[1] == -0.2
-        image = markers.draw(CAMERA, segmentation=True)
-        assert set(np.unique(image.segmentation)) == {-1, 3}
+def test_every_layer_draws_its_own_bodies_under_the_same_ids():
+    seen = {"solids": {-1, 0, 1, 2}, "markers": {-1, 3}, "all": {-1, 0, 1, 2, 3}}
+    for layer, expected in seen.items():
+        with visual_client(build, layer) as client:
+            image = client.draw(CAMERA, segmentation=True)
+            assert set(np.unique(image.segmentation)) == expected
+
+
+def test_bodies_that_were_moved_while_building_are_drawn_there():
+    def build_and_move(client):
+        arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        box = client.create_box((0.1,) * 3, mass=1, position=(0, 0, 9))
+        client.set_joint(arm, 1, 0.8, 0.0)
+        client.set_base(box, (0.2, 0.3, 0.1), (0, 0, 0.6, 0.8))
+        client.finish_building()
+        client.set_joint(arm, 1, 0.0, 0.0)  # after building: not in the blueprint
+
+    def reference(client):
+        arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
+        client.create_box((0.1,) * 3, mass=1, position=(0.2, 0.3, 0.1))
+        client.set_base(1, (0.2, 0.3, 0.1), (0, 0, 0.6, 0.8))
+        client.set_joints(arm, (1,), (0.8,), (0.0,))
+
+    pictures = []
+    for function in (build_and_move, reference):
+        with visual_client(function) as client:
+            image = client.draw(CAMERA, segmentation=True)
+            pictures.append([array.copy() for array in image])
+    for ours, theirs in zip(*pictures, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert {0, 1} <= set(np.unique(pictures[0][2]))
 
 
 def test_depth_in_metres():
     camera = Camera(
         target=(0, 0, 0), distance=2.0, yaw=0, pitch=-90, height=32, width=32
     )
-    with VisualClient() as client:
+
+    def build_box(client):
         client.create_box((0.3, 0.3, 0.25), mass=0, position=(0, 0, 0))
+
+    with visual_client(build_box) as client:
         depth = to_metres(client.draw(camera).depth, camera)
     assert depth[16, 16] == pytest.approx(1.75, abs=1e-4)
     assert depth[0, 0] == camera.far
@@ -90,8 +121,11 @@ def test_depth_in_metres():
 
 def test_six_faces_differ():
     views = [(90, 0), (180, 0), (0, -90), (-90, 0), (0, 0), (0, 90)]
-    with VisualClient() as client:
+
+    def build_cube(client):
         client.create_box((0.02,) * 3, mass=0, position=(0, 0, 0), visual=VISUAL)
+
+    with visual_client(build_cube) as client:
         colors = []
         for yaw, pitch in views:
             # So narrow a view that a face fills the picture.
@@ -120,8 +154,12 @@ def test_bad_cameras_are_named():
 
 def test_missing_texture_is_named(tmp_path):
     visual = Visual(texture=tmp_path / "none.png")
-    with VisualClient() as client, pytest.raises(BulletError, match=r"none\.png"):
+
+    def build_box(client):
         client.create_box((1, 1, 1), mass=0, position=(0, 0, 0), visual=visual)
+
+    with pytest.raises(BulletError, match=r"none\.png"):
+        visual_client(build_box)
 
 
 def test_unknown_renderer_is_named():

@@ -8,7 +8,7 @@ import torch_panda
 
 pytest.importorskip("viser", reason="needs the extra viewer")
 
-from torch_panda.rendering import web_scene, web_viewer
+from torch_panda.rendering import web_bodies, web_viewer
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def world_pose(nodes, name):
     while name:
         node = nodes[name]
         local = np.eye(4)
-        local[:3, :3] = web_scene.SO3(np.asarray(node.wxyz)).as_matrix()
+        local[:3, :3] = web_bodies.SO3(np.asarray(node.wxyz)).as_matrix()
         local[:3, 3] = node.position
         pose, name = local @ pose, name.rpartition("/")[0]
     return pose

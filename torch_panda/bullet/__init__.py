@@ -1,5 +1,6 @@
-"""Bullet's C API: one client, and many of them stepped in parallel."""
+"""Bullet's C API: one client, and many clients stepped in parallel."""
 
+from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
@@ -15,10 +16,12 @@ from torch_panda.bullet.pool import WorkerError, WorkerPool
 from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.shapes import Box, Cylinder, Sphere, Visual
 from torch_panda.bullet.simulation import VectorSimulation
+from torch_panda.bullet.state import SimulationState
 
 __all__ = [
     "EXACT",
     "FAST",
+    "Blueprint",
     "Box",
     "BulletError",
     "Control",
@@ -28,6 +31,7 @@ __all__ = [
     "PhysicsName",
     "PhysicsParams",
     "Scene",
+    "SimulationState",
     "Sphere",
     "ThreadGuard",
     "VectorSimulation",

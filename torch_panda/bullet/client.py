@@ -1,65 +1,417 @@
-"""One DIRECT physics client of Bullet."""
+"""One DIRECT client of Bullet: a world of bodies that is built, moved and observed."""
 
 from collections.abc import Sequence
 from ctypes import byref, c_int
+from dataclasses import dataclass
+from pathlib import Path
 
-from torch_panda.bullet import capi, library, native
+from typing_extensions import Self
+
+from torch_panda.bullet import building, capi, library, native
+from torch_panda.bullet.blueprint import (
+    Blueprint,
+    Command,
+    CreateBody,
+    LoadURDF,
+    SetBase,
+    SetJoints,
+    SetPhysics,
+    Vector,
+)
 from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState, Doubles
-from torch_panda.bullet.connection import BulletError, doubles, shared
+from torch_panda.bullet.building import ORIGIN
+from torch_panda.bullet.connection import (
+    BulletError,
+    check_status,
+    connect,
+    doubles,
+    shared_doubles,
+)
 from torch_panda.bullet.contacts import ContactPoint, read_contact
 from torch_panda.bullet.physics import EXACT, PhysicsParams
-from torch_panda.bullet.scene_client import NO_ROTATION, ORIGIN, SceneClient
+from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
+from torch_panda.bullet.urdf import (
+    Tool,
+    check_collision_filters,
+    find_urdf,
+    urdf_with_tool,
+)
+from torch_panda.checks import check_not_negative, check_quaternion
+from torch_panda.rotations import NO_ROTATION
 
 # pybullet's default for setJointMotorControlArray(POSITION_CONTROL).
 VELOCITY_GAIN = 1.0
 
 
-class PhysicsClient(SceneClient):
-    """One DIRECT client: a world of bodies that moves.
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a body, as its URDF describes it."""
+
+    index: int
+    name: str
+    link_name: str
+    is_movable: bool
+    damping: float
+
+
+class PhysicsClient:
+    """One DIRECT client of Bullet: a world of bodies.
+
+    One thread at a time may use a client. The client has no visual shapes: it records
+    the commands that build the scene, and renderers draw a copy of the scene that they
+    build from this blueprint.
 
     Args:
-        physics: how it integrates.
+        physics: Parameters of the integration.
 
     Raises:
         ImportError: the installed pybullet has another C API.
+        BulletError: Bullet could not create a client.
 
     Attributes:
-        native: what the native loop knows of it.
+        connection: The connection to Bullet, for commands that this class lacks.
+        native: The struct by which the native loop knows the client.
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
-        super().__init__()
-        self.native = native.Client(self._handle, 0)
-        # The last status code in use: it moves when another version adds one before.
+        self.connection = connect()
+        self.native = native.Client(self.connection.handle, 0)
+        self._physics = physics
+        self._bodies: list[int] = []
+        self._blueprint: list[Command] = []
+        self._is_recording = True
+        # This command has the highest status code in use, which differs in every
+        # version of Bullet that inserts a status code before it.
         try:
             self.detect_collisions()
         except BulletError as error:
             self.close()
             raise library.wrong_pybullet(f"its status codes differ: {error}") from None
-        command = capi.physics_init(self._handle)
+        command = capi.physics_init(self.connection.handle)
         capi.physics_set_timestep(command, physics.timestep)
         capi.physics_set_gravity(command, 0.0, 0.0, physics.gravity)
         capi.physics_set_solver_iterations(command, physics.solver_iterations)
         capi.physics_set_residual_threshold(command, physics.residual_threshold)
-        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
-        self._physics = physics
+        self._run(command, "set parameters")
 
     @property
-    def num_detections(self) -> int:
-        """How often collisions have been detected; every time step does."""
-        return self.native.num_detections
+    def is_closed(self) -> bool:
+        """Whether the client was closed."""
+        return self.connection.is_closed
 
     def close(self) -> None:
         """Free the world. Closing again does nothing."""
         self.native.handle = None
-        super().close()
+        self.connection.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __reduce__(self) -> "tuple[object, ...]":
+        raise TypeError("a PhysicsClient owns native memory and cannot be pickled")
+
+    # ---- building a scene --------------------------------------------------------
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Ids of the bodies, in the order in which they were built."""
+        return tuple(self._bodies)
+
+    @property
+    def blueprint(self) -> Blueprint:
+        """The commands that built the scene; equal in clients of the same scene."""
+        return tuple(self._blueprint)
+
+    def finish_building(self) -> None:
+        """Stop recording commands in the blueprint."""
+        self._is_recording = False
+
+    def load_urdf(
+        self,
+        path: str | Path,
+        *,
+        position: Sequence[float] = ORIGIN,
+        orientation: Sequence[float] = NO_ROTATION,
+        fixed_base: bool = False,
+        tool: Tool | None = None,
+    ) -> int:
+        """Load a URDF and return its body id.
+
+        Args:
+            path: Path of a file, or of a file that pybullet ships.
+            position: Position of the base, world frame [m].
+            orientation: Orientation of the base, quaternion xyzw.
+            fixed_base: Whether the base cannot move.
+            tool: A link to add.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file sets collision groups or masks, which Bullet does not
+                report and `BroadPhase` could therefore not restore.
+            BulletError: Bullet cannot read the file.
+        """
+        file = find_urdf(path)
+        if tool is not None:
+            file = urdf_with_tool(file, tool)
+        check_collision_filters(file)
+        check_quaternion("orientation", orientation)
+        x, y, z, w = map(float, orientation)
+        urdf = LoadURDF(file, _vector(position), (x, y, z, w), fixed_base)
+        body = building.load_urdf(self.connection, urdf, capi.URDF_IGNORE_VISUAL_SHAPES)
+        self._bodies.append(body)
+        self._record(urdf)
+        return body
+
+    def create_box(
+        self,
+        half_extents: Sequence[float],
+        *,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a box and return its body id.
+
+        Args:
+            half_extents: Half the edge lengths along x, y and z [m].
+            mass: Mass [kg]; 0 makes a body that never moves.
+            position: Position of its centre, world frame [m].
+            visual: How renderers draw it.
+
+        Raises:
+            ValueError: the mass is negative or not finite.
+        """
+        return self._create_body(Box(_vector(half_extents)), mass, position, visual)
+
+    def create_cylinder(
+        self,
+        radius: float,
+        height: float,
+        *,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create an upright cylinder and return its body id; see `create_box`."""
+        return self._create_body(Cylinder(radius, height), mass, position, visual)
+
+    def create_sphere(
+        self,
+        radius: float,
+        *,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a sphere and return its body id; see `create_box`."""
+        return self._create_body(Sphere(radius), mass, position, visual)
+
+    def create_marker(
+        self,
+        position: Sequence[float],
+        shape: Shape | None = None,
+        *,
+        visual: Visual = Visual(),  # noqa: B008 (frozen)
+    ) -> int:
+        """Create a marker, a body that touches nothing, and return its id.
+
+        Args:
+            position: Position of its centre, world frame [m].
+            shape: Shape that renderers draw, translucent; None draws nothing.
+            visual: How renderers draw it.
+        """
+        return self._create_body(shape, 0.0, position, visual, is_marker=True)
+
+    def _create_body(
+        self,
+        shape: Shape | None,
+        mass: float,
+        position: Sequence[float],
+        visual: Visual,
+        *,
+        is_marker: bool = False,
+    ) -> int:
+        check_not_negative(mass=mass)
+        place = _vector(position)
+        collision_shape = building.NO_SHAPE
+        if shape is not None and not is_marker:
+            collision_shape = self._create_collision_shape(shape)
+        body = building.create_body(
+            self.connection, place, mass=mass, collision_shape=collision_shape
+        )
+        self._bodies.append(body)
+        self._record(CreateBody(shape, mass, place, visual, is_marker))
+        return body
+
+    def _create_collision_shape(self, shape: Shape) -> int:
+        command = capi.shape_init(self.connection.handle)
+        match shape:
+            case Box(half_extents):
+                capi.shape_add_box(command, doubles(half_extents))
+            case Cylinder(radius, height):
+                capi.shape_add_cylinder(command, radius, height)
+            case Sphere(radius):
+                capi.shape_add_sphere(command, radius)
+        status = self.connection.submit(
+            command, capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
+        )
+        return int(capi.status_shape(status))
+
+    def _record(self, command: Command) -> None:
+        if self._is_recording:
+            self._blueprint.append(command)
+
+    # ---- links and joints --------------------------------------------------------
+
+    def joints(self, body: int) -> list[Joint]:
+        """The joints of a body, in the order of its URDF."""
+        handle = self.connection.handle
+        info = capi.JointInfo()
+        joints = []
+        for index in range(capi.joint_count(handle, body)):
+            capi.joint_info(handle, body, index, byref(info))
+            name, link = info.joint_name.decode(), info.link_name.decode()
+            is_movable = info.u_size == 1
+            joints.append(Joint(index, name, link, is_movable, info.damping))
+        return joints
+
+    def mass(self, body: int, link: int = -1) -> float:
+        """Mass of a link (-1 is the base) [kg]; 0 for a base that cannot move."""
+        return float(self._dynamics(body, link).mass)
+
+    def friction(self, body: int, link: int = -1) -> float:
+        """Lateral friction of a link (-1 is the base)."""
+        return float(self._dynamics(body, link).lateral_friction)
+
+    def restitution(self, body: int, link: int = -1) -> float:
+        """Restitution of a link (-1 is the base)."""
+        return float(self._dynamics(body, link).restitution)
+
+    def centre_of_mass(self, body: int, link: int = -1) -> tuple[float, ...]:
+        """Centre of mass of a link (-1 is the base) in the frame of its URDF [m]."""
+        return tuple(self._dynamics(body, link).local_inertial_frame[:3])
+
+    def _dynamics(self, body: int, link: int) -> capi.DynamicsInfo:
+        command = capi.dynamics_info_init(self.connection.handle, body, link)
+        status = self.connection.submit(
+            command, capi.CMD_GET_DYNAMICS_INFO_COMPLETED, "report dynamics"
+        )
+        info = capi.DynamicsInfo()
+        capi.dynamics_info(status, byref(info))
+        return info
+
+    def set_friction(
+        self,
+        body: int,
+        link: int = -1,
+        *,
+        lateral: float | None = None,
+        spinning: float | None = None,
+    ) -> None:
+        """Set friction coefficients of a link (-1 is the base); None keeps one.
+
+        Raises:
+            ValueError: a coefficient is negative or not finite.
+        """
+        self.set_dynamics(
+            body, link, lateral_friction=lateral, spinning_friction=spinning
+        )
+
+    def set_dynamics(
+        self,
+        body: int,
+        link: int = -1,
+        *,
+        mass: float | None = None,
+        lateral_friction: float | None = None,
+        spinning_friction: float | None = None,
+        restitution: float | None = None,
+        joint_damping: float | None = None,
+    ) -> None:
+        """Change physical numbers of a link (-1 is the base); None keeps a number.
+
+        Args:
+            body: The body.
+            link: The link.
+            mass: Mass [kg]; the inertia of a body's base scales with it.
+            lateral_friction: Friction along a surface. Bullet multiplies the values of
+                two bodies that touch.
+            spinning_friction: Friction about the normal of a contact.
+            restitution: 1 bounces back at full speed. Bullet multiplies the values of
+                two bodies that touch.
+            joint_damping: Damping of the link's joint [N m s/rad] or [N s/m].
+
+        Raises:
+            ValueError: a number is negative or not finite.
+        """
+        numbers = {
+            "mass": mass,
+            "lateral_friction": lateral_friction,
+            "spinning_friction": spinning_friction,
+            "restitution": restitution,
+            "joint_damping": joint_damping,
+        }
+        check_not_negative(**numbers)
+        command = capi.dynamics_init(self.connection.handle)
+        for name, value in numbers.items():
+            if value is not None:
+                _DYNAMICS_SETTERS[name](command, body, link, value)
+        self.connection.submit_quick(
+            command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
+        )
+        self._record(SetPhysics("set_dynamics", (body, link, *numbers.values())))
+
+    def set_joint_friction(self, body: int, joint: int, force: float) -> None:
+        """Let a joint without a motor resist motion by up to a force [N] or [N m].
+
+        The default of Bullet is about 1 N.
+
+        Raises:
+            ValueError: the force is negative or not finite.
+        """
+        check_not_negative(force=force)
+        handle, info = self.connection.handle, capi.JointInfo()
+        capi.joint_info(handle, body, joint, byref(info))
+        command = capi.motor_init(handle, body, capi.CONTROL_MODE_POSITION_VELOCITY_PD)
+        capi.motor_set_velocity(command, info.u_index, 0.0)
+        capi.motor_set_kp(command, info.u_index, 0.0)
+        capi.motor_set_kd(command, info.u_index, 1.0)
+        capi.motor_set_force(command, info.u_index, force)
+        self.connection.submit(
+            command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "set a motor"
+        )
+        self._record(SetPhysics("set_joint_friction", (body, joint, force)))
+
+    def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
+        """Set the collision group and mask of a link (-1 is the base).
+
+        Two links touch if the group of either has a bit of the other's mask. The link
+        leaves Bullet's broad phase and enters it again as the last link, without its
+        former overlaps and contacts.
+        """
+        command = capi.filter_init(self.connection.handle)
+        capi.filter_set_group_mask(command, body, link, group, mask)
+        self._run(command, "set a collision filter")
+
+    def enable_wrench_sensor(self, body: int, joint: int) -> None:
+        """Make Bullet compute the forces through a joint in every step."""
+        handle = self.connection.handle
+        command = capi.physics_init(handle)
+        capi.physics_set_joint_feedback(command, capi.JOINT_FEEDBACK_IN_JOINT_FRAME)
+        self._run(command, "set parameters")
+        command = capi.sensor_init(handle, body)
+        capi.sensor_enable_wrench(command, joint, 1)
+        self._run(command, "add a sensor")
 
     # ---- moving the world --------------------------------------------------------
 
     def set_joint(
         self, body: int, joint: int, position: float, velocity: float
     ) -> None:
-        """Put a joint at a position [rad] or [m], with a velocity [rad/s] or [m/s]."""
+        """Move a joint to a position [rad] or [m], with a velocity (per second)."""
         self.set_joints(body, (joint,), (position,), (velocity,))
 
     def set_joints(
@@ -69,14 +421,12 @@ class PhysicsClient(SceneClient):
         positions: Sequence[float],
         velocities: Sequence[float],
     ) -> None:
-        """Put several joints somewhere at once; see `set_joint`."""
-        command = capi.pose_init(self._open(), body)
-        for joint, position, velocity in zip(
-            joints, positions, velocities, strict=True
-        ):
-            capi.pose_set_joint_position(self._handle, command, joint, position)
-            capi.pose_set_joint_velocity(self._handle, command, joint, velocity)
-        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set joints")
+        """Move several joints at once; see `set_joint`."""
+        building.set_joints(self.connection, body, joints, positions, velocities)
+        if self._is_recording:
+            self._record(
+                SetJoints(body, tuple(joints), tuple(float(x) for x in positions))
+            )
 
     def set_base(
         self,
@@ -86,43 +436,52 @@ class PhysicsClient(SceneClient):
         linear_velocity: Sequence[float] = ORIGIN,
         angular_velocity: Sequence[float] = ORIGIN,
     ) -> None:
-        """Put a body somewhere, with a velocity, in the world frame.
+        """Move a body to a pose and give it a velocity, in the world frame.
 
         Args:
-            body: the body.
-            position: of its centre of mass [m].
-            orientation: quaternion xyzw.
-            linear_velocity: [m/s].
-            angular_velocity: [rad/s].
+            body: The body.
+            position: Position of its centre of mass [m].
+            orientation: Quaternion xyzw.
+            linear_velocity: Linear velocity [m/s].
+            angular_velocity: Angular velocity [rad/s].
         """
-        command = capi.pose_init(self._open(), body)
-        capi.pose_set_linear_velocity(command, doubles(linear_velocity))
-        capi.pose_set_angular_velocity(command, doubles(angular_velocity))
-        capi.pose_set_position(command, *position)
-        capi.pose_set_orientation(command, *orientation)
-        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set a base pose")
+        building.set_base(
+            self.connection,
+            body,
+            position,
+            orientation,
+            linear_velocity,
+            angular_velocity,
+        )
+        if self._is_recording:
+            x, y, z, w = map(float, orientation)
+            self._record(SetBase(body, _vector(position), (x, y, z, w)))
 
     def set_gravity(self, gravity: float) -> None:
         """Set gravity along the world's z axis [m/s^2]."""
-        command = capi.physics_init(self._open())
+        command = capi.physics_init(self.connection.handle)
         capi.physics_set_gravity(command, 0.0, 0.0, gravity)
-        self._submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set gravity")
+        self._run(command, "set gravity")
 
     def save(self) -> int:
         """Take a snapshot of all poses, velocities and contacts; return its id."""
-        command = capi.save_init(self._open())
-        status = self._submit(command, capi.CMD_SAVE_STATE_COMPLETED, "save a state")
+        command = capi.save_init(self.connection.handle)
+        status = self.connection.submit(
+            command, capi.CMD_SAVE_STATE_COMPLETED, "save a state"
+        )
         return int(capi.status_snapshot(status))
 
     def load(self, snapshot: int) -> None:
-        """Put everything where it was in a snapshot that was taken without contacts.
+        """Move everything to where it was in a snapshot that has no contacts.
 
-        Other than `set_base` it leaves the links' boxes, from which Bullet's broad
-        phase finds overlaps, where they are until the next collision detection.
+        Unlike `set_base`, this does not update the AABBs from which Bullet's broad
+        phase finds overlaps: the next collision detection does.
         """
-        command = capi.load_init(self._open())
+        command = capi.load_init(self.connection.handle)
         capi.load_set_snapshot(command, snapshot)
-        self._submit(command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state")
+        self.connection.submit(
+            command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state"
+        )
 
     def control_joints(
         self,
@@ -131,20 +490,20 @@ class PhysicsClient(SceneClient):
         forces: Sequence[float],
         velocities: Sequence[float] | Doubles = (),
     ) -> None:
-        """Drive the first movable joints to velocities, the others to positions.
+        """Drive the first movable joints to velocities and the others to positions.
 
-        Does what pybullet's ``setJointMotorControlArray`` does in velocity and in
-        position control, with the position gain of the client's physics. For positions
-        the desired velocity is Bullet's default, 0.
+        Does the same as pybullet's ``setJointMotorControlArray`` in velocity and in
+        position control, with the position gain of the client's physics. In position
+        control the desired velocity is Bullet's default, 0.
 
         Args:
-            body: the body.
-            positions: of the others [rad] or [m].
-            forces: the most each motor may exert [N m] or [N].
-            velocities: of the first ones [rad/s] or [m/s].
+            body: The body.
+            positions: Positions of the other joints [rad] or [m].
+            forces: Maximum force of every motor [N m] or [N].
+            velocities: Velocities of the first joints [rad/s] or [m/s].
         """
         command = capi.motor_init(
-            self._open(), body, capi.CONTROL_MODE_POSITION_VELOCITY_PD
+            self.connection.handle, body, capi.CONTROL_MODE_POSITION_VELOCITY_PD
         )
         for k, velocity in enumerate(velocities):
             capi.motor_set_velocity(command, U_OFFSET + k, velocity)
@@ -155,45 +514,91 @@ class PhysicsClient(SceneClient):
         for k, force in enumerate(forces):
             capi.motor_set_kd(command, U_OFFSET + k, VELOCITY_GAIN)
             capi.motor_set_force(command, U_OFFSET + k, force)
-        # Bullet only takes notes: done before another thread could use the GIL.
-        status = capi.submit_quick(self._open(), command)
-        self._check(status, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints")
+        self.connection.submit_quick(
+            command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
+        )
 
     def apply_torques(self, body: int, torques: Doubles) -> None:
-        """Turn the first movable joints by torques [N m] for one time step."""
-        command = capi.motor_init(self._open(), body, capi.CONTROL_MODE_TORQUE)
+        """Apply torques [N m] to the first movable joints for one time step."""
+        command = capi.motor_init(
+            self.connection.handle, body, capi.CONTROL_MODE_TORQUE
+        )
         for k, torque in enumerate(torques):
             capi.motor_set_torque(command, U_OFFSET + k, torque)
-        status = capi.submit_quick(self._open(), command)
-        self._check(status, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "apply torques")
+        self.connection.submit_quick(
+            command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "apply torques"
+        )
 
     def step(self, count: int = 1) -> None:
         """Advance the world by ``count`` time steps."""
-        handle = self._open()
-        # A client has one command buffer, and stepping leaves it as it was: submitting
-        # it again steps again.
+        handle = self.connection.handle
+        # A client has one command buffer, which stepping does not change: submitting
+        # the same command again steps again.
         command = capi.step_init(handle)
         expected = capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED
         for _ in range(count):
             self.native.num_detections += 1
-            self._check(capi.submit(handle, command), expected, "step")
+            check_status(capi.submit(handle, command), expected, "step")
 
     def detect_collisions(self, count: int = 1) -> None:
         """Run collision detection ``count`` times without advancing time."""
         if count < 1:
             return
-        handle = self._open()
+        handle = self.connection.handle
         command = capi.detect_init(handle)
         self.native.num_detections += count
-        for _ in range(count):  # as in `step`; the last answer is checked
+        for _ in range(count):  # one command buffer, as in `step`
             status = capi.submit(handle, command)
-        self._check(
+        check_status(
             status,
             capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED,
             "detect collisions",
         )
 
-    # ---- asking it ---------------------------------------------------------------
+    # ---- observing the world -----------------------------------------------------
+
+    @property
+    def num_detections(self) -> int:
+        """Number of collision detections so far; every time step has one."""
+        return self.native.num_detections
+
+    def state(self, body: int, *, link_velocities: bool = False) -> BodyState:
+        """The state of a body: base, joints, links, and forces in the joints."""
+        command = capi.state_init(self.connection.handle, body)
+        if link_velocities:
+            capi.state_want_link_velocity(command, 1)
+        return BodyState(
+            self.connection.submit(
+                command, capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED, "report a state"
+            )
+        )
+
+    def contact_points(
+        self, body_a: int | None = None, body_b: int | None = None
+    ) -> list[ContactPoint]:
+        """Contacts of the last time step.
+
+        Args:
+            body_a: Only contacts of this body, which becomes body a of each contact.
+            body_b: Only contacts with this body.
+        """
+        # Bullet could filter, but swaps a and b without swapping the friction forces.
+        handle = self.connection.handle
+        self.connection.submit(
+            capi.contact_init(handle),
+            capi.CMD_CONTACT_POINT_INFORMATION_COMPLETED,
+            "report contacts",
+        )
+        information = capi.ContactInformation()
+        capi.contact_result(handle, byref(information))
+        contacts = []
+        for point in information.points[: information.count]:
+            contact = read_contact(point)
+            if body_a not in (None, contact.body_a):
+                contact = contact.swapped()
+            if body_a in (None, contact.body_a) and body_b in (None, contact.body_b):
+                contacts.append(contact)
+        return contacts
 
     def inverse_kinematics(
         self,
@@ -205,54 +610,46 @@ class PhysicsClient(SceneClient):
     ) -> None:
         """Find joint positions that bring a link to a pose, by damped least squares.
 
-        The default solver, because the others share a static work vector.
+        This is Bullet's default solver. Its other solvers share a static work vector
+        and are not thread-safe.
 
         Args:
-            body: the body.
-            link: whose centre of mass is to be moved.
-            position: (3,), where to, world frame [m].
-            orientation: quaternion xyzw.
-            joint_positions: receives one position per movable joint.
+            body: The body.
+            link: The link whose centre of mass is to reach the pose.
+            position: Target position (3,), world frame [m].
+            orientation: Target orientation, quaternion xyzw.
+            joint_positions: Output, one position per movable joint.
         """
-        command = capi.ik_init(self._open(), body)
-        capi.ik_set_target(command, link, shared(position), doubles(orientation))
+        command = capi.ik_init(self.connection.handle, body)
+        capi.ik_set_target(
+            command, link, shared_doubles(position), doubles(orientation)
+        )
         damping = [self._physics.ik_damping] * len(joint_positions)
         capi.ik_set_iterations(command, self._physics.ik_iterations)
         capi.ik_set_damping(command, len(damping), doubles(damping))
-        status = self._submit(
+        status = self.connection.submit(
             command,
             capi.CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED,
             "solve the inverse kinematics",
         )
-        capi.ik_result(status, byref(c_int()), byref(c_int()), shared(joint_positions))
-
-    def state(self, body: int, *, link_velocities: bool = False) -> BodyState:
-        """The state of a body: its base, joints and links, and the forces in it."""
-        command = capi.state_init(self._open(), body)
-        if link_velocities:
-            capi.state_want_link_velocity(command, 1)
-        return BodyState(
-            self._submit(
-                command, capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED, "report a state"
-            )
+        capi.ik_result(
+            status, byref(c_int()), byref(c_int()), shared_doubles(joint_positions)
         )
 
-    def contact_points(
-        self, body_a: int | None = None, body_b: int | None = None
-    ) -> list[ContactPoint]:
-        """Contacts of the last step, of all bodies or of those given."""
-        # Not filtered by Bullet, which would swap a and b but not the friction.
-        command = capi.contact_init(self._open())
-        self._submit(
-            command, capi.CMD_CONTACT_POINT_INFORMATION_COMPLETED, "report contacts"
-        )
-        found = capi.ContactInformation()
-        capi.contact_result(self._handle, byref(found))
-        points = []
-        for point in found.points[: found.count]:
-            contact = read_contact(point)
-            if body_a not in (None, contact.body_a):
-                contact = contact.swapped()
-            if body_a in (None, contact.body_a) and body_b in (None, contact.body_b):
-                points.append(contact)
-        return points
+    def _run(self, command: int, action: str) -> None:
+        """Submit a command whose answer is only that it was carried out."""
+        self.connection.submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, action)
+
+
+_DYNAMICS_SETTERS = {
+    "mass": capi.dynamics_set_mass,
+    "lateral_friction": capi.dynamics_set_lateral_friction,
+    "spinning_friction": capi.dynamics_set_spinning_friction,
+    "restitution": capi.dynamics_set_restitution,
+    "joint_damping": capi.dynamics_set_joint_damping,
+}
+
+
+def _vector(values: Sequence[float]) -> Vector:
+    x, y, z = map(float, values)
+    return x, y, z

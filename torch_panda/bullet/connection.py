@@ -1,84 +1,114 @@
-"""A client of Bullet: its handle, and the commands that it submits."""
+"""The connection to one client of Bullet: its handle, and checked commands."""
 
 from collections.abc import Sequence
 from ctypes import Array, c_double
 
 import numpy as np
 import numpy.typing as npt
-from typing_extensions import Self
 
 from torch_panda.bullet import capi
 
 
 class BulletError(RuntimeError):
-    """Bullet refused a command, or a simulation was used as it must not be."""
+    """Bullet refused a command, or a simulation was used in a wrong way."""
 
 
 class Connection:
-    """The owner of a client's handle.
+    """Owns a client's handle, submits commands and checks their status codes.
 
-    A client must be used by one thread at a time. Clients of one process are
-    independent: in different threads they work in parallel.
+    One thread at a time may use a client. Clients of one process are independent:
+    different threads may use different clients at the same time.
+
+    Args:
+        handle: Bullet's handle of the client; None or 0 if Bullet could not create it.
 
     Raises:
-        BulletError: Bullet could not create a client.
+        BulletError: Bullet could not create the client.
     """
 
-    def __init__(self) -> None:
-        self._handle: int | None = self._connect()
-        if not self._handle:
+    def __init__(self, handle: int | None) -> None:
+        if not handle:
             raise BulletError("Bullet could not create a client")
-
-    def _connect(self) -> int | None:
-        """Make a world, and return the handle by which Bullet knows the client."""
-        handle: int | None = capi.connect_direct()
-        return handle
+        self._handle: int | None = handle
 
     @property
-    def is_closed(self) -> bool:
-        """Whether the world is gone."""
-        return self._handle is None
+    def handle(self) -> int:
+        """Bullet's handle of the client.
 
-    def close(self) -> None:
-        """Free the world. Closing again does nothing."""
-        if self._handle is not None:
-            capi.disconnect(self._handle)
-            self._handle = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def __reduce__(self) -> "tuple[object, ...]":
-        raise TypeError("a PhysicsClient owns native memory and cannot be pickled")
-
-    def _open(self) -> int:
+        Raises:
+            BulletError: the client is closed.
+        """
         if self._handle is None:
             raise client_closed()
         return self._handle
 
-    def _submit(self, command: int, expected: int, action: str) -> int:
-        status = capi.submit(self._open(), command)
-        self._check(status, expected, action)
-        return status
+    @property
+    def is_closed(self) -> bool:
+        """Whether the client was closed."""
+        return self._handle is None
 
-    def _check(self, status: int | None, expected: int, action: str) -> None:
-        """Raise unless Bullet answered with the expected status code."""
-        code = capi.status_type(status) if status else None
-        if code != expected:
-            raise refusal(action, code, expected)
+    def submit(self, command: int, expected: int, action: str) -> int:
+        """Submit a command, release the GIL while Bullet works, and check the answer.
+
+        Args:
+            command: Handle of the command.
+            expected: Status code of success.
+            action: What the command does, for the error.
+
+        Returns:
+            Handle of the status, valid until the next command.
+
+        Raises:
+            BulletError: the client is closed, or the status code is another one.
+        """
+        status: int = capi.submit(self.handle, command)
+        return check_status(status, expected, action)
+
+    def submit_quick(self, command: int, expected: int, action: str) -> int:
+        """Submit a cheap command: keep the GIL, because releasing it costs more.
+
+        Arguments, result and errors are those of `submit`.
+        """
+        status: int = capi.submit_quick(self.handle, command)
+        return check_status(status, expected, action)
+
+    def close(self) -> None:
+        """Free the client. Closing again does nothing."""
+        if self._handle is not None:
+            capi.disconnect(self._handle)
+            self._handle = None
+
+
+def connect() -> Connection:
+    """Create a client without a window (pybullet's ``DIRECT``).
+
+    Raises:
+        BulletError: Bullet could not create the client.
+    """
+    return Connection(capi.connect_direct())
+
+
+def check_status(status: int | None, expected: int, action: str) -> int:
+    """Return a status if its code is the expected one.
+
+    Raises:
+        BulletError: the code is another one, or Bullet gave no answer.
+    """
+    code = capi.status_type(status) if status else None
+    if code != expected:
+        raise refusal(action, code, expected)
+    assert status is not None
+    return status
 
 
 def refusal(action: str, code: int | None, expected: int) -> BulletError:
-    """The error where Bullet did not answer with the expected status code."""
+    """The error for a command that Bullet did not answer as expected."""
     answer = "gave no answer" if code is None else f"answered with status {code}"
     return BulletError(f"Bullet could not {action}: it {answer}, expected {expected}")
 
 
 def client_closed() -> BulletError:
-    """The error where a client is closed."""
+    """The error for a command to a closed client."""
     return BulletError("the physics client is closed")
 
 
@@ -87,6 +117,6 @@ def doubles(values: Sequence[float]) -> Array[c_double]:
     return (c_double * len(values))(*values)
 
 
-def shared(row: npt.NDArray[np.float64]) -> Array[c_double]:
-    """A C array over the memory of a numpy array, (k,) and contiguous."""
+def shared_doubles(row: npt.NDArray[np.float64]) -> Array[c_double]:
+    """A C array that shares the memory of a contiguous numpy array, (k,)."""
     return (c_double * len(row)).from_buffer(row.data)

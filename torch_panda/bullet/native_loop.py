@@ -17,7 +17,7 @@ from torch_panda.bullet.control import MotorControl
 from torch_panda.bullet.physics import PhysicsParams
 from torch_panda.bullet.pool import WorkerError
 from torch_panda.bullet.scene import Scene
-from torch_panda.bullet.scene_state import SceneState
+from torch_panda.bullet.state import SimulationState
 
 
 class NativeLoop:
@@ -35,7 +35,7 @@ class NativeLoop:
         self,
         clients: Sequence[PhysicsClient],
         scene: Scene,
-        state: SceneState,
+        state: SimulationState,
         *,
         physics: PhysicsParams,
         num_threads: int,

@@ -1,19 +1,19 @@
-"""What a client holds, by body ids."""
+"""Body ids of a scene."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a simulation moves and reads; the same ids in every client.
+    """The bodies that a simulation moves and reads; the same ids in every client.
 
     Attributes:
-        robot: body id of the robot.
-        joints: indices of its movable joints.
-        ee_link: its link whose centre of mass is the end-effector.
-        objects: body ids of the movable objects.
-        object_joints: of each object the indices of its movable joints.
-        markers: body ids of the markers that show where the objects should go.
+        robot: Body id of the robot.
+        joints: Indices of the robot's movable joints.
+        ee_link: Link of the robot whose centre of mass is the end-effector.
+        objects: Body ids of the movable objects.
+        object_joints: Indices of the movable joints of every object.
+        markers: Body ids of the markers that show where the objects should go.
     """
 
     robot: int

@@ -1,57 +1,47 @@
-"""Many copies of one scene, stepped in parallel."""
+"""Many clients of one scene, stepped in parallel."""
 
 import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from torch import Tensor
 
+from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.broad_phase import BroadPhase
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
-from torch_panda.bullet.link_client import Blueprint, LinkClient
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool
 from torch_panda.bullet.scene import Scene
-from torch_panda.bullet.scene_state import SceneState
+from torch_panda.bullet.state import SimulationState
 
 
 class VectorSimulation:
-    """``num_envs`` clients that hold the same scene, and the threads that step them.
-
-    The state of all clients lies in float64 tensors that `step` and `reset`
-    overwrite in place; copy what is to be kept. Positions are of centres of mass, in
-    the world frame.
+    """Steps ``num_envs`` clients of one scene in parallel threads.
 
     Args:
-        build: builds the scene in a client; called once per client, in one thread.
-        num_envs: number of clients.
-        num_threads: number of threads; None means one per core, at most ``num_envs``.
-        physics: how the clients integrate.
-
-    Attributes:
-        joint_position: (num_envs, n_joints) [rad] or [m].
-        joint_velocity: (num_envs, n_joints) [rad/s] or [m/s].
-        ee_position: (num_envs, 3) [m].
-        ee_velocity: (num_envs, 3) [m/s].
-        ee_state: (num_envs, 6), both.
-        ee_orientation: (num_envs, 4), quaternion xyzw.
-        object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
-        object_state: (num_envs, n_objects, 12), position, Euler angles and velocity.
-        object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
-        object_joint_position: (num_envs, n_object_joints) [rad] or [m], of all joints
-            of the first object, then of the next.
-        object_joint_velocity: (num_envs, n_object_joints) [rad/s] or [m/s].
-        object_euler: (num_envs, n_objects, 3), the pose's roll, pitch and yaw [rad] as
-            `step` and `reset` leave it; `reset` does not start from it.
-        marker_pose: (num_envs, n_markers, 7), where `reset` puts the markers.
+        build: Builds the scene in a client. It is called once per client, in one
+            thread, and must build the same scene every time.
+        num_envs: Number of clients.
+        num_threads: Number of threads; None means one per core, at most ``num_envs``.
+        physics: Parameters of the integration.
 
     Raises:
-        BulletError: ``build`` does not build the same in every client.
-        ValueError: the environment variable asks for a loop that there is not.
+        BulletError: ``build`` built another scene in a later client.
+        TypeError: ``build`` did not return a `Scene`.
+        ValueError: the environment variable ``TORCH_PANDA_LOOP`` names a loop that
+            does not exist or that was not compiled.
+
+    Attributes:
+        scene: Body ids of the scene.
+        state: Tensors with the state of all clients. Steps and resets overwrite them:
+            copy what you keep.
+        n_substeps: Substeps per step.
+        ctrl_dt: Length of a step [s].
     """
 
     def __init__(
@@ -69,41 +59,32 @@ class VectorSimulation:
         self.ctrl_dt = physics.ctrl_dt
         self._physics = physics
         self._build = build
-        self._blueprint: Blueprint | None = None
         self._clients: list[PhysicsClient] = []
         self._broad_phases: list[BroadPhase] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
         self._native: NativeLoop | None = None
         try:
-            for _ in range(num_envs):
-                self._clients.append(PhysicsClient(physics=physics))
-                self._broad_phases.append(self._build_in(self._clients[-1]))
+            client = PhysicsClient(physics=physics)
+            self._clients.append(client)
+            self.scene = _build(build, client)
             self._check_joints()
-            self._state = SceneState(self.scene, num_envs)
+            self._blueprint = client.blueprint
+            self._broad_phases.append(BroadPhase(client))
+            for _ in range(1, num_envs):
+                self._clients.append(PhysicsClient(physics=physics))
+                self._broad_phases.append(self._build_again(self._clients[-1]))
+            self.state = SimulationState(self.scene, num_envs)
             if is_native:
                 self._native = NativeLoop(
                     self._clients,
                     self.scene,
-                    self._state,
+                    self.state,
                     physics=physics,
                     num_threads=self.num_threads,
                 )
         except BaseException:
             self.close()
             raise
-        self.joint_position = self._state.joint_position
-        self.joint_velocity = self._state.joint_velocity
-        self.ee_position = self._state.ee_position
-        self.ee_velocity = self._state.ee_velocity
-        self.ee_state = self._state.ee_state
-        self.ee_orientation = self._state.ee_orientation
-        self.object_pose = self._state.object_pose
-        self.object_state = self._state.object_state
-        self.object_velocity = self._state.object_velocity
-        self.object_joint_position = self._state.object_joint_position
-        self.object_joint_velocity = self._state.object_joint_velocity
-        self.object_euler = self._state.object_euler
-        self.marker_pose = self._state.marker_pose
 
     @property
     def num_envs(self) -> int:
@@ -120,29 +101,79 @@ class VectorSimulation:
         """The clients, by environment."""
         return self._clients
 
-    def check_same(self, client: LinkClient, scene: Scene) -> None:
-        """Make sure that another client holds the scene that these hold.
+    @property
+    def blueprint(self) -> Blueprint:
+        """The commands that built the scene, the same in every client."""
+        return self._blueprint
 
-        Raises:
-            BulletError: it does not.
-            TypeError: what built it returned no `Scene`.
-        """
-        if not isinstance(scene, Scene):
-            raise TypeError(f"what builds a scene must return a Scene, got {scene!r}")
-        assert self._blueprint is not None
-        found = (scene, *client.blueprint)
-        for there, here in zip(found, (self.scene, *self._blueprint), strict=False):
-            if there != here:
-                raise BulletError(
-                    f"the scene must be the same in every client, got {there} "
-                    f"after {here}"
-                )
-        if len(client.blueprint) != len(self._blueprint):
-            raise BulletError(
-                f"the scene must be the same in every client, got "
-                f"{len(client.blueprint)} commands that build it after "
-                f"{len(self._blueprint)}"
-            )
+    # ---- the tensors of `state`, which tasks, robots and sensors read ------------
+
+    @property
+    def joint_position(self) -> Tensor:
+        """(num_envs, n_joints) [rad] or [m]."""
+        return self.state.joint_position
+
+    @property
+    def joint_velocity(self) -> Tensor:
+        """(num_envs, n_joints) [rad/s] or [m/s]."""
+        return self.state.joint_velocity
+
+    @property
+    def ee_position(self) -> Tensor:
+        """(num_envs, 3) [m]."""
+        return self.state.ee_position
+
+    @property
+    def ee_velocity(self) -> Tensor:
+        """(num_envs, 3) [m/s]."""
+        return self.state.ee_velocity
+
+    @property
+    def ee_state(self) -> Tensor:
+        """(num_envs, 6), position and velocity of the end-effector."""
+        return self.state.ee_state
+
+    @property
+    def ee_orientation(self) -> Tensor:
+        """(num_envs, 4), quaternion xyzw."""
+        return self.state.ee_orientation
+
+    @property
+    def object_pose(self) -> Tensor:
+        """(num_envs, n_objects, 7), position [m] and quaternion xyzw."""
+        return self.state.object_pose
+
+    @property
+    def object_state(self) -> Tensor:
+        """(num_envs, n_objects, 12), position, Euler angles, velocity."""
+        return self.state.object_state
+
+    @property
+    def object_velocity(self) -> Tensor:
+        """(num_envs, n_objects, 6) [m/s] and [rad/s]."""
+        return self.state.object_velocity
+
+    @property
+    def object_euler(self) -> Tensor:
+        """(num_envs, n_objects, 3) [rad]."""
+        return self.state.object_euler
+
+    @property
+    def object_joint_position(self) -> Tensor:
+        """(num_envs, n_object_joints) [rad] or [m]."""
+        return self.state.object_joint_position
+
+    @property
+    def object_joint_velocity(self) -> Tensor:
+        """(num_envs, n_object_joints) [rad/s] or [m/s]."""
+        return self.state.object_joint_velocity
+
+    @property
+    def marker_pose(self) -> Tensor:
+        """(num_envs, n_markers, 7), position [m] and quaternion xyzw."""
+        return self.state.marker_pose
+
+    # ---- steps and resets --------------------------------------------------------
 
     def step(
         self, control: Control, setpoint: Doubles, envs: Sequence[int] | None = None
@@ -180,7 +211,7 @@ class VectorSimulation:
                 )
             else:
                 client.step(self.n_substeps)
-            self._state.read(env, client)
+            self.state.read(env, client)
 
         self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
         return self.diverged()
@@ -221,20 +252,20 @@ class VectorSimulation:
                 return
             client = self._clients[env]
             self._broad_phases[env].restore()
-            self._state.place(env, client)
-            self._state.read(env, client)
+            self.state.place(env, client)
+            self.state.read(env, client)
 
         self._pool.run(reset_one, envs)
 
     def diverged(self) -> list[int]:
         """The clients whose state, as it was last read, is not finite."""
-        return self._state.diverged()
+        return self.state.diverged()
 
     def rebuild(self, env: int) -> None:
         """Replace a client by a new one: no reset cures Bullet of a NaN."""
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
-        self._broad_phases[env] = self._build_in(client)
+        self._broad_phases[env] = self._build_again(client)
         if self._native is not None:
             self._native.replace(env, client)
 
@@ -246,13 +277,25 @@ class VectorSimulation:
         for client in self._clients:
             client.close()
 
-    def _build_in(self, client: PhysicsClient) -> BroadPhase:
-        """Build the scene in a client; return the way back to it."""
-        scene = self._build(client)
-        if self._blueprint is None:
-            self.scene, self._blueprint = scene, client.blueprint
-        self.check_same(client, scene)
-        client.finish_building()
+    def _build_again(self, client: PhysicsClient) -> BroadPhase:
+        """Build the scene in another client.
+
+        Raises:
+            BulletError: it is not the same scene.
+        """
+        scene = _build(self._build, client)
+        first, other = (self.scene, *self._blueprint), (scene, *client.blueprint)
+        for expected, actual in zip(first, other, strict=False):
+            if actual != expected:
+                raise BulletError(
+                    f"the scene must be the same in every client, got {actual} after "
+                    f"{expected}: draw random numbers in resets, not in build"
+                )
+        if len(other) != len(first):
+            raise BulletError(
+                f"the scene must be the same in every client, got {len(other) - 1} "
+                f"commands that build it after {len(first) - 1}"
+            )
         return BroadPhase(client)
 
     def _check_joints(self) -> None:
@@ -264,3 +307,14 @@ class VectorSimulation:
                 f"a scene must name the robot's {found} joints of one degree of "
                 f"freedom, got {len(scene.joints)}"
             )
+
+
+def _build(build: Callable[[PhysicsClient], Scene], client: PhysicsClient) -> Scene:
+    """Build a scene in a new client."""
+    scene = build(client)
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"a function that builds a scene must return a Scene, got {scene!r}"
+        )
+    client.finish_building()
+    return scene

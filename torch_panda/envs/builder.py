@@ -9,7 +9,7 @@ from torch_panda.tasks import Bodies, Task
 
 
 class RobotTaskBuilder:
-    """Builds the same scene in any client; see `rendering.SceneBuilder`.
+    """Builds the same scene in any client.
 
     It holds descriptions only. If it held the simulation, which holds the builder, the
     cycle of references would keep a forgotten environment alive.
@@ -51,10 +51,6 @@ class RobotTaskBuilder:
             object_joints=tuple(_movable_joints(client, k) for k in objects),
             markers=tuple(bodies.markers),
         )
-
-    def build_markers(self, client: PhysicsClient) -> tuple[int, ...]:
-        """Build the task alone and return the body ids of its markers."""
-        return tuple(self._build_task(client).markers)
 
     def _build_task(self, client: PhysicsClient) -> Bodies:
         bodies = self._task.build(client)

@@ -51,7 +51,6 @@ class Episodes:
 
     Attributes:
         simulation: The Bullet clients and their state.
-        build_scene: Builds the scene in a client.
         renderer: Draws the environments.
         seeds: Seeds of the episodes.
         entries: Observed entries beside ``observation`` and the goals, by key.
@@ -101,14 +100,14 @@ class Episodes:
         # Environments that need a reset: new ones, and those whose last reset failed.
         self._needs_reset = set(range(n))
         sensors = read_sensors(sensors, robot)
-        self.build_scene = RobotTaskBuilder(robot, task, sensors)
         self.simulation = VectorSimulation(
-            self.build_scene, n, num_threads=num_threads, physics=self.physics
+            RobotTaskBuilder(robot, task, sensors),
+            n,
+            num_threads=num_threads,
+            physics=self.physics,
         )
         try:
-            self.renderer = VectorRenderer(
-                self.simulation, self.build_scene, renderer=renderer
-            )
+            self.renderer = VectorRenderer(self.simulation, renderer=renderer)
             randomizer = DomainRandomizer(
                 randomize, robot, task, self.simulation, self.physics
             )

@@ -336,7 +336,7 @@ class RobotTaskEnv(EnvBase):
         ``object``, or ``object1`` and ``object2``, unless the visuals of the task name
         their bodies.
         """
-        return segmentation_ids(self.episodes.build_scene)
+        return segmentation_ids(self.episodes.simulation)
 
     def render(
         self,
@@ -387,7 +387,7 @@ class RobotTaskEnv(EnvBase):
         """
         episodes = self.episodes
         with episodes.exclusive():
-            return Window(episodes.simulation, episodes.build_scene, camera or Camera())
+            return Window(episodes.simulation, camera or Camera())
 
     def open_viewer(
         self,

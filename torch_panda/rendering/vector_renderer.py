@@ -9,22 +9,21 @@ from torch import Tensor
 from torch_panda.bullet import VectorSimulation, WorkerPool
 from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.egl import RendererName
+from torch_panda.rendering.env_renderer import EnvRenderer
 from torch_panda.rendering.frames import Frames
-from torch_panda.rendering.scene_renderer import SceneBuilder, SceneRenderer
 
 # Meshes finer than this are drawn as they are [m].
 _FINEST_CELL = 0.004
 
 
 class VectorRenderer:
-    """Draws the environments of a simulation, each thread with a `SceneRenderer`.
+    """Draws the environments of a simulation, each thread with a `EnvRenderer`.
 
     Nothing is built before something is drawn. In small pictures the robot's meshes
     are merged to cells of half a pixel (see `mesh_cell`).
 
     Args:
         simulation: what is drawn, by its own threads.
-        build_scene: builds the scene of the simulation.
         renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, in
             one thread of its own, because a context of OpenGL belongs to a thread.
     """
@@ -32,21 +31,19 @@ class VectorRenderer:
     def __init__(
         self,
         simulation: VectorSimulation,
-        build_scene: SceneBuilder,
         *,
         renderer: RendererName = "tiny",
     ) -> None:
         self._simulation = simulation
-        self._build_scene = build_scene
         self._renderer: RendererName = renderer
         # Idle ones by mesh cell; lists are popped and appended to under the GIL.
-        self._scenes: dict[float, list[SceneRenderer]] = {}
+        self._idle: dict[float, list[EnvRenderer]] = {}
         self._gl_thread = WorkerPool(1) if renderer == "egl" else None
 
     def draw(
         self, envs: Sequence[int], camera: Camera, frames: Frames, rows: Sequence[int]
     ) -> None:
-        """Draw environments into rows of ``frames``; see `SceneRenderer.draw`.
+        """Draw environments into rows of ``frames``; see `EnvRenderer.draw`.
 
         Raises:
             WorkerError: Bullet failed in one picture.
@@ -55,15 +52,15 @@ class VectorRenderer:
         run = self._simulation.run if self._gl_thread is None else self._gl_thread.run
         cell = mesh_cell(camera) if self._gl_thread is None else 0.0
         threads = self._simulation.num_threads if self._gl_thread is None else 1
-        scenes = self._provide(cell, min(threads, len(jobs)))
+        renderers = self._provide(cell, min(threads, len(jobs)))
 
         def work(job: int) -> None:
             env, row = jobs[job]
-            scene = scenes.pop()
+            renderer = renderers.pop()
             try:
-                scene.draw(env, camera, frames, row)
+                renderer.draw(env, camera, frames, row)
             finally:
-                scenes.append(scene)
+                renderers.append(renderer)
 
         run(work, range(len(jobs)))
 
@@ -75,36 +72,35 @@ class VectorRenderer:
 
     def close(self) -> None:
         """Free all that was built. Closing again does nothing."""
-        scenes = [scene for idle in self._scenes.values() for scene in idle]
-        self._scenes = {}
+        renderers = [renderer for idle in self._idle.values() for renderer in idle]
+        self._idle = {}
         if self._gl_thread is None:
-            for scene in scenes:
-                scene.close()
+            for renderer in renderers:
+                renderer.close()
         elif not sys.is_finalizing():  # when Python ends, its threads already have
-            self._gl_thread.run(lambda k: scenes[k].close(), range(len(scenes)))
+            self._gl_thread.run(lambda k: renderers[k].close(), range(len(renderers)))
             self._gl_thread.close()
 
-    def _provide(self, cell: float, count: int) -> list[SceneRenderer]:
+    def _provide(self, cell: float, count: int) -> list[EnvRenderer]:
         """At least so many, made one by one: Bullet's importer is not for threads."""
-        scenes = self._scenes.setdefault(cell, [])
+        renderers = self._idle.setdefault(cell, [])
 
         def make(_: int) -> None:
-            scenes.append(
-                SceneRenderer(
+            renderers.append(
+                EnvRenderer(
                     self._simulation,
-                    self._build_scene,
                     renderer=self._renderer,
                     mesh_cell=cell,
                 )
             )
 
-        missing = range(len(scenes), count)
+        missing = range(len(renderers), count)
         if self._gl_thread is None:
             for index in missing:
                 make(index)
         else:
             self._gl_thread.run(make, missing)
-        return scenes
+        return renderers
 
 
 def mesh_cell(camera: Camera) -> float:

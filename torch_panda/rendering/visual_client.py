@@ -1,16 +1,21 @@
-"""A client that holds the visuals of bodies, and draws them."""
+"""A client of Bullet that holds the visual shapes of a scene, and draws them."""
 
+import dataclasses
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
+from typing_extensions import Self
 
-from torch_panda.bullet import PhysicsClient, capi
-from torch_panda.bullet.connection import BulletError, doubles
+from torch_panda.bullet import Blueprint, Scene, SimulationState, building, capi
+from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase, SetJoints
+from torch_panda.bullet.connection import BulletError, Connection, connect, doubles
 from torch_panda.bullet.library import library_path
-from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Shape, Sphere, Visual
+from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Sphere
 from torch_panda.rendering.camera import Camera, HandCamera
 from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.mesh_decimation import decimated_urdf
@@ -22,14 +27,14 @@ _NOT_SHINY = doubles((0.0, 0.0, 0.0))
 
 
 class Image(NamedTuple):
-    """What a camera sees, valid until the client's next command.
+    """A camera's image, valid until the client's next command.
 
     Attributes:
         rgb: (height, width, 3) uint8.
         depth: (height, width) float32, from 0 at ``near`` to 1 at ``far``, not linear;
             see `camera.to_metres`.
-        segmentation: (height, width) int32, the body id of what is seen, -1 where
-            nothing is; None if it was not asked for.
+        segmentation: (height, width) int32, body id of every pixel, -1 for the
+            background; None if it was not requested.
     """
 
     rgb: npt.NDArray[np.uint8]
@@ -37,41 +42,84 @@ class Image(NamedTuple):
     segmentation: npt.NDArray[np.int32] | None
 
 
-class VisualClient(PhysicsClient):
-    """A client that draws; it is built as a `PhysicsClient` and not stepped.
+class VisualClient:
+    """A client that holds the visual shapes of a scene. It draws and is never stepped.
 
-    Bullet's software renderer knows no translucency. So what is opaque and what is
-    translucent are two layers, in a client each, for the caller to blend.
+    Bullet's software renderer has no translucency. Opaque bodies and translucent
+    markers are therefore two layers, each in a client of its own, which the caller
+    blends. In every layer, bodies have the ids that they have in physics clients.
 
     Args:
-        layer: what is seen: "solids", the "markers" only, or "all", for a renderer
-            that draws markers translucent itself.
-        renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, whose
-            client must be made, used and closed by one thread.
-        mesh_cell: merge the vertices of robots' meshes in cubes of this edge length
-            [m]; see `decimated_urdf`. 0 leaves them as they are.
-
-    Attributes:
-        visuals: how bodies are drawn, by body id.
+        blueprint: Commands that built the scene in a physics client.
+        layer: Bodies to draw: "solids", "markers", or "all" for a renderer that draws
+            markers translucent itself.
+        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer,
+            whose client must be made, used and closed by one thread.
+        mesh_cell: Merge the vertices of meshes in cubes of this edge length [m]; see
+            `decimated_urdf`. 0 draws all details.
+        connection: Connection to a client with a window; None makes one without.
     """
 
     def __init__(
         self,
+        blueprint: Blueprint,
         layer: Layer = "solids",
         *,
         renderer: RendererName = "tiny",
         mesh_cell: float = 0.0,
+        connection: Connection | None = None,
     ) -> None:
-        super().__init__()
-        # The shadows of the first two pictures of Bullet's OpenGL renderer are wrong.
-        self._warm_up = 2 if renderer == "egl" else 0
-        if renderer == "egl":
-            self._load_egl()
+        self._connection = connect() if connection is None else connection
         self._layer = layer
         self._mesh_cell = mesh_cell
-        if layer != "markers":
-            self._urdf_flags = 0
-        self.visuals: dict[int, Visual] = {}
+        # The shadows of the first two pictures of Bullet's OpenGL renderer are wrong.
+        self._warm_up = 2 if renderer == "egl" else 0
+        try:
+            if renderer == "egl":
+                self._load_egl()
+            self._build(blueprint)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the client was closed."""
+        return self._connection.is_closed
+
+    def close(self) -> None:
+        """Free the client. Closing again does nothing."""
+        self._connection.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def pose(self, scene: Scene, state: SimulationState, env: int) -> None:
+        """Move robot, objects and markers to their poses in an environment."""
+        if self._layer != "markers":
+            positions = state.joint_position[env].tolist()
+            self._set_joints(scene.robot, scene.joints, positions)
+            self._pose_bodies(scene.objects, state.object_pose[env])
+            positions, first = state.object_joint_position[env].tolist(), 0
+            for body, joints in zip(scene.objects, scene.object_joints, strict=True):
+                last = first + len(joints)
+                if joints:
+                    self._set_joints(body, joints, positions[first:last])
+                first = last
+        self._pose_bodies(scene.markers, state.marker_pose[env])
+
+    def _pose_bodies(self, bodies: Sequence[int], poses: Tensor) -> None:
+        for body, pose in zip(bodies, poses.tolist(), strict=True):
+            building.set_base(self._connection, body, pose[:3], pose[3:])
+
+    def _set_joints(
+        self, body: int, joints: Sequence[int], positions: Sequence[float]
+    ) -> None:
+        at_rest = (0.0,) * len(joints)
+        building.set_joints(self._connection, body, joints, positions, at_rest)
 
     def draw(
         self,
@@ -109,15 +157,15 @@ class VisualClient(PhysicsClient):
         while self._warm_up:
             self._warm_up -= 1
             self.draw(camera, hand, shadow=shadow)
-        command = capi.camera_init(self._open())
+        command = capi.camera_init(self._connection.handle)
         capi.camera_set_matrices(command, view, projection)
         capi.camera_set_size(command, camera.width, camera.height)
         capi.camera_set_shadow(command, int(shadow))
         flags = 0 if segmentation else capi.ER_NO_SEGMENTATION_MASK
         capi.camera_set_flags(command, flags)
-        self._submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
+        self._connection.submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
         data = capi.CameraImage()
-        capi.camera_result(self._handle, byref(data))
+        capi.camera_result(self._connection.handle, byref(data))
         size = (camera.height, camera.width)
         return Image(
             np.ctypeslib.as_array(data.rgba, shape=(*size, 4))[..., :3],
@@ -128,59 +176,56 @@ class VisualClient(PhysicsClient):
         )
 
     def _load_egl(self) -> None:
-        command = capi.plugin_init(self._open())
+        command = capi.plugin_init(self._connection.handle)
         capi.plugin_set_path(command, library_path("eglRenderer").encode())
         capi.plugin_set_suffix(command, b"_eglRendererPlugin")
-        status = self._submit(
+        status = self._connection.submit(
             command, capi.CMD_CUSTOM_COMMAND_COMPLETED, "load its EGL renderer"
         )
         if capi.status_plugin(status) < 0:
             raise BulletError("Bullet could not load its EGL renderer")
 
-    # ---- visuals -----------------------------------------------------------------
+    # ---- building ----------------------------------------------------------------
 
-    def _drawn_urdf(self, file: str) -> str:
-        if self._mesh_cell > 0 and self._layer == "solids":
-            return str(decimated_urdf(file, self._mesh_cell))
-        return file
+    def _build(self, blueprint: Blueprint) -> None:
+        connection = self._connection
+        for command in blueprint:
+            match command:
+                case LoadURDF():
+                    self._load_urdf(command)
+                case CreateBody():
+                    self._create_body(command)
+                case SetBase(body, position, orientation):
+                    building.set_base(connection, body, position, orientation)
+                case SetJoints(body, joints, positions) if self._layer != "markers":
+                    self._set_joints(body, joints, positions)
 
-    def _create_body(
-        self,
-        shape: Shape | None,
-        mass: float,
-        position: Sequence[float],
-        visual: Visual,
-        *,
-        is_marker: bool = False,
-    ) -> int:
-        body = super()._create_body(shape, mass, position, visual, is_marker=is_marker)
-        self.visuals[body] = visual
-        if visual.texture is not None and self._draws(is_marker):
-            path = str(visual.texture).encode()
-            command = capi.texture_init(self._open(), path)
-            status = self._submit(
-                command, capi.CMD_LOAD_TEXTURE_COMPLETED, f"load {visual.texture}"
-            )
-            texture = capi.status_texture(status)
-            command = capi.visual_update_init(self._open(), body, -1, -1)
-            capi.visual_update_texture(command, texture)
-            self._submit(
-                command, capi.CMD_VISUAL_SHAPE_UPDATE_COMPLETED, "set a texture"
-            )
-        return body
+    def _load_urdf(self, urdf: LoadURDF) -> None:
+        if self._layer == "markers":  # an invisible body takes its id
+            building.create_body(self._connection, urdf.position)
+            return
+        if self._mesh_cell > 0:
+            file = str(decimated_urdf(urdf.file, self._mesh_cell))
+            urdf = dataclasses.replace(urdf, file=file)
+        building.load_urdf(self._connection, urdf, flags=0)
 
-    def _create_collision_shape(self, shape: Shape) -> int:
-        # Bullet draws the collision shape of a body that has no visual shape.
-        return -1
+    def _create_body(self, body: CreateBody) -> None:
+        is_drawn = body.shape is not None and (
+            self._layer == "all" or body.is_marker == (self._layer == "markers")
+        )
+        # A collision shape would be drawn where there is no visual shape.
+        body_id = building.create_body(
+            self._connection,
+            body.position,
+            visual_shape=self._create_shape(body) if is_drawn else building.NO_SHAPE,
+        )
+        if is_drawn and body.visual.texture is not None:
+            self._set_texture(body_id, body.visual.texture)
 
-    def _create_visual_shape(
-        self, shape: Shape, visual: Visual, *, is_marker: bool
-    ) -> int:
-        if not self._draws(is_marker):
-            return -1
-        handle = self._open()
+    def _create_shape(self, body: CreateBody) -> int:
+        handle, visual = self._connection.handle, body.visual
         command = capi.visual_init(handle)
-        match shape:
+        match body.shape:
             case Box(half_extents) if visual.texture is not None:
                 add_textured_box(handle, command, half_extents)
             case Box(half_extents):
@@ -190,16 +235,28 @@ class VisualClient(PhysicsClient):
             case Sphere(radius):
                 capi.visual_add_sphere(command, radius)
         color = visual.color if visual.texture is None else WHITE
-        opacity = visual.opacity if is_marker and self._layer == "all" else 1.0
+        is_translucent = body.is_marker and self._layer == "all"
+        opacity = visual.opacity if is_translucent else 1.0
         capi.visual_set_color(command, 0, doubles((*color, opacity)))
         capi.visual_set_specular(command, 0, _NOT_SHINY)
-        status = self._submit(
+        status = self._connection.submit(
             command, capi.CMD_CREATE_VISUAL_SHAPE_COMPLETED, "create a visual shape"
         )
-        return capi.status_visual(status)
+        return int(capi.status_visual(status))
 
-    def _draws(self, is_marker: bool) -> bool:
-        return self._layer == "all" or is_marker == (self._layer == "markers")
+    def _set_texture(self, body: int, path: Path) -> None:
+        handle = self._connection.handle
+        status = self._connection.submit(
+            capi.texture_init(handle, str(path).encode()),
+            capi.CMD_LOAD_TEXTURE_COMPLETED,
+            f"load {path}",
+        )
+        texture = capi.status_texture(status)
+        command = capi.visual_update_init(handle, body, -1, -1)
+        capi.visual_update_texture(command, texture)
+        self._connection.submit(
+            command, capi.CMD_VISUAL_SHAPE_UPDATE_COMPLETED, "set a texture"
+        )
 
 
 def add_textured_box(

@@ -15,7 +15,7 @@ from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rendering.camera import Camera
-from torch_panda.rendering.web_scene import WebScene
+from torch_panda.rendering.web_bodies import WebBodies
 
 POSITION = 3  # numbers of an object's part of a goal
 ARROW_LENGTH = 0.005  # of a contact's force [m/N]
@@ -23,7 +23,7 @@ LONGEST_ARROW = 0.12  # [m]
 
 
 class Frame(NamedTuple):
-    """An environment at one step; see `WebScene.show`."""
+    """An environment at one step; see `WebBodies.show`."""
 
     joint_position: npt.NDArray[np.float64]
     object_pose: npt.NDArray[np.float64]
@@ -72,7 +72,7 @@ class WebViewer:
         )
         server.initial_camera.look_at = camera.target
         server.initial_camera.position = eye(camera)
-        self._scene = WebScene(server, simulation.clients[0], simulation.scene)
+        self._bodies = WebBodies(server, simulation.clients[0], simulation.scene)
         gui = server.gui
         self._status = gui.add_markdown("waiting for the first step")
         self._note = gui.add_markdown("")
@@ -179,7 +179,7 @@ class WebViewer:
             self._status.content = f"**{self._title}**{number}\n\n{frame.status}"
             forces = frame.forces if self._contacts.value else frame.forces[:0]
             with self._server.atomic():
-                self._scene.show(*frame[:3], arrows(forces))
+                self._bodies.show(*frame[:3], arrows(forces))
 
 
 def read_forces(

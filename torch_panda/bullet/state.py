@@ -1,4 +1,4 @@
-"""The state of many copies of one scene, in tensors."""
+"""The state of all clients of a simulation, in tensors."""
 
 import numpy as np
 import torch
@@ -9,34 +9,57 @@ from torch_panda.bullet.scene import Scene
 from torch_panda.checks import all_finite
 
 
-class SceneState:
-    """What `VectorSimulation` knows of its clients, and the way from and to a client.
+class SimulationState:
+    """Tensors with the state of every client, which steps and resets overwrite.
+
+    All tensors are float64, on the CPU and in the world frame. Positions are those of
+    centres of mass.
 
     Args:
-        scene: what the clients hold.
-        num_envs: number of clients.
-
-    The tensors are attributes of the same names as there.
+        scene: Body ids of the scene, the same in every client.
+        num_envs: Number of clients.
 
     Attributes:
-        rows: (num_envs, k) float64 and contiguous. All but ``marker_pose`` are parts of
+        joint_position: (num_envs, n_joints) [rad] or [m].
+        joint_velocity: (num_envs, n_joints) [rad/s] or [m/s].
+        ee_position: (num_envs, 3) [m].
+        ee_velocity: (num_envs, 3) [m/s].
+        ee_state: (num_envs, 6), position and velocity.
+        ee_orientation: (num_envs, 4), quaternion xyzw.
+        object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
+        object_state: (num_envs, n_objects, 12), position [m], Euler angles [rad] and
+            velocity.
+        object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
+        object_euler: (num_envs, n_objects, 3), roll, pitch and yaw [rad]. Steps and
+            resets compute them from the quaternion; a reset does not read them.
+        object_joint_position: (num_envs, n_object_joints) [rad] or [m], all joints of
+            the first object, then all joints of the next.
+        object_joint_velocity: (num_envs, n_object_joints) [rad/s] or [m/s].
+        marker_pose: (num_envs, n_markers, 7), to which a reset moves the markers.
+        rows: (num_envs, k), contiguous. All tensors but ``marker_pose`` are views of
             it, in the order of ``client_row`` in ``client.c``.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
         n_joints, n_objects = len(scene.joints), len(scene.objects)
         self._scene = scene
-        # Objects that have joints: their ids, joints, and where in the tensors.
+        # Objects with joints: body id, joint indices, and columns in the tensors.
         self._jointed_objects: list[tuple[int, tuple[int, ...], slice]] = []
-        n_more = 0
+        n_object_joints = 0
         for body, joints in zip(scene.objects, scene.object_joints, strict=True):
             if joints:
-                own = slice(n_more, n_more + len(joints))
-                self._jointed_objects.append((body, joints, own))
-                n_more += len(joints)
+                columns = slice(n_object_joints, n_object_joints + len(joints))
+                self._jointed_objects.append((body, joints, columns))
+                n_object_joints += len(joints)
         arm = (n_joints, n_joints, 3, 3, 4)
-        sizes = (*arm, 7 * n_objects, n_more, n_more, 12 * n_objects)
-        # In one tensor, which one check finds finite or not.
+        sizes = (
+            *arm,
+            7 * n_objects,
+            n_object_joints,
+            n_object_joints,
+            12 * n_objects,
+        )
+        # One tensor, so that one operation checks whether all numbers are finite.
         self.rows = torch.zeros(num_envs, sum(sizes), dtype=torch.float64, device="cpu")
         (
             self.joint_position,
@@ -57,22 +80,23 @@ class SceneState:
         self.marker_pose = torch.zeros(
             num_envs, len(scene.markers), 7, dtype=torch.float64, device="cpu"
         )
-        # The same memory, part by part, for `read`: rows of tensors take longer.
+        # The same memory as numpy arrays for `read`: indexing tensors takes longer.
         ends = np.cumsum(sizes)[:-1]
         self._parts = [np.split(row, ends) for row in self.rows.numpy()]
 
     def diverged(self) -> list[int]:
-        """The clients whose state is not finite."""
+        """Indices of the clients whose state is not finite."""
         if all_finite(self.rows):
             return []
         return (~self.rows.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
     def place(self, env: int, client: PhysicsClient) -> None:
-        """Put robot, markers and objects of a client where the tensors say."""
+        """Move robot, markers and objects of a client to the state in the tensors."""
         scene = self._scene
         positions = self.joint_position[env].tolist()
         velocities = self.joint_velocity[env].tolist()
-        # One by one and in panda-gym's order: Bullet's broad phase remembers the way.
+        # One by one and in panda-gym's order, because the state of Bullet's broad phase
+        # depends on the order.
         for joint, position, velocity in zip(
             scene.joints, positions, velocities, strict=True
         ):
@@ -86,8 +110,8 @@ class SceneState:
             client.set_base(body, pose[:3], pose[3:], velocity[:3], velocity[3:])
         positions = self.object_joint_position[env].tolist()
         velocities = self.object_joint_velocity[env].tolist()
-        for body, joints, own in self._jointed_objects:
-            client.set_joints(body, joints, positions[own], velocities[own])
+        for body, joints, columns in self._jointed_objects:
+            client.set_joints(body, joints, positions[columns], velocities[columns])
 
     def read(self, env: int, client: PhysicsClient) -> None:
         """Copy the state of a client into the tensors."""
@@ -109,7 +133,7 @@ class SceneState:
             angles = euler_angles(*pose[3:].tolist())
             observed = (*pose[:3], *angles, *state.base_velocity)
             states[12 * k : 12 * k + 12] = observed
-        for body, _, own in self._jointed_objects:
+        for body, _, columns in self._jointed_objects:
             state = client.state(body)
-            object_joints[own] = state.joint_positions
-            object_speeds[own] = state.joint_velocities
+            object_joints[columns] = state.joint_positions
+            object_speeds[columns] = state.joint_velocities

@@ -11,19 +11,19 @@ import viser
 from PIL import Image
 from viser.transforms import SO3
 
-from torch_panda.bullet import Box, Cylinder, PhysicsClient, Scene, Sphere, Visual
-from torch_panda.bullet.shapes import LIGHT_GREY, Shape
+from torch_panda.bullet import Box, Cylinder, PhysicsClient, Scene, Sphere
+from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase
+from torch_panda.bullet.shapes import LIGHT_GREY
 from torch_panda.rendering.mesh_decimation import decimated_urdf
 
 MESH_CELL = 0.003  # how coarse meshes are [m]
-MAKES_A_BODY = ("load_urdf", "create_body", "create_marker")  # in the order of ids
 YELLOW = (255, 190, 0)
 
 Floats = npt.NDArray[np.float64]
-Joint = tuple[Any, Floats, SO3, Floats, bool]  # see WebScene._add_urdf
+Joint = tuple[Any, Floats, SO3, Floats, bool]  # see WebBodies._add_urdf
 
 
-class WebScene:
+class WebBodies:
     """The bodies of a client, drawn by a viser server.
 
     Args:
@@ -39,25 +39,27 @@ class WebScene:
         self._tree.set_up_direction("+z")
         self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
-        build = [x for x in client.blueprint if x[0] in MAKES_A_BODY]
-        arguments: Any  # of the commands that built the scene
-        for body, (kind, *arguments) in enumerate(build):
-            name = f"/body{body}"
-            if kind == "load_urdf":
-                urdf, pose, _ = arguments
-                self._nodes[body] = self._tree.add_frame(name, show_axes=False)
-                _place(self._nodes[body], np.array(pose))
-                movable = [x.name for x in client.joints(body) if x.is_movable]
-                handles = self._add_urdf(name, urdf, movable)
-                if body == scene.robot:
-                    self._joints = [handles[joint] for joint in movable]
-            else:
-                shape, _, position, visual = arguments
-                is_marker = kind == "create_marker"
-                node = self._add_shape(name, shape, visual, is_marker=is_marker)
-                if node is not None:
+        bodies = iter(client.bodies)
+        for command in client.blueprint:
+            match command:
+                case LoadURDF():
+                    body = next(bodies)
+                    name = f"/body{body}"
+                    node = self._tree.add_frame(name, show_axes=False)
+                    _place(node, np.array((*command.position, *command.orientation)))
                     self._nodes[body] = node
-                    node.position = position
+                    movable = [x.name for x in client.joints(body) if x.is_movable]
+                    handles = self._add_urdf(name, command.file, movable)
+                    if body == scene.robot:
+                        self._joints = [handles[joint] for joint in movable]
+                case CreateBody():
+                    body = next(bodies)
+                    node = self._add_shape(f"/body{body}", command)
+                    if node is not None:
+                        node.position = command.position
+                        self._nodes[body] = node
+                case SetBase(body, position, orientation) if body in self._nodes:
+                    _place(self._nodes[body], np.array((*position, *orientation)))
         self._objects = [self._nodes.get(body) for body in scene.objects]
         self._markers = [self._nodes.get(body) for body in scene.markers]
 
@@ -165,17 +167,16 @@ class WebScene:
                         )
         return handles
 
-    def _add_shape(
-        self, name: str, shape: Shape | None, visual: Visual, *, is_marker: bool
-    ) -> Any:  # noqa: ANN401 (viser's handles)
-        """Add a body of one shape; None: it has none."""
-        if isinstance(shape, Box) and visual.texture is not None and not is_marker:
+    def _add_shape(self, name: str, body: CreateBody) -> Any:  # noqa: ANN401 (viser's)
+        """Add a body of one shape and return its node; None if it has no shape."""
+        visual, shape = body.visual, body.shape
+        if isinstance(shape, Box) and visual.texture is not None and not body.is_marker:
             return self._tree.add_mesh_trimesh(
                 name, textured_box(shape, visual.texture)
             )
         look: dict[str, Any] = {
             "color": visual.color if visual.texture is None else LIGHT_GREY,
-            "opacity": visual.opacity if is_marker else None,
+            "opacity": visual.opacity if body.is_marker else None,
         }
         match shape:
             case Box(half_extents):

@@ -1,0 +1,83 @@
+"""The blueprint of a scene: the commands that built it, as data.
+
+Two clients hold the same scene if their blueprints are equal. Renderers build their own
+copy of a scene from its blueprint.
+"""
+
+from dataclasses import dataclass
+
+from torch_panda.bullet.shapes import Shape, Visual
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class LoadURDF:
+    """Loads a URDF. The new body gets the next id.
+
+    Attributes:
+        file: Path of the file, with the tool if one was added.
+        position: Position of the base, world frame [m].
+        orientation: Orientation of the base, quaternion xyzw.
+        fixed_base: Whether the base cannot move.
+    """
+
+    file: str
+    position: Vector
+    orientation: Quaternion
+    fixed_base: bool
+
+
+@dataclass(frozen=True)
+class CreateBody:
+    """Creates a body of one shape. The new body gets the next id.
+
+    Attributes:
+        shape: Shape of the body; None for a marker that nothing shows.
+        mass: Mass [kg]; 0 for a body that never moves.
+        position: Position of its centre, world frame [m].
+        visual: How the body is drawn.
+        is_marker: Whether the body is a marker, which touches nothing.
+    """
+
+    shape: Shape | None
+    mass: float
+    position: Vector
+    visual: Visual
+    is_marker: bool
+
+
+@dataclass(frozen=True)
+class SetBase:
+    """Moves a body: position [m] and quaternion xyzw, world frame."""
+
+    body: int
+    position: Vector
+    orientation: Quaternion
+
+
+@dataclass(frozen=True)
+class SetJoints:
+    """Moves joints of a body to positions [rad] or [m]."""
+
+    body: int
+    joints: tuple[int, ...]
+    positions: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class SetPhysics:
+    """Changes physical numbers of a link or joint, which no renderer shows.
+
+    Attributes:
+        method: Method of `PhysicsClient` that was called.
+        arguments: Its arguments.
+    """
+
+    method: str
+    arguments: tuple[float | None, ...]
+
+
+Command = LoadURDF | CreateBody | SetBase | SetJoints | SetPhysics
+Blueprint = tuple[Command, ...]
