@@ -72,7 +72,7 @@ class Changing(Push):
     def build(self, client):
         self.count += 1
         create_table(client)
-        size = 0.02 + (0.001 * self.count if self.change == "size" else 0.0)
+        size = 0.02 + (0.03 * self.count if self.change == "size" else 0.0)
         height = 0.02 + (0.001 * self.count if self.change == "place" else 0.0)
         cube = client.create_box((size,) * 3, mass=1.0, position=(0, 0, height))
         if self.change == "friction":
@@ -93,11 +93,11 @@ def test_pictures_show_the_scene_of_the_simulation():
     task = Changing("size")
     with make(task, seed=0) as env:
         env.reset()
-        first = env.render(size=24)
+        first = env.render(size=48)
         assert task.count == 1
     with make(task, seed=0) as env:  # a larger cube
         env.reset()
-        assert (env.render(size=24) != first).any()
+        assert (env.render(size=48) != first).any()
         assert task.count == 2
 
 
