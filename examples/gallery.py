@@ -16,11 +16,11 @@ from PIL import Image, ImageDraw
 from tensordict.nn import TensorDictModuleBase
 
 import torch_panda
-from experts import make_expert
-from limits import Limit, Positive, Seed, check_limits
-from training.files import prepare
-from training.policies import load_policy, read_checkpoint
-from video import FPS, play, tile
+from torch_panda.experts import make_expert
+from torch_panda.learning.files import prepare
+from torch_panda.learning.limits import Limit, Positive, Seed, check_limits
+from torch_panda.learning.policy_files import load_policy, read_checkpoint
+from torch_panda.learning.video import FPS, play, tile
 
 TASKS = (
     *("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip"),

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import CEMPlanner
 
 import torch_panda
-from limits import Limit, Positive, Seed, check_limits
+from torch_panda.learning.limits import Limit, Positive, Seed, check_limits
 
 ACTION_SCALE = 0.02  # [m] by which an action of 1 moves the hand, to try out
 BEHIND = 0.04  # [m] from its middle, where the hand pushes a cube

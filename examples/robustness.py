@@ -22,10 +22,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
-from limits import Positive, Seed, check_limits
 from torch_panda import Randomization
-from training.files import prepare
-from training.policies import load_policy, read_checkpoint
+from torch_panda.learning.files import prepare
+from torch_panda.learning.limits import Positive, Seed, check_limits
+from torch_panda.learning.policy_files import load_policy, read_checkpoint
 
 
 @dataclass

@@ -3,7 +3,9 @@
 import signal
 
 import pytest
+import torch
 
+import torch_panda
 from torch_panda.bullet import native
 
 
@@ -22,3 +24,35 @@ def loop(request, monkeypatch):
         pytest.skip("installed where there was no C compiler")
     monkeypatch.setenv(native.LOOP_VARIABLE, request.param)
     return request.param
+
+
+@pytest.fixture
+def make_demos(tmp_path):
+    """Write random episodes in the format in which an expert's are written."""
+    from tests.learning.episodes import play
+    from torch_panda.learning.buffers import STORED_KEYS
+
+    def make(env_id="PandaPush-v1", episodes=4):
+        with torch_panda.make(env_id, num_envs=episodes, seed=0) as env:
+            data = play(env).select(*STORED_KEYS).reshape(-1)
+        path = tmp_path / "demos.pt"
+        torch.save(data.to_dict(), path)
+        return path
+
+    return make
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Evaluate few episodes, and restore signal handlers and threads afterwards."""
+    from torch_panda.learning import curve
+
+    monkeypatch.setattr(curve, "EPISODES", 8)
+    monkeypatch.setattr(curve, "NUM_ENVS", 8)
+    handlers = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(precision)

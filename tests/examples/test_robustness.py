@@ -5,14 +5,14 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
+import robustness
 import torch
 
-import robustness
 import torch_panda
 from torch_panda import Randomization
-from training.policies import load_policy, read_checkpoint
+from torch_panda.learning.policy_files import load_policy, read_checkpoint
 
-POLICY = Path(__file__).parents[2] / "examples" / "policies" / "PandaPush-v1.pt"
+POLICY = Path(__file__).parents[2] / "torch_panda" / "policies" / "PandaPush-v1.pt"
 
 
 def test_draws_a_grid(tmp_path, capsys):

@@ -21,14 +21,15 @@ from torch import nn
 from torchrl.objectives import DDPGLoss
 
 import torch_panda
-from agents import Hyperparameters, make_agent
-from agents.base import LEARNING_RATE, TAU
-from agents.networks import HIDDEN_SIZE
-from agents.normalizer import CLIP_NORMALIZED
-from tests.examples.agents.transitions import make_transitions
+from tests.learning.transitions import make_transitions
 from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
-from train import Args, Run, default_args
-from training.buffers import BUFFER_SIZE
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.agents.base import LEARNING_RATE, TAU
+from torch_panda.learning.buffers import BUFFER_SIZE
+from torch_panda.learning.networks import HIDDEN_SIZE
+from torch_panda.learning.normalizer import CLIP_NORMALIZED
+from torch_panda.learning.options import Args, default_args
+from torch_panda.learning.training import Run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
 EPISODES = 80

@@ -1,0 +1,129 @@
+"""The benchmark command, run in small."""
+
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+from torch_panda.__main__ import main
+from torch_panda.bullet.native import LIBRARY
+from torch_panda.commands import bench
+
+
+def table_rows(output):
+    lines = [line for line in output.splitlines() if line.startswith("| ")][1:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
+    picture = tmp_path / "speed.png"
+    options = ["--num-envs", "2", "1", "--num-threads", "2", "--rounds", "2"]
+    options += ["--steps", "2", "--others", "bare-bullet", "--plot", str(picture)]
+    main(["bench", *options])
+    rows = table_rows(capsys.readouterr().out)
+    names = ["torch_panda", "bare Bullet, C threads"][: 1 if LIBRARY is None else 2]
+    # Threads beyond the number of environments would have nothing to do.
+    expected = [["PandaPush-v3", n, n, name] for n in ("2", "1") for name in names]
+    assert [row[:4] for row in rows] == expected
+    for row in rows:
+        speed, cpu_speed, created, memory = (
+            float(row[k].partition(" ")[0]) for k in (4, 6, 7, 8)
+        )
+        assert speed > 0
+        assert cpu_speed > 0
+        assert created > 0
+        assert 20 < memory < 60  # [MB]
+        if row[3] == "torch_panda":
+            assert row[5] == "1.00 (1.00 to 1.00)"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", bench.CONTENDERS)
+def test_every_installed_contender_is_measured(name):
+    contender = bench.CONTENDERS[name]
+    if not all(map(find_spec, contender.modules)):
+        pytest.skip("not installed")
+    if name == "bare-bullet" and LIBRARY is None:
+        pytest.skip("the native loop was not compiled")
+    running = contender.make(bench.Setting("PandaReach-v3", num_envs=2, num_threads=1))
+    running.step()
+    running.close()
+
+
+def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
+    turns = iter(
+        [
+            bench.Measurement(200.0, 100.0, 0.05, 44.0),
+            bench.Measurement(100.0, 50.0, 0.1, 110.0),
+            bench.Measurement(300.0, 150.0, 0.05, 44.0),
+            RuntimeError("out of memory"),
+            KeyboardInterrupt(),
+        ]
+    )
+
+    def measure(*args):
+        turn = next(turns)
+        if isinstance(turn, BaseException):
+            raise turn
+        return turn
+
+    monkeypatch.setattr(bench, "measure", measure)
+    main(["bench", "--others", "fast", "--rounds", "5"])
+    output = capsys.readouterr().out
+    ours, fast = table_rows(output)
+    assert ours[4] == "250 (200 to 300)"
+    assert fast[4:6] == ["100 (100 to 100)", "2.00 (2.00 to 2.00)"]
+    assert 'torch_panda, physics="fast": RuntimeError: out of memory' in output
+    assert "interrupted" in output
+
+
+def test_environments_that_exceed_the_free_memory_are_not_measured(monkeypatch, capsys):
+    monkeypatch.setattr(bench, "available_memory", lambda: 80.0)
+    with pytest.raises(SystemExit) as error:
+        main(["bench", "--num-envs", "2", "--others"])
+    assert error.value.code == 1
+    assert (
+        "2 environments need about 0.1 GB, 0.1 GB are free" in capsys.readouterr().out
+    )
+
+
+def test_bare_bullet_repeats_its_episode(monkeypatch):
+    """A later episode visits the states of the first, so that it costs the same."""
+    if LIBRARY is None:
+        pytest.skip("the native loop was not compiled")
+    envs = []
+    make_env = bench._make_env
+    monkeypatch.setattr(
+        bench, "_make_env", lambda setting: envs.append(make_env(setting)) or envs[0]
+    )
+    running = bench.CONTENDERS["bare-bullet"].make(bench.Setting("PandaPush-v3", 2, 2))
+    position = envs[0].episodes.simulation.joint_position
+    states = []
+    for _ in range(100):
+        running.step()
+        states.append(position.clone())
+    running.close()
+    first, second = torch.stack(states).split(50)
+    assert torch.equal(first, second)
+    assert first.std(dim=0).max() > 0.01  # [rad]: it moves
+
+
+def test_buffers_are_compared(capsys):
+    print(bench.compare_buffers(rounds=1, capacity=2000))
+    rows = table_rows(capsys.readouterr().out)
+    assert [row[0] for row in rows] == ["plain", "with HindsightRelabel"]
+    assert all(float(row[1].partition(" ")[0]) > 0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--ids", "PandaFly-v1"], "--ids: 'PandaFly-v1' is no environment"),
+        (["--num-envs", "4", "0"], "--num-envs must be at least 1, got 0"),
+        (["--rounds", "0"], "--rounds must be at least 1, got 0"),
+        (["--plot", "no/such/folder.png"], "--plot must be a file in an existing"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises(SystemExit, match=message):
+        main(["bench", *options])

@@ -1,0 +1,222 @@
+"""The distributed example, on a Ray cluster of two nodes on this machine."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torch_panda.commands import plot
+from torch_panda.learning import curve
+from torch_panda.transforms import HindsightRelabel
+
+ray = pytest.importorskip("ray")
+distributed = pytest.importorskip("torch_panda.commands.distributed")
+
+IDS = ("collector", "traj_ids")
+# Ray's workers are nice by default: on a busy machine they would hardly run.
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
+    "OMP_NUM_THREADS": "1",
+}
+
+
+@pytest.fixture(scope="module")
+def address():
+    from ray.cluster_utils import Cluster
+
+    node = {"num_cpus": 1, "object_store_memory": 200 * 2**20}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in QUIET.items():
+            patch.setenv(name, value)
+        cluster = Cluster(
+            initialize_head=True, head_node_args={**node, "include_dashboard": False}
+        )
+        cluster.add_node(**node)
+        yield cluster.address
+        cluster.shutdown()
+
+
+@pytest.fixture
+def start(address, tmp_path, monkeypatch):
+    """Make a learner with two workers, one on each node."""
+    learners = []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+
+    def start(**options):
+        args = distributed.Args(
+            address=address, num_envs=4, eval_interval=10**6, **options
+        )
+        distributed.connect(args)
+        learners.append(distributed.Learner(args, tmp_path))
+        return learners[0]
+
+    monkeypatch.setattr(curve, "EPISODES", 4)
+    monkeypatch.setattr(curve, "NUM_ENVS", 4)
+    yield start
+    for learner in learners:
+        learner.close()
+    ray.shutdown()
+    torch.set_num_threads(threads)
+
+
+def goals_of_others(buffer, true_ids):
+    """Which relabelled rows of a few samples have another trajectory's goal."""
+    stored = buffer.storage[:]
+    batch = torch.cat([buffer.sample(256) for _ in range(4)])
+    row = batch["index"]
+    goal = batch["desired_goal"]
+    relabelled = (goal != stored["desired_goal"][row]).any(-1)
+    reached = (goal[:, None] == stored["next", "achieved_goal"]).all(-1)
+    own = true_ids[row][:, None] == true_ids
+    return ~(reached & own).any(-1)[relabelled]
+
+
+def test_workers_fill_one_buffer(distributed, start, tmp_path):
+    learner = start(total_steps=800, steps_per_batch=20, updates_per_step=0.1)
+    # One CPU each and none left: the workers are on different nodes.
+    assert len(ray.nodes()) == 2
+    assert ray.available_resources().get("CPU", 0) == 0
+    first = {k: v.clone() for k, v in learner.agent.explore.state_dict().items()}
+    learner.train()
+
+    assert learner.progress.steps == 800
+    assert [row["step"] for row in learner.progress.curve] == [0, 800]
+    assert learner.agent.updates == 80
+    assert (tmp_path / "checkpoint.pt").exists()
+    stored = learner.buffer.storage[:]
+    assert len(stored) == 800
+    ids, lengths = stored[IDS].unique(return_counts=True)
+    assert lengths.max() == 50  # an episode is in three batches or more
+    assert set((ids % 2).tolist()) == {0, 1}
+    goals = [
+        set(map(tuple, stored["desired_goal"][stored[IDS] % 2 == worker].tolist()))
+        for worker in range(2)
+    ]
+    assert not goals[0] & goals[1], "two workers with one seed"
+
+    # The worker of the last batch has got the learner's weights and normaliser.
+    current = learner.agent.explore.state_dict()
+    theirs = [s["policy_state_dict"] for s in learner.collector.state_dict()]
+    assert any(same(weights, current) for weights in theirs)
+    assert not any(same(weights, first) for weights in theirs)
+
+    others = goals_of_others(learner.buffer, stored[IDS])
+    assert len(others) > 512
+    assert not others.any()
+    # The workers' own numbers collide: with them, goals do get mixed.
+    colliding = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(800),
+        transform=HindsightRelabel(learner.env.compute_reward),
+    )
+    copy = stored.select(*stored.keys(True, True)).exclude("index", "hindsight_serial")
+    colliding.extend(copy.set(IDS, copy[IDS] // 2))
+    assert goals_of_others(colliding, stored[IDS]).any()
+
+
+def same(weights, other):
+    return all(torch.equal(value, other[key]) for key, value in weights.items())
+
+
+def test_a_dead_worker_is_an_error(start, tmp_path):
+    learner = start(total_steps=100_000, updates_per_step=0.0)
+    ray.kill(learner.collector.remote_collectors[1])
+    with pytest.raises(ray.exceptions.RayActorError):
+        learner.train()
+
+
+def test_too_small_a_cluster_is_an_error(distributed, address):
+    with pytest.raises(ValueError, match="room for 0 workers of 2 CPUs, not for 2"):
+        distributed.connect(distributed.Args(address=address, cpus_per_worker=2))
+    ray.shutdown()
+
+
+@pytest.mark.parametrize("name", ["curve.csv", "checkpoint.pt"])
+def test_another_run_is_not_overwritten(distributed, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(distributed, "connect", pytest.fail)
+    (tmp_path / name).write_text("theirs")
+    with pytest.raises(SystemExit, match=f"^{tmp_path} holds a run: "):
+        distributed.main(distributed.Args(out=tmp_path))
+    assert (tmp_path / name).read_text() == "theirs"
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+def test_something_must_explore(distributed, tmp_path, monkeypatch, algo):
+    monkeypatch.setattr(distributed, "connect", pytest.fail)
+    args = distributed.Args(
+        algo=algo, noise_eps=0.0, random_eps=(0.0, 0.0), out=tmp_path / "run"
+    )
+    with pytest.raises(SystemExit, match=f"^algo {algo} explores by noise_eps and "):
+        distributed.main(args)
+    assert not args.out.exists()
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_run_is_drawn(distributed, address, tmp_path):
+    args = distributed.Args(
+        address=address,
+        num_envs=4,
+        steps_per_batch=5,
+        total_steps=40,
+        updates_per_step=0.25,
+        out=tmp_path / "run",
+    )
+    distributed.main(args)
+    written = json.loads((args.out / "args.json").read_text())
+    assert (written["env_id"], written["total_steps"]) == ("PandaReach-v1", 40)
+    runs = plot.read_runs([tmp_path])
+    (line,) = runs["PandaReach-v1"]["DDPG"]
+    assert line == "distributed, num envs 4, steps per batch 5, updates per step 0.25"
+    (drawn,) = runs["PandaReach-v1"]["DDPG"][line]
+    assert [row["step"] for row in drawn] == [0, 40]
+
+
+@pytest.mark.slow
+def test_interrupt_leaves_nothing_running(tmp_path):
+    mark = str(uuid.uuid4())
+    arguments = (
+        *("--total-steps", "1000000", "--eval-interval", "200", "--num-envs", "4"),
+        *("--updates-per-step", "0.1", "--out", tmp_path),
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-m", "torch_panda", "distributed", *arguments],
+        env={**os.environ, **QUIET, "TEST_MARK": mark},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "checkpoint.pt").exists():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert len(marked(mark)) > 3  # Ray's own processes and the workers
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "stopping after this iteration" in output
+    while marked(mark):
+        assert time.monotonic() < deadline, marked(mark)
+        time.sleep(0.1)
+
+
+def marked(mark):
+    """Commands of the running processes with this in their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"TEST_MARK={mark}".encode() in (folder / "environ").read_bytes():
+                found.append((folder / "cmdline").read_text())
+        except OSError:
+            continue
+    return found

@@ -1,0 +1,138 @@
+"""The files that the scripts are given: bad ones are one line, and nothing is lost."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from torch_panda.commands import evaluate, train, watch
+from torch_panda.commands import record as record_demos
+from torch_panda.datasets.demonstrations import read_demos
+from torch_panda.learning import video
+
+
+def save(path, content):
+    """Write bytes as they are, anything else as torch does; "half" is half a file."""
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+        return
+    torch.save({"env_id": "PandaReach-v1"} if content == "half" else content, path)
+    if content == "half":
+        data = path.read_bytes()
+        path.write_bytes(data[: len(data) // 2])
+
+
+BAD = pytest.mark.parametrize(
+    "content",
+    [b"", b"hello", b"\x80\x02]", "half", {"steps": 1}, [1, 2], TensorDict(x=1)],
+    ids=["empty", "text", "pickle", "half", "state", "list", "tensordict"],
+)
+
+
+@BAD
+@pytest.mark.parametrize("script", [evaluate, watch])
+def test_files_that_hold_no_policy(tmp_path, script, content):
+    path = tmp_path / "checkpoint.pt"
+    save(path, content)
+    given = {"run": path} if script is evaluate else {"policy": str(tmp_path)}
+    message = f"^{path} does not hold a policy, or is damaged \\(\\w+\\)$"
+    with pytest.raises(SystemExit, match=message):
+        script.main(script.Args(**given))
+
+
+@pytest.mark.parametrize("script", [evaluate, watch])
+def test_policies_of_other_versions(tmp_path, script):
+    path = tmp_path / "checkpoint.pt"
+    options = {"algo": "ddpg", "relative": True, "depth": 3}
+    save(path, {"env_id": "PandaReach-v1", "hyperparameters": options, "policy": {}})
+    given = {"run": path} if script is evaluate else {"policy": str(tmp_path)}
+    with pytest.raises(SystemExit, match=r"another version, .*: depth, relative$"):
+        script.main(script.Args(**given))
+
+
+def test_a_policy_with_a_value_of_another_version(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    options = {"augmentation": "mirror-shift-swap"}
+    save(path, {"env_id": "PandaReach-v1", "hyperparameters": options, "policy": {}})
+    with pytest.raises(SystemExit, match=r"augmentation must be one of .*-swap'$"):
+        evaluate.main(evaluate.Args(run=path))
+
+
+@BAD
+def test_files_that_hold_no_demonstrations(tmp_path, content):
+    path = tmp_path / "demos.pt"
+    save(path, content)
+    message = f"^{path} does not hold demonstrations, or is damaged \\(\\w+\\)$"
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=1) as env,
+        pytest.raises(ValueError, match=message),
+    ):
+        read_demos(path, env)
+
+
+class Intruder:
+    """What runs code when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_file_of_a_stranger_runs_no_code(tmp_path):
+    path, mark = tmp_path / "demos.pt", tmp_path / "mark"
+    torch.save({"observation": Intruder(mark)}, path)
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=1) as env,
+        pytest.raises(ValueError, match="does not hold demonstrations"),
+    ):
+        read_demos(path, env)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("content", [b"hello", {"args": {}}])
+def test_damaged_state_of_a_run(tmp_path, content):
+    save(tmp_path / "resume.pt", content)
+    before = (tmp_path / "resume.pt").read_bytes()
+    message = "resume.pt does not hold the state of a run, or is damaged"
+    with pytest.raises(SystemExit, match=message):
+        train.main(train.Args(resume=True, out=tmp_path))
+    assert (tmp_path / "resume.pt").read_bytes() == before
+
+
+def test_demonstrations_go_into_a_new_folder(tmp_path):
+    path = tmp_path / "new" / "folder" / "demos.pt"
+    record_demos.main(
+        record_demos.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path)
+    )
+    assert len(torch.load(path)["action"]) > 2
+
+
+def must_not_play(*arguments):
+    raise AssertionError("the file should have been refused before")
+
+
+@pytest.mark.parametrize("script", [record_demos, watch])
+def test_outputs_below_a_file(tmp_path, monkeypatch, script):
+    monkeypatch.setattr(video if script is watch else script, "play", must_not_play)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"^\[Errno .*file"):
+        script.main(script.Args(out=tmp_path / "file" / "out.gif"))
+
+
+@pytest.mark.parametrize("script", [record_demos, watch])
+def test_outputs_do_not_replace_a_folder(tmp_path, monkeypatch, script):
+    monkeypatch.setattr(video if script is watch else script, "play", must_not_play)
+    folder = tmp_path / "folder.gif"
+    folder.mkdir()
+    with pytest.raises(SystemExit, match=f"^cannot write to {folder}$"):
+        script.main(script.Args(out=folder))
+
+
+def test_training_below_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match="Not a directory"):
+        train.main(train.Args(out=tmp_path / "file" / "run"))

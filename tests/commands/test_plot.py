@@ -1,0 +1,192 @@
+"""The plotting example: what it draws, and what it cannot."""
+
+import csv
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+from torch_panda.commands import plot
+from torch_panda.learning.checkpoint import write_options
+from torch_panda.learning.options import Args, default_args
+from torch_panda.learning.recipes import find_changes
+
+POINT = {"step": 0.5, "success": 0.5, "ever_success": 0.5, "return": -40.0}
+
+
+def write_run(folder, args, rows=(POINT,)):
+    write_options(folder, args, default_args(args.preset, args.env_id))
+    with (folder / "curve.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*rows[-1]])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for seed in range(2):
+        write_run(tmp_path / "runs" / str(seed), Args(seed=seed))
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """What is drawn, before it is closed."""
+    drawn = []
+    with monkeypatch.context() as patch:
+        patch.setattr(plt, "close", drawn.append)
+        yield drawn
+    plt.close("all")
+
+
+@pytest.mark.parametrize(
+    ("metric", "label", "shown"),
+    [
+        ("success", "success rate", 0.5),
+        ("ever_success", "success rate at any step", 0.5),
+        ("return", "return", -40.0),
+    ],
+)
+def test_every_metric_is_seen(runs, tmp_path, figures, metric, label, shown):
+    plot.main(plot.Args(runs=[runs], metric=metric, out=tmp_path / "new" / "curves"))
+    assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    (axes,) = figures[0].axes
+    assert axes.get_ylabel() == label
+    low, high = axes.get_ylim()
+    assert low < shown < high
+    assert axes.lines[0].get_ydata().tolist() == [shown]
+
+
+def lines_of(axes):
+    return [line.get_label() for line in axes.lines]
+
+
+def test_a_panel_has_four_lines_that_can_be_told_apart(tmp_path, figures):
+    ways = [
+        *({}, {"her": "none"}, {"double_q": False}, {"batch_size": 64}),
+        *({"anneal_lr": True}, {"demos": Path("demos.pt")}),
+    ]
+    for task in ("Push", "Slide"):
+        for algo in ("td3", "sac"):
+            for way in ways[: 6 if algo == "sac" else 3]:
+                for seed in range(2):
+                    args = Args(env_id=f"Panda{task}-v1", algo=algo, seed=seed, **way)
+                    name = f"{task}-{algo}-{ways.index(way)}-{seed}"
+                    write_run(tmp_path / name, args)
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    panels = {}
+    for axes in figures[0].axes:
+        panels.setdefault(axes.get_title(), []).append(axes)
+    assert {name: list(map(lines_of, some)) for name, some in panels.items()} == {
+        f"Panda{task}-v1, {algo}": [
+            [f"{algo}, {line} (2 seeds)" for line in lines] for lines in expected
+        ]
+        for task in ("Push", "Slide")
+        for algo, expected in {
+            "SAC": [
+                ["paper", "paper, anneal lr", "paper, batch size 64", "paper, demos"],
+                ["paper, no double q", "paper, no her"],
+            ],
+            "TD3": [["paper", "paper, no double q", "paper, no her"]],
+        }.items()
+    }
+    looks = {}
+    for axes in figures[0].axes:
+        for line in axes.lines:
+            look = (line.get_color(), line.get_linestyle())
+            assert looks.setdefault(line.get_label(), look) == look
+    assert len(set(looks.values())) == len(looks) == 9
+
+
+def test_algorithms_share_a_panel_where_they_fit(tmp_path, figures):
+    for env_id, algo in (("PandaPush-v1", "sac"), ("PandaPush-v1", "td3")):
+        for her in ("relabel", "none"):
+            args = Args(env_id=env_id, algo=algo, her=her)
+            write_run(tmp_path / f"{env_id}-{algo}-{her}", args)
+    for task in ("Reach", "Slide", "Stack"):
+        write_run(tmp_path / task, Args(env_id=f"Panda{task}-v1"))
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    first, *others = figures[0].axes
+    assert first.get_title() == "PandaPush-v1"
+    assert lines_of(first) == [
+        f"{line} (1 seed)"
+        for line in (
+            "SAC, paper",
+            "SAC, paper, no her",
+            "TD3, paper",
+            "TD3, paper, no her",
+        )
+    ]
+    titles = [axes.get_title() for axes in others]
+    assert titles == ["PandaReach-v1", "PandaSlide-v1", "PandaStack-v1"]
+    rows = {round(axes.get_position().y0, 2) for axes in figures[0].axes}
+    assert len(rows) == 2  # three panels are side by side
+
+
+def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
+    way = {"gamma": 0.9, "noise_eps": 0.1, "batch_size": 64, "anneal_lr": True}
+    way |= {"desired_ratio": 0.5, "updates_per_step": 0.2, "target_interval": 10}
+    args = Args(env_id="PandaPush-v1", num_envs=9, start_at_object=0.5, **way)
+    write_run(tmp_path / "way", args)
+    for task in ("Reach", "Slide"):
+        write_run(tmp_path / task, Args(env_id=f"Panda{task}-v1"))
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    assert all(axes.get_position().width > 0.2 for axes in figures[0].axes)
+    (label,) = lines_of(figures[0].axes[0])
+    assert "gamma 0.9" in label
+    assert "anneal lr" in label
+
+
+def test_band_over_the_steps_that_all_seeds_have(tmp_path, figures):
+    curves = [
+        {0: 0.0, 100: 0.2, 200: 0.4, 300: 0.6},
+        {0: 0.1, 200: 0.8},  # evaluated less often
+        {0: 0.2, 100: 0.5, 200: 0.6, 300: 0.7, 400: 1.0},
+    ]
+    for seed, curve in enumerate(curves):
+        rows = [{"step": step, "success": value} for step, value in curve.items()]
+        write_run(tmp_path / str(seed), Args(seed=seed), rows)
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    (axes,) = figures[0].axes
+    (line,) = axes.lines
+    assert line.get_xydata().tolist() == [[0, 0.1], [200, 0.6]]
+    (band,) = axes.collections
+    heights = {tuple(point) for point in band.get_paths()[0].vertices.round(6).tolist()}
+    assert {(0.0, 0.05), (0.0, 0.15), (200.0, 0.5), (200.0, 0.7)} <= heights
+
+
+def spoil_arguments(folder):
+    (folder / "args.json").write_text("{}")
+
+
+def spoil_curve(folder):
+    (folder / "curve.csv").write_text("step,success\n100,abc\n")
+
+
+@pytest.mark.parametrize("spoil", [spoil_arguments, spoil_curve])
+def test_a_folder_that_holds_no_run_is_named(runs, tmp_path, spoil):
+    spoil(runs / "1")
+    with pytest.raises(SystemExit, match=f"^cannot draw: {runs / '1'} holds no run: "):
+        plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
+
+
+def test_what_is_no_run_is_left_out(runs, tmp_path, figures):
+    (runs / "1" / "args.json").unlink()
+    plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
+    (axes,) = figures[0].axes
+    assert lines_of(axes) == ["DDPG, paper (1 seed)"]
+
+
+def test_no_run_and_no_place(runs, tmp_path):
+    with pytest.raises(SystemExit, match=r"no run .* below nowhere$"):
+        plot.main(plot.Args(runs=[Path("nowhere")], out=tmp_path / "curves.png"))
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"^cannot draw: \[Errno"):
+        plot.main(plot.Args(runs=[runs], out=tmp_path / "file" / "curves.png"))
+
+
+def test_when_the_learning_rate_has_fallen_is_another_line():
+    args, default = Args(total_steps=200_000), Args()
+    assert find_changes(args, default) == {}
+    args.anneal_lr = default.anneal_lr = True
+    assert find_changes(args, default) == {"total_steps": 200_000}

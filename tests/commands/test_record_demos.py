@@ -1,0 +1,97 @@
+"""Recording demonstrations: what the file holds, and that a stop loses nothing."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+import torch_panda
+from torch_panda.commands import record as record_demos
+from torch_panda.experts import make_expert
+from torch_panda.learning.evaluation import wilson_interval
+from torch_panda.transforms import HindsightRelabel
+
+
+def test_demonstrations_extend_a_replay_buffer(tmp_path, capsys):
+    out = tmp_path / "demos.pt"
+    record_demos.main(record_demos.Args("PandaPush-v3", 6, num_envs=4, out=out))
+    assert "success at the end" in capsys.readouterr().out
+    demonstrations = TensorDict(torch.load(out)).auto_batch_size_(1)
+    ids = demonstrations["collector", "traj_ids"]
+    assert ids.unique().tolist() == list(range(6))
+    last = demonstrations["next", "done"].squeeze(-1)
+    assert ids[last].tolist() == list(range(6))
+
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1000),
+        transform=HindsightRelabel(torch_panda.Push().compute_reward, seed=0),
+        batch_size=64,
+    )
+    buffer.extend(demonstrations)
+    batch = buffer.sample()
+    assert batch["desired_goal"].shape == (64, 3)
+    assert (batch["next", "reward"] == 0).any()
+
+
+def test_what_is_saved_is_the_action_without_noise(tmp_path):
+    out = tmp_path / "demos.pt"
+    args = record_demos.Args("PandaReach-v1", 2, num_envs=2, noise_eps=0.3, out=out)
+    record_demos.main(args)
+    demos = TensorDict(torch.load(out)).auto_batch_size_(1)
+    saved = demos["action"].clone()
+    torch.testing.assert_close(make_expert(args.env_id)(demos)["action"], saved)
+    # What was executed is another one: the hand went elsewhere.
+    moved = demos["next", "observation"][:, :3] - demos["observation"][:, :3]
+    assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
+
+
+def test_numbers_of_the_task_can_be_others(tmp_path, capsys):
+    args = record_demos.Args("PandaReach-v1", 4, num_envs=4, out=tmp_path / "demos.pt")
+    for threshold, success in ((0.5, "4/4"), (1e-9, "0/4")):
+        args.task_options = {"distance_threshold": threshold}
+        record_demos.main(args)
+        assert f"at the end {success}" in capsys.readouterr().out
+    args.task_options = {"threshold": 1.0}
+    with pytest.raises(SystemExit, match=r"accepted are .*distance_threshold"):
+        record_demos.main(args)
+    args.task_options, args.format = {"distance_threshold": 0.5}, "minari"
+    with pytest.raises(SystemExit, match="no task_options"):
+        record_demos.main(args)
+
+
+def stop(*arguments):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("during", ["play", "join"])
+def test_ctrl_c_leaves_the_file_as_it_was(tmp_path, monkeypatch, during):
+    out = tmp_path / "demos.pt"
+    args = record_demos.Args("PandaReach-v3", episodes=2, num_envs=2, out=out)
+    record_demos.main(args)
+    before = out.read_bytes()
+    monkeypatch.setattr(record_demos, during, stop)
+    with pytest.raises(SystemExit, match=r"^stopped$"):
+        record_demos.main(args)
+    assert out.read_bytes() == before
+
+
+def test_ctrl_c_while_writing_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+    out = tmp_path / "demos.pt"
+    out.write_bytes(b"before")
+
+    def write_half(content, path):
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch, "save", write_half)
+    args = record_demos.Args("PandaReach-v3", episodes=2, num_envs=2, out=out)
+    with pytest.raises(SystemExit, match=r"^stopped$"):
+        record_demos.main(args)
+    assert out.read_bytes() == b"before"
+
+
+def test_wilson_interval():
+    # The textbook value for 8 of 10.
+    low, high = wilson_interval(8, 10)
+    assert low == pytest.approx(0.490, abs=1e-3)
+    assert high == pytest.approx(0.943, abs=1e-3)

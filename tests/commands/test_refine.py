@@ -1,0 +1,163 @@
+"""Refining a policy by imitating what it achieves."""
+
+import json
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import torch_panda
+from torch_panda.commands import refine
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.evaluation import evaluate
+from torch_panda.learning.policy_files import (
+    load_agent,
+    load_policy,
+    read_checkpoint,
+    save_policy,
+)
+
+pytestmark = pytest.mark.usefixtures("quick")
+POLICIES = refine.Path(refine.__file__).parent / "policies"
+
+
+def episode(achieved: list[float], asked: list[float]) -> TensorDict:
+    goals = torch.tensor(asked).expand(2, -1)
+    following = {
+        "achieved_goal": torch.stack(
+            (torch.zeros(len(achieved)), torch.tensor(achieved))
+        ),
+        "desired_goal": goals,
+    }
+    return TensorDict({"desired_goal": goals, "next": following}, [2])
+
+
+def test_the_goal_becomes_what_was_achieved_where_goals_differ():
+    varies = torch.tensor([True, True, False])
+    slid = episode([0.5, 0.1, 0.015], [0.4, 0.3, 0.03])
+    slid = refine.ask_for_achieved(slid, torch_panda.Slide(), varies)
+    expected = torch.tensor([[0.5, 0.1, 0.03]] * 2)
+    torch.testing.assert_close(slid["desired_goal"], expected)
+    torch.testing.assert_close(slid["next", "desired_goal"], expected)
+
+
+def test_an_episode_that_achieves_what_is_never_asked_for_is_left_out():
+    fallen = episode([0.5, 0.1, -0.3], [0.1, 0.1, 0.02])  # off the table
+    varies = torch.tensor([True, True, False])
+    assert refine.ask_for_achieved(fallen, torch_panda.Push(), varies) is None
+
+
+@pytest.fixture
+def crooked(tmp_path):
+    """A policy of Reach whose hand comes to rest beside the goal."""
+    saved = read_checkpoint(POLICIES / "PandaReach-v1.pt")
+    with torch_panda.make("PandaReach-v1", num_envs=2) as env:
+        agent = load_agent(saved, env)
+    with torch.no_grad():
+        agent.actor[0][-1].bias[0] += 1.5
+    save_policy(tmp_path / "crooked.pt", agent, "PandaReach-v1")
+    return tmp_path / "crooked.pt"
+
+
+def success(path: refine.Path) -> float:
+    with torch_panda.make("PandaReach-v1", num_envs=32, seed=5) as env:
+        policy = load_policy(read_checkpoint(path), env)
+        return float(evaluate(env, policy, 64).success.float().mean())
+
+
+def test_a_policy_that_misses_learns_to_hit(crooked, tmp_path):
+    assert success(crooked) < 0.2
+    out = tmp_path / "run"
+    refine.main(refine.Args(crooked, out, steps=12_800, updates=800, batch_size=512))
+    assert success(out) > 0.9
+    options = json.loads((out / "args.json").read_text())
+    assert options["preset"] == "refined"
+    changed = {"steps": 12_800, "updates": 800, "batch_size": 512}
+    assert options["changed"] == changed
+
+
+class Stop:
+    """True from the n-th time on that it is asked."""
+
+    def __init__(self, n: int) -> None:
+        self.left = n
+
+    def __bool__(self) -> bool:
+        self.left -= 1
+        return self.left <= 0
+
+
+@pytest.mark.parametrize("asked", [2, 8])  # while it plays, and while it imitates
+def test_a_stopped_run_goes_on_bit_for_bit(crooked, tmp_path, asked):
+    policies = []
+    for name, stops in (("whole", [False]), ("stopped", [Stop(asked), False])):
+        for stop in stops:
+            options = {"steps": 400, "updates": 6, "num_envs": 4, "batch_size": 64}
+            args = refine.Args(crooked, tmp_path / name, **options)
+            args.resume = stop is not stops[0]
+            run = refine.Refinement(args)
+            args.out.mkdir(exist_ok=True)
+            assert run.run(stop) == (not isinstance(stop, Stop))
+            run.close()
+        policies.append(run.agent.state_dict())
+        assert len(run.progress.curve) == 2
+    for key, value in policies[0].items():
+        assert torch.equal(value, policies[1][key]), key
+
+
+@pytest.mark.parametrize("during", ["play", "evaluation"])
+def test_a_killed_run_goes_on_from_its_last_save(
+    crooked, tmp_path, monkeypatch, during
+):
+    class Kill(BaseException):
+        pass
+
+    def kill(*arguments):
+        raise Kill
+
+    options = {"steps": 600, "updates": 4, "num_envs": 4, "batch_size": 64}
+    args = refine.Args(crooked, tmp_path / "run", **options)
+    args.out.mkdir()
+    run = refine.Refinement(args)
+    add, played = run.curve.add, refine.play
+    if during == "evaluation":  # the one after the imitation
+        run.curve.add = lambda progress: kill() if progress.curve else add(progress)
+    plays = iter([played, played, kill if during == "play" else played])
+    with monkeypatch.context() as patch, pytest.raises(Kill):
+        patch.setattr(refine, "SAVE_INTERVAL", 200)
+        patch.setattr(refine, "play", lambda *args: next(plays)(*args))
+        run.run()
+    run.close()
+    args.resume = True
+    resumed = refine.Refinement(args)
+    assert resumed.progress.steps == (400 if during == "play" else 600)
+    assert resumed.run()
+    resumed.close()
+    assert len(resumed.progress.curve) == 2
+
+
+def test_a_stochastic_policy_is_refined_without_its_noise(tmp_path, monkeypatch):
+    with torch_panda.make("PandaReach-v1", num_envs=2) as env:
+        agent = make_agent(env, Hyperparameters(algo="sac"))
+    save_policy(tmp_path / "sac.pt", agent, "PandaReach-v1")
+    options = {"steps": 100, "updates": 1, "num_envs": 2, "batch_size": 4}
+    run = refine.Refinement(refine.Args(tmp_path / "sac.pt", tmp_path, **options))
+    asked = []
+    monkeypatch.setattr(refine, "ask_for_achieved", lambda x, *_: asked.append(x))
+    run.play(stop=False)
+    run.close()
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        for episode in asked:
+            played = episode["action"].clone()
+            own = run.agent.policy(episode.clone())["action"]
+            torch.testing.assert_close(played, own)
+
+
+def test_what_cannot_be_refined_is_refused(crooked, tmp_path):
+    with pytest.raises(SystemExit, match="there is no file"):
+        refine.main(refine.Args(tmp_path / "missing.pt", tmp_path / "run"))
+    with pytest.raises(SystemExit, match="updates must be positive"):
+        refine.main(refine.Args(crooked, tmp_path / "run", updates=0))
+    with pytest.raises(SystemExit, match="trained on PandaReach-v1"):
+        refine.main(refine.Args(crooked, tmp_path / "run", env_id="PandaPush-v1"))

@@ -1,0 +1,268 @@
+"""The training example: it learns something, writes its files, stops and resumes."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+from torch_panda.commands import evaluate, plot, train
+from torch_panda.commands.train import parse
+from torch_panda.learning import training
+from torch_panda.learning.agents.base import LEARNING_RATE
+from torch_panda.learning.options import Args, default_args
+from torch_panda.learning.training import Run
+
+pytestmark = pytest.mark.usefixtures("quick")
+
+
+class After:
+    """A stop signal: true from the n-th question on."""
+
+    def __init__(self, number):
+        self.left = number
+
+    def __bool__(self):
+        self.left -= 1
+        return self.left < 0
+
+
+def read_curve(folder):
+    with (folder / "curve.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def weights(run):
+    return {key: x.clone() for key, x in run.agent.state_dict().items()}
+
+
+def points(run):
+    """Its curve, but for the time that it took."""
+    return [{**row, "seconds": 0} for row in run.progress.curve]
+
+
+def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
+    out = tmp_path / "run"
+    train.main(Args(total_steps=400, eval_interval=200, out=out, noise_eps=0.1))
+    assert "after 400 steps; see" in capsys.readouterr().out
+    rows = read_curve(out)
+    assert [row["step"] for row in rows] == ["0", "200", "400"]
+    assert all(0 <= float(row["success"]) <= 1 for row in rows)
+    assert [row["updates"] for row in rows] == ["0", "100", "200"]
+    assert rows[0]["critic_loss"] == ""
+    assert float(rows[-1]["critic_loss"]) > 0
+    assert json.loads((out / "args.json").read_text())["changed"] == {"noise_eps": 0.1}
+    assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert len(iio.imread(out / "video.mp4")) == 51
+    content = torch.load(out / "checkpoint.pt", weights_only=True)
+    assert content["env_id"] == "PandaReach-v1"
+    assert all(value.isfinite().all() for value in content["policy"].values())
+    assert content["policy"]["module.0.module.count"] == 400
+    assert (out / "checkpoint.pt").stat().st_size < 2 * 2**20
+
+    options = {"distance_threshold": 10.0}
+    evaluate.main(evaluate.Args(run=out, episodes=8, task_options=options))
+    assert "success at the end   100.0%" in capsys.readouterr().out
+    evaluate.main(evaluate.Args(run=out, episodes=8))
+    report = capsys.readouterr().out
+    assert "PandaReach-v1, 8 episodes" in report
+    assert "success at the end" in report
+    with pytest.raises(SystemExit, match="trained on PandaReach-v1"):
+        evaluate.main(evaluate.Args(run=out, env_id="PandaPush-v1"))
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "all.png"))
+    assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"algo": "td3"},
+        {"algo": "sac"},
+        {"algo": "tqc"},
+        {"her": "augment"},
+        {"her": "none", "random_eps": (0.1, 0.9)},
+        {"preset": "tuned", "relative_inputs": "fine", "augmentation": "mirror-shift"},
+        {"start_at_object": 0.5, "target_interval": 3, "network": "layer-norm"},
+        {"desired_ratio": 0.5, "anneal_lr": True},
+    ],
+    ids=lambda options: "-".join(map(str, options.values())),
+)
+def test_resumed_run_equals_uninterrupted_run(tmp_path, options):
+    """Stopped after an iteration and gone on with, in all its bits."""
+    args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=300, **options)
+    args = replace(args, updates_per_step=0.1, eval_interval=100)
+    whole = Run(args, tmp_path)
+    assert whole.train()
+    whole.close()
+    assert whole.agent.updates == 30
+    assert [row["step"] for row in whole.progress.curve] == [0, 100, 200, 300]
+
+    (tmp_path / "stopped").mkdir()
+    stopped = Run(args, tmp_path / "stopped")
+    assert not stopped.train(After(1))
+    stopped.close()
+    assert stopped.progress.steps == 200
+    resumed = Run(replace(args, resume=True), tmp_path / "stopped")
+    assert resumed.progress.steps == 200
+    assert resumed.train()
+    resumed.close()
+    torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
+    assert points(resumed) == points(whole)
+    length = len(whole.buffer)
+    assert len(resumed.buffer) == length
+    for key in ("observation", "desired_goal", "action", ("next", "reward")):
+        ours = resumed.buffer.storage[:length][key]
+        assert torch.equal(ours, whole.buffer.storage[:length][key])
+    again = Run(replace(args, resume=True), tmp_path / "stopped")
+    assert again.train(), "nothing is left to do"
+    again.close()
+    torch.testing.assert_close(weights(again), weights(whole), rtol=0, atol=0)
+
+
+def test_a_killed_run_goes_on_from_its_last_save(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "SAVE_INTERVAL", 200)
+    args = Args(num_envs=2, total_steps=400, updates_per_step=0.1)
+    whole = Run(args, tmp_path)
+    whole.train()
+    whole.close()
+
+    class Kill(BaseException):
+        pass
+
+    def killed_at(steps, run):
+        learn = run.learn
+
+        def learn_or_die():
+            if run.progress.steps == steps:
+                raise Kill
+            return learn()
+
+        return learn_or_die
+
+    for after, saved in ((300, 200), (100, 0)):
+        out = tmp_path / str(after)
+        out.mkdir()
+        killed = Run(args, out)
+        killed.learn = killed_at(after, killed)
+        with pytest.raises(Kill):
+            killed.train()
+        killed.close()
+        resumed = Run(replace(args, resume=True), out)
+        assert resumed.progress.steps == saved
+        resumed.train()
+        resumed.close()
+        torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
+
+
+def test_other_options_and_other_runs_are_refused(tmp_path):
+    args = Args(num_envs=2, total_steps=100, updates_per_step=0.1, video=False)
+    args.out = tmp_path
+    train.main(args)
+    for options, message in (
+        ({"resume": True, "batch_size": 16}, "batch_size was 256, is 16"),
+        ({}, "holds a run: continue it with --resume"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            train.main(replace(args, **options))
+    (tmp_path / "resume.pt").unlink()
+    with pytest.raises(SystemExit, match="there is no run to resume"):
+        train.main(replace(args, resume=True))
+
+
+# 150 steps end within an iteration, which is finished.
+@pytest.mark.parametrize(("total_steps", "falling"), [(200, 20), (150, 15)])
+def test_learning_rate_falls_to_0(tmp_path, total_steps, falling):
+    options = {"num_envs": 2, "updates_per_step": 0.1}
+    run = Run(Args(total_steps=total_steps, anneal_lr=True, **options), tmp_path)
+    (group,) = run.agent.optimizer.param_groups
+    rates, update = [], run.agent.update
+    run.agent.update = lambda *batch: rates.append(group["lr"]) or update(*batch)
+    run.train()
+    run.close()
+    expected = [LEARNING_RATE * max(0, 1 - k / falling) for k in range(20)]
+    assert rates == pytest.approx(expected)
+
+
+def test_episodes_in_which_nothing_moves_are_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "KEEP_UNMOVED", 0.0)
+    options = {"env_id": "PandaPush-v1", "num_envs": 2, "total_steps": 100}
+    for preset, stored in (("paper", 100), ("tuned", 0)):
+        run = Run(Args(preset=preset, **options), tmp_path)
+        run.agent.explore.forward = lambda td: td.set("action", torch.zeros(2, 3))
+        run.store(next(iter(run.collector)))
+        assert len(run.buffer) == stored
+        run.progress.steps = 100
+        assert bool(run.learn()) == bool(stored)
+        run.close()
+
+
+def test_interrupt_saves(tmp_path):
+    """Ctrl-C in a process of its own."""
+    out = tmp_path / "run"
+    command = ["-m", "torch_panda", "train", "--total-steps", "100000", "--out", out]
+    process = subprocess.Popen(
+        [sys.executable, *map(str, command), "--eval-interval", "200"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (out / "curve.csv").exists() or len(read_curve(out)) < 2:
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "stopping after this iteration" in output
+    assert "with --resume goes on" in output
+    steps = int(read_curve(out)[-1]["step"])
+    assert torch.load(out / "resume.pt")["progress"]["steps"] >= steps > 0
+    assert (out / "checkpoint.pt").exists()
+
+
+def test_command_line_overrules_the_recipe():
+    args = parse(["--preset", "tuned", "--env-id", "PandaSlide-v1", "--gamma", "0.9"])
+    recipe = default_args("tuned", "PandaSlide-v1")
+    assert args == replace(recipe, gamma=0.9)
+    assert args.desired_ratio > 0
+    assert parse(["--random-eps", "0.1", "0.2"]).random_eps == (0.1, 0.2)
+    assert parse([]) == Args()
+
+
+def test_at_most_30_options_in_whole_phrases(capsys):
+    assert len(fields(Args)) <= 30
+    with pytest.raises(SystemExit):
+        parse(["--help"])
+    text = capsys.readouterr().out
+    assert all(f"--{x.name.replace('_', '-')}" in text for x in fields(Args))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
+        ({"resume": True}, "there is no run to resume"),
+        ({"total_steps": 0}, "total_steps must be positive"),
+        ({"demos": Path("nofile.pt")}, "there is no nofile.pt: .* a file of"),
+        ({"pretrain_updates": 9}, "pretrain_updates needs demos to imitate"),
+        ({"noise_eps": 0.0, "random_eps": (0.0, 0.0)}, "algo ddpg explores by"),
+        ({"her": "parts"}, "--her parts is for goals of several objects"),
+        ({"start_at_object": 0.5}, "starts at objects need"),
+        ({"out": Path("/dev/null")}, "out must be a folder, got the file /dev/null"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message) as stop:
+        train.main(Args(**options))
+    assert "\n" not in str(stop.value)
+    assert not (tmp_path / "runs").exists()

@@ -1,0 +1,147 @@
+"""The examples that draw: a video of a policy, and the picture of all tasks."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
+from pathlib import Path
+from unittest.mock import Mock
+
+import gallery
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+import torch_panda
+from torch_panda.commands import watch
+from torch_panda.experts import make_expert
+
+
+@pytest.mark.parametrize("policy", ["random", "expert"])
+def test_video_shows_every_step(tmp_path, policy):
+    out = tmp_path / "watch.gif"
+    watch.main(watch.Args(policy=policy, env_id="PandaReach-v1", num_envs=2, out=out))
+    frames = iio.imread(out)
+    assert frames.shape == (51, 240, 640, 3)
+    moved = np.abs(np.diff(frames.astype(int), axis=0)).max((1, 2, 3))
+    assert (moved[:10] > 100).all()
+    # The border of a solved cell is green.
+    borders = frames[-1, 120, [1, 321]].astype(int)
+    solved = borders[:, 1] > borders[:, 0] + 50
+    assert solved.all() == (policy == "expert")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"policy": "nothing"}, "random, expert, or .* a run, .* got 'nothing'"),
+        ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
+        ({"out": "watch.txt"}, "must end in .mp4 or .gif, got 'watch.txt'"),
+        ({"env_id": "PandaPushJoints-v1"}, "no expert for 'PandaPushJoints-v1'"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, arguments, message):
+    if "out" in arguments:
+        arguments["out"] = tmp_path / arguments["out"]
+    with pytest.raises(SystemExit, match=message):
+        watch.main(watch.Args(**arguments))
+
+
+def start_human(display, episodes):
+    environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
+    if display is not None:
+        environment["DISPLAY"] = display
+    command = [sys.executable, watch.__file__, "--human", f"--num-envs={episodes}"]
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.fixture
+def screen(tmp_path):
+    """A virtual display: its name, and what it shows as (height, width, 4) bytes."""
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", "1", "-screen", "0", "1024x768x24", "-fbdir", tmp_path],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    number = server.stdout.readline().strip()
+
+    def look():
+        # An XWD file: sizes of 4 bytes, big-endian, then colours, then the picture.
+        data = (tmp_path / "Xvfb_screen0").read_bytes()
+        size = 4 * 1024 * 768
+        return np.frombuffer(data[-size:], np.uint8).reshape(768, 1024, 4)
+
+    yield f":{number}", look
+    server.terminate()
+    server.wait()
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="needs Xvfb")
+def test_window_shows_the_arm_move(screen):
+    display, look = screen
+    process = start_human(display, episodes=2)
+    views = []
+    while process.poll() is None:
+        view = look()
+        # The background has one colour, the scene in light and shade has many.
+        if len(np.unique(view.view(np.uint32))) > 50:
+            views.append(view.astype(int))
+        time.sleep(0.1)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert "episode 2 of 2: success" in output
+    assert len(views) > 2
+    assert any(np.abs(view - views[0]).max() > 50 for view in views[1:])
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="DISPLAY is of X11")
+def test_window_without_a_display_is_one_line():
+    process = start_human(None, episodes=1)
+    output = process.communicate()[0]
+    assert process.returncode == 1
+    assert output.count("needs a display with OpenGL") == 1
+    assert "Traceback" not in output
+
+
+def test_an_episode_that_ends_at_success_is_one(monkeypatch, capsys):
+    window = Mock()
+    monkeypatch.setattr(watch, "FPS", 1e9)
+    with torch_panda.make("PandaReach-v3", num_envs=1, seed=0) as env:
+        monkeypatch.setattr(env, "open_window", lambda: nullcontext(window))
+        watch.show(env, make_expert("PandaReach-v3"), episodes=2)
+    assert capsys.readouterr().out.splitlines() == [
+        "episode 1 of 2: success",
+        "episode 2 of 2: success",
+    ]
+    assert 2 < window.show.call_count < 50  # the ends of both episodes are shown
+
+
+def test_gallery(tmp_path):
+    gallery.main(gallery.Args(step=1, size=(60, 80), out=tmp_path / "gallery.png"))
+    picture = iio.imread(tmp_path / "gallery.png")
+    assert picture.shape == (180, 240, 3)  # 3 rows of 3
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_gallery_of_policies(tmp_path):
+    out = tmp_path / "policies.png"
+    box = sorted(Path(gallery.__file__).parent.glob("policies/*.pt"))
+    gallery.main(gallery.Args(policies=tuple(box), size=(60, 80), out=out))
+    picture = iio.imread(out).astype(int)
+    assert picture.shape == (60 * len(box), 80 * len(gallery.COLUMNS), 3)
+    first, last = picture[:, :80], picture[:, -80:]
+    assert all(np.abs(first - last)[60 * k :][:60].max() > 100 for k in range(len(box)))
+
+
+def test_gallery_writes_pictures_only(tmp_path):
+    with pytest.raises(SystemExit, match=r"must end in .png or .gif, got 'a.jpg'"):
+        gallery.main(gallery.Args(out=tmp_path / "a.jpg"))

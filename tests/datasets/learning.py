@@ -1,0 +1,31 @@
+"""Recording a small data set, and what imitating it comes to."""
+
+from pathlib import Path
+
+import torch
+
+from torch_panda.commands import record as record_demos
+from torch_panda.datasets.demonstrations import make_demo_buffer
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.evaluation import evaluate
+
+
+def record(format, out, env_id, episodes, seed=0, **options):
+    record_demos.main(
+        record_demos.Args(
+            env_id, episodes, seed, num_envs=8, format=format, out=Path(out), **options
+        )
+    )
+
+
+def imitate(env, demos):
+    """Success at the end of an episode of each environment, after 300 updates."""
+    torch.manual_seed(0)
+    agent = make_agent(env, Hyperparameters())
+    agent.normalizer.update(demos["observation"], demos["desired_goal"])
+    buffer = make_demo_buffer(demos)
+    untrained = evaluate(env, agent.policy, 16).success.float().mean()
+    assert untrained < 0.5
+    for _ in range(300):
+        agent.imitate(buffer.sample(128))
+    return evaluate(env, agent.policy, 16).success.float().mean()

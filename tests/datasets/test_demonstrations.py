@@ -1,0 +1,167 @@
+"""Learning from a file of demonstrations, before and beside one's own transitions."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from tests.commands.test_train import After
+from torch_panda.commands.train import make_run
+from torch_panda.datasets.demonstrations import read_demos
+from torch_panda.learning import pretraining
+from torch_panda.learning.options import Args
+from torch_panda.learning.policy_files import read_checkpoint
+from torch_panda.learning.pretraining import make_demo_buffer
+
+pytestmark = pytest.mark.usefixtures("quick")
+
+
+@pytest.fixture
+def env():
+    with torch_panda.make("PandaPush-v1", num_envs=1) as env:
+        yield env
+
+
+def test_demonstrations_keep_their_goals(env, make_demos):
+    path = make_demos()
+    demos = read_demos(path, env)
+    batch = make_demo_buffer(demos).sample(500)
+    goal = demos["desired_goal"].unflatten(0, (4, 50))[:, 0]
+    assert (batch["desired_goal"] == goal[batch["collector", "traj_ids"]]).all()
+    assert len(batch["index"].unique()) > 100
+
+
+def test_demonstrations_of_another_task(env, make_demos):
+    path = make_demos("PandaReach-v1")
+    with pytest.raises(ValueError, match="observation has size 6, the task's has 18"):
+        read_demos(path, env)
+
+
+def test_demonstrations_of_unequal_lengths(env, make_demos):
+    path = make_demos()
+    content = torch.load(path)
+    content["action"] = content["action"][:-1]
+    torch.save(content, path)
+    with pytest.raises(ValueError, match=f"{path} does not hold demonstrations"):
+        read_demos(path, env)
+
+
+def test_demonstrations_without_a_transition(env, make_demos):
+    path = make_demos()
+    content = TensorDict(torch.load(path)).auto_batch_size_(1)
+    torch.save(content[:0].to_dict(), path)
+    with pytest.raises(ValueError, match=f"{path} holds no transitions"):
+        read_demos(path, env)
+
+
+def test_demonstrations_of_other_rewards(make_demos):
+    path = make_demos()
+    with (
+        torch_panda.make("PandaPushDense-v1", num_envs=1) as env,
+        pytest.raises(ValueError, match=r"100% of the rewards .* is -1 instead of -0"),
+    ):
+        read_demos(path, env)
+
+
+def small(path, **options):
+    return Args(env_id="PandaPush-v1", demos=path, num_envs=2, **options)
+
+
+def test_a_ratio_of_each_batch_is_demonstrations(make_demos, tmp_path):
+    options = {"total_steps": 100, "updates_per_step": 0.05, "batch_size": 32}
+    run = make_run(small(make_demos(), **options), tmp_path)
+    sizes, update = [], run.agent.update
+    run.agent.update = lambda batch, demos: (
+        sizes.append((len(batch), len(demos))) or update(batch, demos)
+    )
+    assert run.train()
+    run.close()
+    assert sizes == [(24, 8)] * 5
+    assert run.agent.normalizer.count == 200 + 100
+    assert len(run.buffer) == 100
+
+
+@pytest.mark.parametrize(
+    ("updates", "expected"), [(40, [0, 12, 24, 36, 40, 40]), (36, [0, 12, 24, 36, 36])]
+)
+def test_imitation_saves_in_between(
+    make_demos, tmp_path, monkeypatch, updates, expected
+):
+    monkeypatch.setattr(pretraining, "SAVE_INTERVAL", 12)
+    args = small(make_demos(), total_steps=0, pretrain_updates=updates)
+    run = make_run(args, tmp_path)
+    saved = []
+    run.checkpoint.save = lambda: saved.append(run.progress.pretrained)
+    assert run.train()
+    run.close()
+    assert sorted(set(saved)) == sorted(set(expected))
+
+
+@pytest.mark.parametrize("algo", ["td3", "sac"])
+def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
+    options = {"total_steps": 0, "pretrain_updates": 40, "augmentation": "mirror"}
+    args = small(make_demos(), algo=algo, **options)
+
+    def weights(run):
+        return {key: x.clone() for key, x in run.agent.state_dict().items()}
+
+    whole = make_run(args, tmp_path)
+    before = weights(whole)
+    assert whole.train()
+    after = weights(whole)
+    whole.close()
+    changed = {key for key in after if not torch.equal(before[key], after[key])}
+    assert changed
+    assert any("target_actor" in key for key in changed) == (algo == "td3")
+    assert not any("value" in key or "critic" in key for key in changed)
+    assert not any("normalizer" in key for key in changed)
+    assert [row["step"] for row in whole.progress.curve] == [0, 0]
+
+    stopped = make_run(args, tmp_path)
+    assert not stopped.train(After(15))
+    stopped.close()
+    assert len(stopped.progress.curve) == 1
+    kept, policy = read_checkpoint(tmp_path)["policy"], stopped.agent.policy
+    torch.testing.assert_close(kept, dict(policy.state_dict()), rtol=0, atol=0)
+    args.resume = True
+    resumed = make_run(args, tmp_path)
+    assert resumed.progress.pretrained == 15
+    assert resumed.train()
+    resumed.close()
+    torch.testing.assert_close(weights(resumed), after, rtol=0, atol=0)
+    points = [run.progress.curve[-1]["success"] for run in (resumed, whole)]
+    assert points[0] == points[1]
+
+
+def test_what_was_imitated_is_evaluated_also_after_a_kill(make_demos, tmp_path):
+    """A kill, or a second Ctrl-C, ends the evaluation after the last imitation."""
+    options = {"total_steps": 100, "pretrain_updates": 4, "updates_per_step": 0.05}
+    args = small(make_demos(), **options)
+    whole = make_run(args, tmp_path)
+    assert whole.train()
+    whole.close()
+
+    class Kill(BaseException):
+        pass
+
+    killed = make_run(args, tmp_path)
+    add = killed.curve.add
+
+    def add_or_die(progress, losses=None):
+        if progress.curve:
+            raise Kill
+        add(progress, losses)
+
+    killed.curve.add = add_or_die
+    with pytest.raises(Kill):
+        killed.train()
+    killed.close()
+    resumed = make_run(replace(args, resume=True), tmp_path)
+    assert resumed.train()
+    resumed.close()
+    assert [row["step"] for row in resumed.progress.curve] == [0, 0, 100]
+    state = resumed.agent.state_dict()
+    for key, value in whole.agent.state_dict().items():
+        assert torch.equal(state[key], value), key

@@ -1,0 +1,39 @@
+"""LeRobot data sets: its package reads them back, pictures too, and policies learn."""
+
+import pytest
+import torch
+
+import torch_panda
+from tests.datasets.learning import imitate, record
+from torch_panda.datasets.demonstrations import read_demos
+
+lerobot_dataset = pytest.importorskip(
+    "lerobot.datasets.lerobot_dataset",
+    reason="needs the extra lerobot, which takes an environment of its own",
+)
+EPISODES = 16
+
+
+def test_round_trip_and_a_policy_of_it(tmp_path):
+    folder = tmp_path / "reach"
+    record("lerobot", folder, "PandaReach-v1", EPISODES, image_size=96)
+    dataset = lerobot_dataset.LeRobotDataset("torch_panda/reach", root=folder)
+    assert len(dataset) == EPISODES * 50
+    assert dataset.meta.total_episodes == EPISODES
+    seed = 3
+    with torch_panda.make("PandaReach-v1", seed=seed) as env:
+        start = env.reset()
+        picture = env.render(size=96)
+    first = dataset[seed * 50]
+    assert first["seed"].item() == seed
+    assert torch.equal(first["observation.state"], start["observation"])
+    goals = torch.cat((start["achieved_goal"], start["desired_goal"]))
+    assert torch.equal(first["observation.environment_state"], goals)
+    seen = 255 * first["observation.images.scene"].permute(1, 2, 0)
+    assert (seen - picture.float()).abs().mean() < 3  # a video is not exact
+    with torch_panda.make("PandaReach-v1", num_envs=16, seed=100) as env:
+        demos = read_demos(folder, env)
+        assert len(demos) == EPISODES * 49
+        assert imitate(env, demos) > 0.9
+    with pytest.raises(SystemExit, match="already"):
+        record("lerobot", folder, "PandaReach-v1", 1)

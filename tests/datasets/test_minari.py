@@ -1,0 +1,82 @@
+"""Minari data sets: others read them, episodes start again, policies learn."""
+
+import numpy as np
+import pytest
+import torch
+
+import torch_panda
+from tests.datasets.learning import imitate, record
+from torch_panda.datasets.demonstrations import read_demos
+
+minari = pytest.importorskip(
+    "minari", reason="needs the extra minari, which takes Python 3.11 or newer"
+)
+
+EPISODES = 3
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The root of Minari's data sets, and the id of one of Push."""
+    root, dataset_id = tmp_path_factory.mktemp("minari"), "panda/push-expert-v0"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(root))
+        record("minari", dataset_id, "PandaPush-v1", EPISODES, seed=5)
+        yield root, dataset_id
+
+
+@pytest.mark.filterwarnings("ignore:.*out of date")
+def test_episodes_start_again_from_id_and_seed(recorded):
+    dataset = minari.load_dataset(recorded[1])
+    metadata = list(dataset.storage.get_episode_metadata(range(EPISODES)))
+    assert [episode["seed"] for episode in metadata] == [5, 6, 7]
+    env = dataset.recover_environment()
+    assert env.spec.id == "torch_panda/PandaPush-v1"
+    for episode, found in zip(dataset, metadata, strict=True):
+        state, info = env.reset(seed=found["seed"])
+        steps = [(state, info["is_success"])]
+        for action in episode.actions:
+            state, reward, terminated, truncated, info = env.step(action)
+            steps.append((state, info["is_success"]))
+        assert (episode.terminations[-1], episode.truncations[-1]) == (False, True)
+        assert (terminated, truncated, reward) == (False, True, episode.rewards[-1])
+        for key, values in episode.observations.items():
+            np.testing.assert_array_equal(values, [state[key] for state, _ in steps])
+        success = [success for _, success in steps]
+        np.testing.assert_array_equal(episode.infos["is_success"], success)
+        assert success[-1]
+    env.close()
+
+
+def test_torchrl_reads_it_offline(recorded, tmp_path):
+    from torchrl.data.datasets.minari_data import MinariExperienceReplay
+
+    replay = MinariExperienceReplay(
+        recorded[1], batch_size=16, root=tmp_path, load_from_local_minari=True
+    )
+    assert len(replay) == EPISODES * 50
+    batch = replay.sample()
+    goals = [batch["next", "observation", f"{x}_goal"] for x in ("achieved", "desired")]
+    reward = torch_panda.Push().compute_reward(*goals)
+    assert torch.equal(reward, batch["next", "reward"].float())
+
+
+def test_a_policy_learns_from_it(recorded):
+    root, _ = recorded
+    record("minari", "panda/reach-expert-v0", "PandaReach-v1", 24)
+    folder = root / "panda/reach-expert-v0"
+    with torch_panda.make("PandaReach-v1", num_envs=16, seed=100) as env:
+        demos = read_demos(folder, env)
+        assert demos["next", "done"].sum() == 24
+        assert imitate(env, demos) > 0.9
+
+
+def test_bad_names_are_one_line(recorded):
+    for name, message in (
+        (recorded[1], "already"),
+        ("push", "ends in its version, .* such as .*, got 'push'"),
+        ("x/y-v0", "a namespace has two characters or more, .*, got 'x/y-v0'"),
+        ("panda/x.y-v0", "such as panda/push-expert-v0, got 'panda/x.y-v0'"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            record("minari", name, "PandaReach-v1", 1)

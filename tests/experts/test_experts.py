@@ -1,0 +1,84 @@
+"""The scripted experts: they solve their tasks, from observations alone."""
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+
+import torch_panda
+from torch_panda import experts
+from torch_panda.commands import record as record_demos
+
+
+def successes(env_id, episodes, seed):
+    """Success at the end of each episode, and the episodes."""
+    with torch_panda.make(env_id, num_envs=episodes, seed=seed) as env:
+        episodes = record_demos.play(env, experts.make_expert(env_id))
+    return [bool(episode["next", "success"][-1]) for episode in episodes], episodes
+
+
+# Bounds that the measured rates miss less than once in 1,000 draws of so many episodes.
+# Random actions succeed at the end of one Push episode in nine, and more rarely else.
+@pytest.mark.parametrize(
+    ("env_id", "episodes", "least"),
+    [
+        ("PandaReach-v1", 16, 16),
+        ("PandaPush-v1", 16, 15),
+        ("PandaSlide-v1", 32, 20),
+        ("PandaPickAndPlace-v1", 16, 15),
+        ("PandaStack-v1", 16, 12),
+        ("PandaFlip-v1", 48, 28),
+        ("PandaDrawer-v1", 16, 15),
+        ("PandaPegInsertion-v1", 16, 15),
+        ("PandaPush-v3", 16, 13),
+        ("PandaFlip-v3", 32, 20),
+    ],
+)
+def test_solves_its_task(env_id, episodes, least):
+    done, _ = successes(env_id, episodes, seed=11)
+    assert sum(done) >= least
+
+
+def test_v3_episodes_end_at_success():
+    done, episodes = successes("PandaReach-v3", 16, seed=3)
+    assert all(done)
+    for episode in episodes:
+        assert episode["next", "done"].sum() == 1
+        assert not episode["next", "success"][:-1].any()
+
+
+@pytest.mark.parametrize("task", list(experts.EXPERTS))
+def test_the_actions_of_an_environment_depend_on_its_observation_only(task):
+    torch.manual_seed(0)
+    env_id = f"Panda{task}-v1"
+    expert = experts.make_expert(env_id)
+    with torch_panda.make(env_id, num_envs=4, seed=0) as env:
+        rollout = env.rollout(20, expert, break_when_any_done=False)
+    keys = ["observation", "achieved_goal", "desired_goal"]
+    order = torch.randperm(rollout.numel())
+    shuffled = rollout.reshape(-1)[order]
+    again = expert(shuffled.select(*keys))["action"]
+    assert torch.allclose(again, shuffled["action"], atol=1e-5)
+
+
+def test_a_single_environment_has_no_batch_dimension():
+    with torch_panda.make("PandaFlip-v1", seed=0) as env:
+        rollout = env.rollout(3, experts.make_expert("PandaFlip-v1"))
+    assert rollout["action"].shape == (3, 4)
+
+
+def test_collectors_take_an_expert():
+    env = torch_panda.make("PandaReach-v1", num_envs=4, seed=0)
+    expert = experts.make_expert("PandaReach-v1")
+    collector = Collector(env, expert, frames_per_batch=400, total_frames=400)
+    (data,) = list(collector)
+    collector.shutdown()
+    # The episodes' last steps: 100 steps are two episodes of each environment.
+    assert data["next", "success"][:, [49, 99]].all()
+
+
+@pytest.mark.parametrize(
+    "env_id", ["PandaPushJoints-v1", "PandaFly-v1", "PandaDrawer-v3", "Push"]
+)
+def test_ids_without_an_expert(env_id):
+    with pytest.raises(ValueError, match="no expert for"):
+        experts.make_expert(env_id)

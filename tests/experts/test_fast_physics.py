@@ -1,0 +1,55 @@
+"""Experts succeed as often under `physics="fast"`: pytest -m slow -s this file."""
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda import experts
+from torch_panda.commands import record as record_demos
+
+pytestmark = pytest.mark.slow
+
+
+def success(task, physics, episodes):
+    """Whether an expert succeeds, at the end and at any time: (episodes, 2)."""
+    env_id, flags = f"Panda{task}-v1", []
+    expert = experts.make_expert(env_id)
+    with torch_panda.make(env_id, num_envs=32, seed=7, physics=physics) as env:
+        while len(flags) < episodes:
+            for episode in record_demos.play(env, expert):
+                reached = episode["next", "success"]
+                flags.append((reached[-1].item(), reached.any().item()))
+    return torch.tensor(flags).double()
+
+
+# Slide and Flip hang by a thread in exact physics, too: more episodes tell. At Slide
+# 5 points are allowed, and it needs exact timing: 20 substeps.
+STRIKES = pytest.mark.xfail(strict=True, reason="hangs on a few percent of a strike")
+EARLY_END = {"residual_threshold": 1e-3}  # of the solver, and all else exact
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("task", "physics", "episodes", "allowed"),
+    [
+        ("Reach", "fast", 256, 2),
+        ("Push", "fast", 256, 2),
+        ("PickAndPlace", "fast", 256, 2),
+        ("Stack", "fast", 256, 2),
+        pytest.param("Slide", "fast", 2048, 5, marks=STRIKES),
+        pytest.param("Flip", "fast", 1024, 2, marks=STRIKES),
+        ("Slide", EARLY_END, 2048, 5),
+    ],
+)
+def test_experts_succeed_as_often(task, physics, episodes, allowed):
+    """At the end of the episode: nearly, but for the sampling error."""
+    params = physics if physics == "fast" else torch_panda.PhysicsParams(**physics)
+    exact, other = (success(task, p, episodes) for p in ("exact", params))
+    change = 100 * (other - exact)  # the same starts and goals: paired
+    mean, error = change.mean(0), 1.96 * change.std(0) / episodes**0.5
+    for k, when in enumerate(("at the end", "at any time")):
+        print(
+            f"{task}: {when} exact {100 * exact[:, k].mean():.1f} %, {physics} "
+            f"{100 * other[:, k].mean():.1f} %, {mean[k]:+.1f} +- {error[k]:.1f}"
+        )
+    assert mean[0] + error[0] > -allowed

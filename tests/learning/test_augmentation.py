@@ -1,0 +1,78 @@
+"""Transitions that are mirrored and moved: which rows, and how."""
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda.learning.augmentation import SHIFT, Augmentation, mirror, shift
+from torch_panda.learning.geometry import read_geometry
+from torch_panda.learning.transitions import Transitions
+
+
+@pytest.fixture(scope="module")
+def env():
+    with torch_panda.make("PandaStack-v1", num_envs=8, seed=0) as env:
+        yield env
+
+
+def transitions(env):
+    return Transitions.from_tensordict(env.rollout(1).reshape(-1))
+
+
+def test_every_second_row_is_mirrored(env):
+    geometry = read_geometry(env)
+    rows = transitions(env)
+    found = mirror(rows, geometry)
+    names = ("observation", "goal", "action", "next_observation")
+    for name in names:
+        factors = getattr(geometry, name.removeprefix("next_"))
+        now, was = getattr(found, name), getattr(rows, name)
+        assert (now[1::2] == was[1::2]).all()
+        torch.testing.assert_close(now[::2], was[::2] * torch.tensor(factors))
+        assert (now[::2] != was[::2]).any()
+    assert found.reward is rows.reward
+    twice = mirror(found, geometry)
+    assert all(torch.equal(getattr(twice, x), getattr(rows, x)) for x in names)
+
+
+def test_shift(env):
+    geometry, few = read_geometry(env), transitions(env)
+    before = Transitions(*(x.repeat(50, *[1] * (x.ndim - 1)) for x in few))
+    torch.manual_seed(0)
+    rows = shift(before, geometry, 0.2)
+    moved = rows.goal - before.goal
+    some = (moved != 0).any(1)
+    assert 0.4 < some.double().mean() < 0.6
+    assert (moved[:, [0, 1]].abs().amax(0) > 0.15).all()
+    assert (moved[:, [0, 1]].abs() <= 0.2).all()
+    torch.testing.assert_close(moved[:, :3], moved[:, 3:])
+    assert (moved[:, 2] == 0).all()
+    for name in ("observation", "next_observation"):
+        now, was = getattr(rows, name), getattr(before, name)
+        assert (now[~some] == was[~some]).all()
+        torch.testing.assert_close(
+            geometry.differences(now, rows.goal), geometry.differences(was, before.goal)
+        )
+        changed = (now != was).any(0).nonzero().flatten()
+        assert changed.tolist() == [0, 1, 7, 8, 19, 20]
+        torch.testing.assert_close((now - was)[:, :3], moved[:, :3])
+
+
+@pytest.mark.parametrize("kind", ["none", "mirror", "mirror-shift"])
+def test_kinds(env, kind):
+    geometry, rows = read_geometry(env), transitions(env)
+    torch.manual_seed(0)
+    found = Augmentation(geometry, kind)(rows)
+    expected = rows if kind == "none" else mirror(rows, geometry)
+    torch.manual_seed(0)
+    if kind == "mirror-shift":
+        expected = shift(expected, geometry, SHIFT)
+    assert all(map(torch.equal, found, expected))
+
+
+def test_joint_control_has_no_mirror():
+    with torch_panda.make("PandaPushJoints-v1", num_envs=1) as env:
+        geometry = read_geometry(env)
+    with pytest.raises(ValueError, match="pass --augmentation none"):
+        Augmentation(geometry, "mirror")
+    Augmentation(geometry, "none")

@@ -1,0 +1,123 @@
+"""What the agents assume about the tasks holds in their physics."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+import torch_panda
+from torch_panda.experts.cube_orientations import (
+    STRAIGHT,
+    compose,
+    straighten,
+    to_matrix,
+)
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.geometry import read_geometry
+from torch_panda.rotations import rotation_distance
+
+MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
+MIRROR_VELOCITY = torch.tensor([1, -1, 1, -1, 1, -1], dtype=torch.float64)
+
+
+TASKS = ["Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip"]
+
+
+@pytest.mark.parametrize("task", [*TASKS, "Drawer", "PegInsertion"])
+def test_mirrored_starts_and_actions_give_mirrored_episodes(task):
+    """Of an arm that moves, and of objects that tumble through the air above it."""
+    generator = torch.Generator().manual_seed(0)
+    with torch_panda.make(f"Panda{task}-v1", num_envs=2, seed=3) as env:
+        geometry = read_geometry(env)
+        assert geometry.action is not None
+        state = env.reset().update(env.get_state())
+        pose, velocity = state["object_pose"], state["object_velocity"]
+        pose[0] = torch.randn(pose[0].shape, generator=generator)
+        pose[0, :, 3:] /= pose[0, :, 3:].norm(dim=-1, keepdim=True)
+        pose[0, :, 2] += 20.0
+        velocity[0] = torch.randn(velocity[0].shape, generator=generator)
+        pose[1], velocity[1] = pose[0] * MIRROR_POSE, velocity[0] * MIRROR_VELOCITY
+        if "object_joint_position" in state.keys():  # noqa: SIM118 (a TensorDict)
+            state["object_joint_position"][1] = state["object_joint_position"][0]
+        goal = state["desired_goal"]
+        goal[1] = goal[0] * torch.tensor(geometry.goal)
+        td = env.reset(state, set_state=True)
+        for _ in range(10):
+            action = 0.2 * torch.randn(len(geometry.action), generator=generator)
+            action[1] += 0.1  # out of the plane
+            td["action"] = torch.stack((action, action * torch.tensor(geometry.action)))
+            td = env.step(td)["next"]
+            one, mirrored = td["observation"]
+            one = one * torch.tensor(geometry.observation)
+            arm = env.robot.observation_dim
+            if task == "Flip":  # a quaternion and its negative are one orientation
+                quaternion = slice(arm + 3, arm + 7)
+                one[quaternion] *= (one[quaternion] @ mirrored[quaternion]).sign()
+            # The hand is 0.3 degrees off the plane, and moves differently by so much
+            # [m, m/s] where it moves at up to 0.5 m/s.
+            error = (mirrored - one).abs()
+            assert error[:3].max() < 0.01
+            assert error[:arm].max() < 0.05
+            assert one[1].abs() > 1e-3  # not in the plane itself
+            torch.testing.assert_close(mirrored[arm:], one[arm:], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("task", ["Push", "PickAndPlace", "Stack"])
+def test_differences(task):
+    with torch_panda.make(f"Panda{task}-v1", num_envs=3, seed=0) as env:
+        td = env.reset()
+        found = read_geometry(env).differences(td["observation"], td["desired_goal"])
+        objects = td["achieved_goal"].unflatten(-1, (-1, 3))
+        goals = td["desired_goal"].unflatten(-1, (-1, 3))
+        from_hand = objects - td["observation"][:, None, :3]
+        expected = torch.cat((from_hand, goals - objects), 1).flatten(1)
+        torch.testing.assert_close(found, expected)
+
+
+def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
+    generator = torch.Generator().manual_seed(0)
+    with torch_panda.make("PandaFlip-v1", seed=0) as env:
+        geometry = read_geometry(env)
+    place = slice(geometry.orientation, geometry.orientation + 4)
+    observation = torch.randn(20, 20, generator=generator)
+    goal = normalize(torch.randn(20, 4, generator=generator), dim=-1)
+    cube = observation[:, place] = normalize(observation[:, place], dim=-1)
+    seen, turn, matrix, likeness = geometry.turns(observation, goal)
+    # It leads from the cube to the goal, and no other of the 24 is nearer.
+    torch.testing.assert_close(matrix, to_matrix(turn).flatten(-2))
+    torch.testing.assert_close(
+        matrix.view(20, 3, 3) @ to_matrix(cube), to_matrix(goal), atol=1e-5, rtol=0
+    )
+    others = compose(cube[:, None], STRAIGHT)
+    torch.testing.assert_close(seen[:, place][:, 3], others[..., 3].abs().amax(1))
+    # As like one of the 24 as the cube's straight orientation, so turned, is the goal.
+    turned = compose(STRAIGHT, straighten(cube)[:, None])
+    left = rotation_distance(turned, goal[:, None]).squeeze(-1)
+    torch.testing.assert_close(likeness, 1 - left)
+    for same in STRAIGHT:
+        alike = observation.clone()
+        alike[:, place] = compose(cube, same)
+        again = geometry.turns(alike, compose(goal, same))
+        expected = (seen, turn, matrix, likeness)
+        torch.testing.assert_close(again, expected, atol=1e-5, rtol=0)
+
+
+class PushAndTell(torch_panda.Push):
+    """Observes one number more."""
+
+    observation_dim = 13
+
+    def observation(self, simulation):
+        height = simulation.object_pose[:, 0, 2:3]
+        return torch.cat((super().observation(simulation), height), 1)
+
+
+@pytest.mark.parametrize(
+    "options", [{"relative_inputs": "coarse"}, {"augmentation": "mirror-shift"}]
+)
+def test_other_layouts_are_not_guessed(options):
+    scene = {"robot": torch_panda.Panda(block_gripper=True), "task": PushAndTell()}
+    with torch_panda.RobotTaskEnv(**scene, num_envs=2) as env:
+        with pytest.raises(ValueError, match=r"\[18, 3\] numbers here, got \[19, 3\]"):
+            make_agent(env, Hyperparameters(**options))
+        agent = make_agent(env, Hyperparameters())
+        assert env.rollout(2, agent.policy)["action"].shape == (2, 2, 3)

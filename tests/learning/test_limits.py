@@ -1,0 +1,99 @@
+"""The numbers that the scripts accept: others are refused before a run starts."""
+
+import importlib
+import re
+from dataclasses import fields
+from math import inf, nan
+from typing import get_args, get_type_hints
+
+import pytest
+
+from torch_panda.commands import evaluate, train, watch
+from torch_panda.commands import record as record_demos
+from torch_panda.learning.limits import check_limits, find_limits
+
+
+def numbers(hint):
+    """Whether a type has numbers."""
+    parts = get_args(hint)
+    return any(map(numbers, parts)) if parts else hint in (int, float)
+
+
+@pytest.mark.parametrize(
+    "script",
+    ["train", "evaluate", "record", "refine", "watch", "distributed"],
+)
+def test_every_number_has_a_limit(script):
+    if script == "distributed":
+        pytest.importorskip("ray")
+    options = importlib.import_module(f"torch_panda.commands.{script}").Args
+    hints = get_type_hints(options, include_extras=True)
+    names = [option.name for option in fields(options) if numbers(hints[option.name])]
+    assert len(names) > 1
+    assert not [name for name in names if not list(find_limits(hints[name]))]
+
+
+def refused(script, message, **options):
+    """The script ends with one line, this one."""
+    with pytest.raises(SystemExit, match=f"^{message}$") as stop:
+        script.main(script.Args(**options))
+    assert "\n" not in str(stop.value)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        *(("seed", -1), ("seed", 2**64), ("total_steps", -1), ("eval_interval", 0)),
+        *(("num_envs", 0), ("batch_size", 0), ("target_interval", 0)),
+        *(("updates_per_step", -0.5), ("updates_per_step", inf), ("action_l2", nan)),
+        *(("noise_eps", -0.1), ("pretrain_updates", -1), ("start_at_object", 2.0)),
+        *(("desired_ratio", -0.1), ("desired_ratio", 1.1), ("desired_ratio", nan)),
+        *(("random_eps", (1.5, 0.0)), ("random_eps", (0.0, nan))),
+        *(("gamma", 0.0), ("gamma", 1.01)),
+    ],
+)
+def test_training_refuses(tmp_path, option, value):
+    hints = get_type_hints(train.Args, include_extras=True)
+    limit, *_ = find_limits(hints[option])
+    message = re.escape(f"{option} must be {limit.description}, got {value}")
+    out = tmp_path / "run"
+    refused(train, message, **{option: value}, out=out)
+    assert not out.exists()
+
+
+def test_training_refuses_what_does_not_explore(tmp_path):
+    options = {"noise_eps": 0.0, "random_eps": (0.0, 0.5)}
+    message = "algo ddpg explores by noise_eps and random_eps: .*"
+    refused(train, message, num_envs=1, out=tmp_path / "run", **options)
+
+
+@pytest.mark.parametrize("device", ["", "nothing", "meta", "cuda:99"])
+def test_devices_that_do_not_work(tmp_path, device):
+    message = f"device must be one that torch can use here, .* got '{device}': .+"
+    refused(train, message, device=device, out=tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("script", "option", "value"),
+    [
+        *((evaluate, "episodes", 0), (evaluate, "num_envs", 0), (evaluate, "seed", -1)),
+        (evaluate, "task_options", {"play": nan}),
+        *((record_demos, "episodes", 0), (record_demos, "num_envs", 0)),
+        *((watch, "num_envs", 0), (watch, "seed", 2**64)),
+        *((watch, "port", 0), (watch, "port", 65536)),
+    ],
+)
+def test_others_refuse(tmp_path, script, option, value):
+    (tmp_path / "checkpoint.pt").touch()
+    options = {option: value} | ({"run": tmp_path} if script is evaluate else {})
+    refused(script, f"{option} must be .*, got {value}", **options)
+
+
+def test_accepts_ends_of_ranges():
+    lowest = {"seed": 0, "desired_ratio": 0.0, "random_eps": (0.0, 0.0)}
+    check_limits(train.Args(**lowest, updates_per_step=0.0, total_steps=0))
+    highest = {"seed": 2**64 - 1, "desired_ratio": 1.0, "random_eps": (1.0, 1.0)}
+    check_limits(train.Args(**highest, gamma=1.0))
+    check_limits(train.Args(gamma=None))
+    for port in (1, 65535):
+        check_limits(watch.Args(port=port))

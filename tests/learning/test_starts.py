@@ -1,0 +1,144 @@
+"""Training episodes that begin with the hand at an object."""
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+
+import torch_panda
+from torch_panda.learning.starts import PHYSICAL, StartFrom, states_at_objects
+
+NUM_ENVS = 8
+
+
+@pytest.fixture(scope="module")
+def states():
+    return states_at_objects("PandaPush-v1", seed=3)
+
+
+def place(env, states):
+    """Let the first environments start from these states."""
+    return env.reset(states[: env.num_envs].exclude("placed"), set_state=True)
+
+
+@pytest.mark.parametrize("task", ["Push", "Slide"])
+def test_hand_beside_an_object_at_rest(task):
+    states = states_at_objects(f"Panda{task}-v1", seed=0)
+    assert len(states) >= 24
+    with torch_panda.make(f"Panda{task}-v1", num_envs=24) as env:
+        td = place(env, states)
+        offset = td["observation"][:, :3] - td["achieved_goal"]
+        still = env.step(td.set("action", torch.zeros(24, 3)))["next", "achieved_goal"]
+    distance = offset[:, :2].norm(dim=-1)
+    assert ((distance > 0.045) & (distance < 0.09)).all()
+    assert (offset[:, 2].abs() < 0.01).all()
+    quadrants = {(x > 0, y > 0) for x, y in offset[:, :2].tolist()}
+    assert len(quadrants) == 4
+    torch.testing.assert_close(still, td["achieved_goal"], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("task", "number"), [("PickAndPlace", 1), ("Stack", 2)])
+def test_hand_holds_an_object(task, number):
+    states = states_at_objects(f"Panda{task}-v1", seed=0)
+    assert len(states) >= 20
+    with torch_panda.make(f"Panda{task}-v1", num_envs=20) as env:
+        td = place(env, states)
+        before = td["achieved_goal"].unflatten(-1, (number, 3))
+        for _ in range(6):
+            up = torch.tensor([0.0, 0.0, 0.5, -1.0]).repeat(20, 1)
+            td = env.step(td.set("action", up))["next"]
+        lifted = td["achieved_goal"].unflatten(-1, (number, 3)) - before
+    raised = lifted[..., 2] > 0.05
+    placed = states["placed"][:20, 0]
+    assert placed.any() == (task == "Stack")
+    assert (raised[~placed].sum(1) == 1).all()
+    assert raised.any(0).all()  # each object in some states
+    assert not raised[placed][:, :-1].any()
+    if placed.any():
+        assert 0.3 < raised[placed, -1].double().mean() < 0.7  # the others lie there
+
+
+def test_lower_cube_of_a_stack_can_be_at_its_goal():
+    """In half of the states, and it stays there: the upper one is held up, or lies."""
+    states = states_at_objects("PandaStack-v1", seed=0, number=64)
+    placed = states[states["placed"][:, 0]]
+    assert 0.4 < len(placed) / len(states) < 0.6
+    torch.manual_seed(0)
+    with torch_panda.make("PandaStack-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartFrom(placed, 1.0))
+        td = env.reset()
+        lower, upper = td["achieved_goal"].split(3, -1)
+        goal = td["desired_goal"][:, :3]
+        begun = (lower - goal).norm(dim=1) < 1e-3
+        # The others had no room: they begin as the task does.
+        assert begun.sum() >= NUM_ENVS / 2
+        held = upper[:, 2] > 0.1
+        assert (begun & held).any()
+        assert (begun & ~held).any()
+        for _ in range(10):
+            hold = torch.tensor([0.0, 0.0, 0.0, -1.0]).repeat(NUM_ENVS, 1)
+            td = env.step(td.set("action", hold))["next"]
+            lower, upper = td["achieved_goal"].split(3, -1)
+            torch.testing.assert_close(lower[begun], goal[begun], atol=2e-3, rtol=0)
+            assert (upper[begun & held, 2] > 0.08).all()
+        assert len(goal.unique(dim=0)) == NUM_ENVS
+
+
+def test_where_no_object_has_room_episodes_begin_as_the_task_does():
+    states = states_at_objects("PandaStack-v1", seed=0)
+    lies = states["placed"][:, 0] & (states["object_pose"][:, -1, 2] < 0.1)
+    with torch_panda.make("PandaStack-v1", num_envs=1, seed=0) as base:
+        goal = base.reset()["desired_goal"][0, :2]
+        base.set_seed(0)
+        crowded = states[lies][:1].clone()
+        crowded["object_pose"][0, -1, :2] = goal.to(crowded["object_pose"])
+        td = TransformedEnv(base, StartFrom(crowded, 1.0)).reset()
+        base.set_seed(0)
+        assert (td["observation"] == base.reset()["observation"]).all()
+
+
+def test_ratio_of_the_episodes(states):
+    # Hands that start in the neutral position are 20 cm high.
+    with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartFrom(states, 0.3))
+        torch.manual_seed(0)
+        starts = torch.stack([env.reset() for _ in range(50)])
+        low = starts["observation"][..., 2] < 0.1
+        assert 0.2 < low.float().mean() < 0.4
+        assert low.any(0).all()
+        assert not low.all(1).any()
+        goals = starts["desired_goal"].flatten(0, 1)
+        assert len(goals.unique(dim=0)) == len(goals)
+        # They are not the goals that the states were saved with.
+        assert (goals[low.flatten()].std(0)[:2] > 0.07).all()
+        reached = starts["achieved_goal"][low]
+        known = states["object_pose"][:, 0, :3].float()
+        torch.testing.assert_close(
+            (reached[:, None] - known).abs().amax(-1).amin(1),
+            torch.zeros(len(reached)),
+        )
+        td = env.rollout(3)
+        assert td.batch_size == (NUM_ENVS, 3)
+        assert not set(PHYSICAL) & set(td.keys())
+
+
+def test_partial_reset_leaves_the_others_alone(states):
+    with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartFrom(states, 1.0))
+        td = env.rollout(3)[:, -1]["next"]
+        before = base.get_state()
+        td["_reset"] = torch.zeros(NUM_ENVS, 1, dtype=torch.bool)
+        td["_reset"][2] = True
+        after = env.reset(td)
+        state = base.get_state()
+        others = torch.arange(NUM_ENVS) != 2
+        assert (state[others] == before[others]).all()
+        assert (after["observation"][others] == td["observation"][others]).all()
+        known = states["joint_position"]
+        assert (state["joint_position"][2] == known).all(1).any()
+        assert state["step_count"].flatten().tolist() == [3, 3, 0, 3, 3, 3, 3, 3]
+
+
+@pytest.mark.parametrize("env_id", ["PandaReach-v1", "PandaPushJoints-v1"])
+def test_tasks_that_cannot_start_so(env_id):
+    with pytest.raises(ValueError, match=f"end-effector .* got {env_id}"):
+        states_at_objects(env_id, seed=0)

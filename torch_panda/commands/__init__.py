@@ -1,0 +1,47 @@
+"""The commands of ``python -m torch_panda``, a module each.
+
+A module has its options, ``Args``, and ``main(args)``. It is imported when its command
+runs, because commands need libraries that the environments do not.
+"""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+# Names of commands, and what they do.
+COMMANDS = {
+    "train": "train an agent with hindsight experience replay",
+    "evaluate": "measure how often a policy succeeds",
+    "watch": "record a policy as a video, or show it in a window or browser",
+    "record": "record demonstrations of a scripted expert",
+    "plot": "draw the success curves of runs",
+    "refine": "let a policy imitate itself on the goals that it achieved",
+    "distributed": "train on the machines of a Ray cluster",
+    "bench": "measure steps per second beside other environments",
+    "info": "print versions, environments, threads and renderers",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command.
+
+    Args:
+        arguments: the command's name and its options; None takes those of the process.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help"):
+        print(describe())
+        return
+    if name not in COMMANDS:
+        raise SystemExit(f"unknown command {name!r}\n\n{describe()}")
+    import_module(f"torch_panda.commands.{name}").run(arguments[1:])
+
+
+def describe() -> str:
+    """The usage, with a line for each command."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:{width}}  {text}" for name, text in COMMANDS.items()]
+    usage = "usage: python -m torch_panda COMMAND [OPTIONS]"
+    hint = "python -m torch_panda COMMAND --help lists the options of a command"
+    return "\n".join([usage, "", "commands:", *lines, "", hint])

@@ -1,0 +1,674 @@
+"""Benchmark: steps per second of torch_panda beside other vector environments.
+
+The contenders take turns (A B C, A B C, ...), so that other work on the machine slows
+all of them. Each turn runs in a process of its own, which makes the environments, warms
+up, measures and ends. Only one contender is in memory at any time.
+"""
+
+import math
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any, Literal, NamedTuple, get_args
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase, GymEnv, ParallelEnv
+from tqdm import tqdm
+
+import torch_panda
+from torch_panda.bullet.native import loop_name
+from torch_panda.info import num_cores
+from torch_panda.transforms import HindsightRelabel
+
+OURS = "torch_panda"
+Other = Literal["fast", "bare-bullet", "async", "sb3", "parallel", "fetch", "envpool"]
+
+
+@dataclass
+class Args:
+    """Compare steps per second with other vector environments, in turns."""
+
+    ids: tuple[str, ...] = ("PandaPush-v3",)
+    """environments to measure; `python -m torch_panda info` lists the ids"""
+    num_envs: tuple[int, ...] = (16,)
+    """numbers of environments that are stepped in parallel"""
+    num_threads: int | None = None
+    """number of threads of contenders that use threads; None means one per core, and at
+    most one per environment"""
+    others: tuple[Other, ...] = get_args(Other)
+    """contenders beside torch_panda; one whose libraries are missing is skipped"""
+    rounds: int = 7
+    """number of turns of each contender; the table shows the median"""
+    steps: int = 50
+    """steps of each environment in a turn, after as many steps that warm up"""
+    render_size: int | None = None
+    """observe pictures of this width and height [pixels]; measures only torch_panda,
+    "fast" and "async" """
+    buffers: bool = False
+    """measure replay buffers with and without hindsight instead of environments"""
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """picture of the speeds to write, for instance speed.png"""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A workload that all contenders run.
+
+    Attributes:
+        env_id: Id of one of our environments.
+        num_envs: Number of environments stepped in parallel.
+        num_threads: Number of threads of contenders that use threads.
+        render_size: Width and height of observed pictures [pixels]; None means none.
+    """
+
+    env_id: str
+    num_envs: int
+    num_threads: int
+    render_size: int | None = None
+
+
+class Running(NamedTuple):
+    """Environments of a contender. ``step`` steps all of them with random actions."""
+
+    step: Callable[[], object]
+    close: Callable[[], object]
+
+
+class Measurement(NamedTuple):
+    """Result of one turn.
+
+    Attributes:
+        speed: Steps of all environments together [1/s].
+        cpu_speed: The same per second of processor time of all processes. Other work
+            on the machine hardly changes it. NaN where the system does not tell.
+        creation: Time to create one environment, without imports [s].
+        memory: Memory of one environment [MB]; NaN where the system does not tell.
+    """
+
+    speed: float
+    cpu_speed: float
+    creation: float
+    memory: float
+
+
+# Contenders -------------------------------------------------------------------
+
+
+def _run_torchrl(env: EnvBase) -> Running:
+    td: TensorDictBase = env.reset()
+
+    def step() -> None:
+        nonlocal td
+        td["action"] = torch.rand(env.action_spec.shape) * 2 - 1
+        _, td = env.step_and_maybe_reset(td)
+
+    return Running(step, env.close)
+
+
+def _run_vector_env(
+    env: Any,  # noqa: ANN401 (of Gymnasium, Stable-Baselines3 or EnvPool)
+    num_envs: int,
+    action_space: gymnasium.Space[Any],
+) -> Running:
+    rng = np.random.default_rng(0)
+    shape = (num_envs, gymnasium.spaces.flatdim(action_space))
+    env.reset()
+
+    def step() -> None:
+        env.step(rng.uniform(-1, 1, size=shape).astype(np.float32))
+
+    return Running(step, env.close)
+
+
+def _make_env(setting: Setting, **options: Any) -> torch_panda.RobotTaskEnv:  # noqa: ANN401 (options of make)
+    if setting.render_size is not None:
+        options |= {"from_pixels": True, "render_size": setting.render_size}
+    return torch_panda.make(
+        setting.env_id,
+        num_envs=setting.num_envs,
+        num_threads=setting.num_threads,
+        seed=0,
+        **options,
+    )
+
+
+def _make_ours(setting: Setting, **options: Any) -> Running:  # noqa: ANN401 (options of make)
+    return _run_torchrl(_make_env(setting, **options))
+
+
+def _make_bare_bullet(setting: Setting) -> Running:
+    """Our native loop with nothing between its steps.
+
+    It repeats an episode of random actions, whose setpoints it computes the first time.
+    """
+    if loop_name() != "native":
+        raise RuntimeError("torch_panda was installed without its native loop")
+    env = _make_env(setting)
+    env.reset()
+    simulation, robot = env.episodes.simulation, env.robot
+    start = [
+        (tensor, tensor.clone())
+        for tensor in (
+            simulation.joint_position,
+            simulation.joint_velocity,
+            simulation.object_pose,
+            simulation.object_velocity,
+            simulation.object_joint_position,
+            simulation.object_joint_velocity,
+        )
+    ]
+    setpoints: list[np.ndarray] = []
+    num_steps = 0
+
+    def step() -> None:
+        nonlocal num_steps
+        if num_steps == env.max_episode_steps:
+            for tensor, value in start:
+                tensor.copy_(value)
+            simulation.reset(range(setting.num_envs))
+            num_steps = 0
+        if num_steps == len(setpoints):
+            action = env.action_spec.rand()
+            setpoints.append(robot.setpoint(action, simulation).numpy())
+        simulation.step(robot.motor_control, setpoints[num_steps])
+        num_steps += 1
+
+    return Running(step, env.close)
+
+
+def _panda_gym_id(setting: Setting) -> str:
+    major = version("panda-gym").split(".")[0]
+    # The prefix names the module whose import registers the id.
+    return f"panda_gym:{setting.env_id.rsplit('-', 1)[0]}-v{major}"
+
+
+def _make_panda_gym_env(setting: Setting) -> gymnasium.Env[Any, Any]:
+    if setting.render_size is None:
+        return gymnasium.make(_panda_gym_id(setting))
+    env = gymnasium.make(
+        _panda_gym_id(setting),
+        render_mode="rgb_array",
+        renderer="Tiny",
+        render_width=setting.render_size,
+        render_height=setting.render_size,
+    )
+    return gymnasium.wrappers.AddRenderObservation(env, render_only=True)
+
+
+def _make_async(
+    make_env: Callable[[Setting], gymnasium.Env[Any, Any]], setting: Setting
+) -> Running:
+    env = gymnasium.vector.AsyncVectorEnv(
+        [partial(make_env, setting)] * setting.num_envs, context="fork"
+    )
+    return _run_vector_env(env, setting.num_envs, env.single_action_space)
+
+
+def _make_sb3(setting: Setting) -> Running:
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    env = SubprocVecEnv(
+        [partial(_make_panda_gym_env, setting)] * setting.num_envs, start_method="fork"
+    )
+    return _run_vector_env(env, setting.num_envs, env.action_space)
+
+
+def _make_parallel(setting: Setting) -> Running:
+    make_env = partial(GymEnv, _panda_gym_id(setting))
+    return _run_torchrl(ParallelEnv(setting.num_envs, make_env, mp_start_method="fork"))
+
+
+def _newest_fetch_id(env_id: str, ids: Sequence[str]) -> str:
+    """Newest version of the Fetch robot's task of the same name."""
+    match = re.fullmatch(r"Panda(Reach|Push|Slide|PickAndPlace)(Dense)?-v\d+", env_id)
+    if match is None:
+        raise ValueError(f"Fetch has no task like {env_id}")
+    prefix = f"Fetch{match[1]}{match[2] or ''}-v"
+    versions = [int(x.removeprefix(prefix)) for x in ids if x.startswith(prefix)]
+    return f"{prefix}{max(versions)}"
+
+
+def _make_fetch_env(setting: Setting) -> gymnasium.Env[Any, Any]:
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium.make(_newest_fetch_id(setting.env_id, list(gymnasium.registry)))
+
+
+def _make_envpool(setting: Setting) -> Running:
+    import envpool
+
+    env = envpool.make(
+        _newest_fetch_id(setting.env_id, envpool.list_all_envs()),
+        env_type="gymnasium",
+        num_envs=setting.num_envs,
+        num_threads=setting.num_threads,
+    )
+    return _run_vector_env(env, setting.num_envs, env.action_space)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Vector environment to compare.
+
+    Attributes:
+        title: Name in the table.
+        make: Makes the environments of a setting.
+        memory: Typical memory of one environment [MB].
+        modules: Modules that must be installed.
+        renders: Whether it can observe pictures.
+    """
+
+    title: str
+    make: Callable[[Setting], Running]
+    memory: float
+    modules: tuple[str, ...] = ()
+    renders: bool = False
+
+    def obstacle(self, setting: Setting) -> str | None:
+        """Reason why the contender cannot run here; None if it can."""
+        missing = [module for module in self.modules if find_spec(module) is None]
+        if missing:
+            return f"{' and '.join(missing)} is not installed"
+        if setting.render_size is not None and not self.renders:
+            return "--render-size is not supported"
+        needed, free = self.memory * setting.num_envs, available_memory()
+        # Linux ends arbitrary processes when memory runs out.
+        if needed > 0.9 * free:
+            return (
+                f"{setting.num_envs} environments need about {needed / 1000:.1f} GB, "
+                f"{free / 1000:.1f} GB are free"
+            )
+        return None
+
+
+CONTENDERS: dict[str, Contender] = {
+    OURS: Contender("torch_panda", _make_ours, 45, renders=True),
+    "fast": Contender(
+        'torch_panda, physics="fast"',
+        partial(_make_ours, physics="fast"),
+        45,
+        renders=True,
+    ),
+    "bare-bullet": Contender("bare Bullet, C threads", _make_bare_bullet, 45),
+    "async": Contender(
+        "panda-gym, AsyncVectorEnv",
+        partial(_make_async, _make_panda_gym_env),
+        115,
+        ("panda_gym",),
+        renders=True,
+    ),
+    "sb3": Contender(
+        "panda-gym, SB3 SubprocVecEnv",
+        _make_sb3,
+        155,
+        ("panda_gym", "stable_baselines3"),
+    ),
+    "parallel": Contender(
+        "panda-gym, torchrl ParallelEnv", _make_parallel, 115, ("panda_gym",)
+    ),
+    "fetch": Contender(
+        "Fetch (MuJoCo), AsyncVectorEnv",
+        partial(_make_async, _make_fetch_env),
+        50,
+        ("gymnasium_robotics",),
+    ),
+    "envpool": Contender("Fetch (MuJoCo), EnvPool", _make_envpool, 15, ("envpool",)),
+}
+
+
+# Measurement ------------------------------------------------------------------
+
+
+def measure(name: str, setting: Setting, steps: int) -> Measurement:
+    """Measure one turn of a contender in a new process.
+
+    Args:
+        name: Key of `CONTENDERS`.
+        setting: Workload.
+        steps: Steps of each environment, after as many steps that warm up.
+
+    Raises:
+        Exception: The contender's own error, or ``BrokenProcessPool`` if its process
+            died.
+    """
+    # A forked server imports this module only once, and has no threads yet.
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_measure_here, name, setting, steps).result()
+
+
+def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
+    torch.set_num_threads(1)
+    # pybullet prints on stdout whenever it loads a robot.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    make = CONTENDERS[name].make
+    # A first environment takes the imports out of creation and memory.
+    first = make(replace(setting, num_envs=1, num_threads=1))
+    used_before, start = _memory(), time.perf_counter()
+    running = make(setting)
+    creation, used = time.perf_counter() - start, _memory() - used_before
+    first.close()
+    for _ in range(steps):
+        running.step()
+    start, cpu_start = time.perf_counter(), _cpu_time()
+    for _ in range(steps):
+        running.step()
+    seconds, cpu_seconds = time.perf_counter() - start, _cpu_time() - cpu_start
+    running.close()
+    n = setting.num_envs
+    return Measurement(
+        n * steps / seconds, n * steps / cpu_seconds, creation / n, used / n
+    )
+
+
+def _process_tree(pid: int) -> list[int]:
+    """A process and its descendants; Linux only."""
+    files = Path(f"/proc/{pid}/task").glob("*/children")
+    children = [int(child) for file in files for child in file.read_text().split()]
+    return [pid, *(x for child in children for x in _process_tree(child))]
+
+
+def _memory() -> float:
+    """Resident memory of this process and its descendants [MB]; NaN except on Linux.
+
+    A page that n processes share counts 1/n in each.
+    """
+    if sys.platform != "linux":
+        return math.nan
+    total = 0
+    for pid in _process_tree(os.getpid()):
+        text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+        match = re.search(r"^Pss: +(\d+) kB", text, re.MULTILINE)
+        total += int(match[1]) if match else 0
+    return 1024 * total / 1e6
+
+
+def _cpu_time() -> float:
+    """Processor time of this process and its descendants [s]; NaN except on Linux."""
+    if sys.platform != "linux":
+        return math.nan
+    _, *children = _process_tree(os.getpid())
+    ticks = 0
+    for pid in children:
+        # The second field, the program's name, may contain spaces and ends with ")".
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        ticks += int(fields[11]) + int(fields[12])  # user and system time
+    return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
+
+
+def available_memory() -> float:
+    """Memory that the system can still give [MB]; infinite where it does not tell."""
+    if sys.platform != "linux":
+        return math.inf
+    text = Path("/proc/meminfo").read_text()
+    match = re.search(r"^MemAvailable: +(\d+) kB", text, re.MULTILINE)
+    return 1024 * int(match[1]) / 1e6 if match else math.inf
+
+
+# Report -----------------------------------------------------------------------
+
+_COLUMNS = (
+    "environment",
+    "envs",
+    "threads",
+    "contender",
+    "steps/s",
+    "torch_panda over it",
+    "steps/CPU s",
+    "created in [ms]",
+    "memory [MB]",
+)
+
+Results = dict[tuple[Setting, str], list[Measurement]]
+Obstacles = dict[tuple[str, str], None]
+
+
+def compare(
+    settings: Sequence[Setting], names: Sequence[str], *, rounds: int, steps: int
+) -> tuple[Results, Obstacles]:
+    """Measure contenders in turns: A B C, A B C, and so on.
+
+    A contender that fails takes no further turns. Ctrl-C ends the measurement. The
+    results until then are kept in both cases.
+
+    Args:
+        settings: Workloads.
+        names: Keys of `CONTENDERS`, in the order of their turns.
+        rounds: Number of turns of each contender.
+        steps: Steps of each environment in a turn.
+
+    Returns:
+        The measurements of each setting and contender, and the contenders that did not
+        run with the reason, both in the order of the turns.
+    """
+    results: Results = {}
+    obstacles: Obstacles = {}
+    with tqdm(total=len(settings) * rounds * len(names), unit="turn") as bar:
+        for setting in settings:
+            running = list(names)
+            for _ in range(rounds):
+                for name in list(running):
+                    bar.set_description(f"{setting.env_id} x {setting.num_envs} {name}")
+                    obstacle = CONTENDERS[name].obstacle(setting)
+                    if obstacle is None:
+                        try:
+                            measurement = measure(name, setting, steps)
+                        except KeyboardInterrupt:
+                            obstacles["all", "interrupted"] = None
+                            return results, obstacles
+                        except Exception as error:  # of any library
+                            obstacle = f"{type(error).__name__}: {error}"
+                        else:
+                            results.setdefault((setting, name), []).append(measurement)
+                    if obstacle is not None:
+                        running.remove(name)
+                        obstacles[CONTENDERS[name].title, obstacle] = None
+                    bar.update()
+    return results, obstacles
+
+
+def table(results: Results) -> str:
+    """Markdown table with a row for each setting and contender.
+
+    Speeds are medians and ranges over the rounds. The ratio compares torch_panda's
+    speed with the row's, round by round.
+    """
+    rows: list[Sequence[str]] = [_COLUMNS]
+    for (setting, name), turns in results.items():
+        ours = results.get((setting, OURS), [])
+        pairs = zip(ours, turns, strict=False)  # one may have failed in a later round
+        rows.append(
+            (
+                setting.env_id,
+                str(setting.num_envs),
+                str(setting.num_threads),
+                CONTENDERS[name].title,
+                _spread([turn.speed for turn in turns], digits=0),
+                _spread([a.speed / b.speed for a, b in pairs], digits=2),
+                _spread([turn.cpu_speed for turn in turns], digits=0),
+                f"{1e3 * median(turn.creation for turn in turns):.0f}",
+                f"{median(turn.memory for turn in turns):.0f}",
+            )
+        )
+    return _markdown(rows)
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows]
+    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return "\n".join(lines)
+
+
+def _spread(values: Sequence[float], *, digits: int) -> str:
+    """Median and range."""
+    if not values:
+        return "-"
+    return (
+        f"{median(values):.{digits}f} "
+        f"({min(values):.{digits}f} to {max(values):.{digits}f})"
+    )
+
+
+def plot(path: Path, results: Results) -> None:
+    """Draw steps per second: a panel for each setting, a bar for each contender.
+
+    Args:
+        path: File to write, in the format that its suffix names.
+        results: Measurements in the order in which they are drawn.
+    """
+    from matplotlib.figure import Figure
+
+    settings = list(dict.fromkeys(setting for setting, _ in results))
+    panels = [[name for other, name in results if other == x] for x in settings]
+    figure = Figure(
+        figsize=(7, 0.8 * len(panels) + 0.3 * len(results)), layout="constrained"
+    )
+    axes = figure.subplots(
+        len(panels),
+        squeeze=False,
+        sharex=True,
+        height_ratios=[len(names) for names in panels],
+    )
+    for axis, setting, names in zip(axes[:, 0], settings, panels, strict=True):
+        speeds = [[turn.speed for turn in results[setting, name]] for name in names]
+        middle = [median(values) for values in speeds]
+        spread = [
+            [m - min(values) for m, values in zip(middle, speeds, strict=True)],
+            [max(values) - m for m, values in zip(middle, speeds, strict=True)],
+        ]
+        colors = ["tab:blue" if name == OURS else "tab:gray" for name in names]
+        titles = [CONTENDERS[name].title for name in names]
+        bars = axis.barh(titles, middle, xerr=spread, color=colors)
+        axis.bar_label(bars, fmt="%.0f", label_type="center", color="white")
+        axis.invert_yaxis()
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.set_title(
+            f"{setting.env_id}: {setting.num_envs} environments, "
+            f"{setting.num_threads} threads",
+            fontsize="medium",
+            loc="left",
+        )
+    axes[-1, 0].set_xlabel("steps/s")
+    figure.savefig(path, dpi=150)
+
+
+def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
+    """Time replay buffers with and without hindsight, in turns.
+
+    A cycle is ``extend`` of one episode of 50 steps and ``sample`` of 256 rows, in full
+    buffers that hold episodes of Push, on one thread.
+
+    Args:
+        rounds: Number of turns of each buffer.
+        capacity: Number of rows of a buffer.
+
+    Returns:
+        Markdown table of medians and ranges.
+    """
+    torch.set_num_threads(1)
+    num_episodes, cycles = 20, 20
+    with torch_panda.make("PandaPush-v1", num_envs=num_episodes, seed=0) as env:
+        episodes = env.rollout(env.max_episode_steps)
+        relabel = HindsightRelabel.from_env(env)
+    buffers = {
+        "plain": TensorDictReplayBuffer(
+            storage=LazyTensorStorage(capacity), batch_size=256
+        ),
+        "with HindsightRelabel": TensorDictReplayBuffer(
+            storage=LazyTensorStorage(capacity), transform=relabel, batch_size=256
+        ),
+    }
+    ids = torch.arange(num_episodes)[:, None].expand(episodes.shape).clone()
+    episodes["collector", "traj_ids"] = ids
+    for _ in range(capacity // episodes.numel()):
+        for buffer in buffers.values():
+            buffer.extend(episodes.reshape(-1))
+        ids += num_episodes
+    times: dict[str, list[float]] = {name: [] for name in buffers}
+    for _ in range(rounds):
+        for name, buffer in buffers.items():
+            start = time.thread_time()
+            for episode in episodes[:cycles].unbind(0):
+                buffer.extend(episode)
+                buffer.sample()
+            times[name].append(1e6 * (time.thread_time() - start) / cycles)
+        ids += num_episodes
+    rows = [("replay buffer", "extend(50) + sample(256) [us]", "over plain")]
+    for name, values in times.items():
+        ratios = [b / a for a, b in zip(times["plain"], values, strict=True)]
+        rows.append((name, _spread(values, digits=0), _spread(ratios, digits=2)))
+    return _markdown(rows)
+
+
+def check(args: Args) -> None:
+    """Refuse options that cannot be measured.
+
+    Raises:
+        ValueError: Names the option and what it accepts.
+    """
+    for env_id in args.ids:
+        if env_id not in torch_panda.ENV_IDS:
+            raise ValueError(
+                f"--ids: {env_id!r} is no environment; `python -m torch_panda info` "
+                "lists all"
+            )
+    for option, value in (
+        ("--num-envs", min(args.num_envs, default=0)),
+        ("--num-threads", args.num_threads),
+        ("--rounds", args.rounds),
+        ("--steps", args.steps),
+        ("--render-size", args.render_size),
+    ):
+        if value is not None and value < 1:
+            raise ValueError(f"{option} must be at least 1, got {value}")
+    if args.plot is not None and not args.plot.absolute().parent.is_dir():
+        raise ValueError(f"--plot must be a file in an existing folder: {args.plot}")
+
+
+def run(arguments: Sequence[str] | None = None) -> None:
+    """Run the command.
+
+    Raises:
+        SystemExit: An option is wrong, or torch_panda itself was not measured.
+    """
+    args = tyro.cli(Args, args=arguments, prog="python -m torch_panda bench")
+    try:
+        check(args)
+    except ValueError as error:
+        sys.exit(str(error))
+    if args.buffers:
+        print(compare_buffers(args.rounds))
+        return
+    settings = [
+        Setting(env_id, n, min(n, args.num_threads or num_cores()), args.render_size)
+        for env_id in args.ids
+        for n in args.num_envs
+    ]
+    names = [OURS, *args.others]
+    results, obstacles = compare(settings, names, rounds=args.rounds, steps=args.steps)
+    if results:
+        print(table(results))
+    for title, reason in obstacles:
+        print(f"not measured: {title}: {reason}")
+    if results and args.plot is not None:
+        plot(args.plot, results)
+    if any((setting, OURS) not in results for setting in settings):
+        sys.exit(1)

@@ -1,0 +1,288 @@
+"""Train on the machines of a Ray cluster: workers step environments, one learner.
+
+    python -m torch_panda distributed --num-workers 4 --cpus-per-worker 8 --address auto
+
+Every worker steps `num_envs` environments in `cpus_per_worker` threads and sends what
+it saw to the learner, which stores all workers' transitions in one replay buffer, takes
+the gradient steps that are due, and gives the worker its new weights. The others go on
+meanwhile, so runs are not reproducible bit for bit.
+
+Without `--address` the workers run on this machine. For a cluster of machines that all
+have torch_panda and the same Ray:
+
+    ray get-auth-token --generate      # once; copy ~/.ray/auth_token to all machines
+    export RAY_AUTH_MODE=token         # on all machines
+    ray start --head                   # on the first, where this command runs, too
+    ray start --address=FIRST:6379     # on the others
+"""
+
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+import tyro
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors.distributed import RayCollector
+from torchrl.envs.utils import ExplorationType
+from tqdm import tqdm
+
+import torch_panda
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.buffers import STORED_KEYS, make_buffer
+from torch_panda.learning.checkpoint import (
+    Progress,
+    StopSignal,
+    check_folder,
+    crossed,
+    write_options,
+)
+from torch_panda.learning.curve import Curve
+from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
+from torch_panda.learning.options import check_exploration
+
+try:
+    import ray
+    from ray.exceptions import RayActorError
+except ModuleNotFoundError:
+    raise SystemExit(
+        "this needs Ray: pip install -c .ci/constraints.txt -e '.[ray]'"
+    ) from None
+
+TRAJECTORY_KEY = ("collector", "traj_ids")
+
+
+@dataclass
+class Args(Hyperparameters):
+    """What to train, where, and how long."""
+
+    address: str = "local"
+    """Ray cluster: "local" starts one on this machine for the time of the run, "auto"
+    joins the one that this machine belongs to"""
+    env_id: str = "PandaReach-v1"
+    """one of torch_panda.ENV_IDS"""
+    num_workers: Positive = 2
+    """processes that collect, spread over the machines"""
+    num_envs: Positive = 8
+    """environments of each worker"""
+    steps_per_batch: Positive = 50
+    """steps of each environment in a batch that a worker sends"""
+    cpus_per_worker: Positive = 1
+    """CPUs that a worker reserves, and threads that step its environments"""
+    total_steps: Positive = 10_000
+    """environment steps, over all workers"""
+    updates_per_step: Weight = 0.5
+    """gradient steps per environment step"""
+    batch_size: Positive = 256
+    """transitions per gradient step"""
+    eval_interval: Positive = 1_000
+    """environment steps between evaluations"""
+    seed: Seed = 0
+    """the seed of the environments, the networks and the sampling"""
+    out: Path | None = None
+    """the folder of the results; None means runs/<env-id>-<algo>-distributed-<seed>"""
+
+    @property
+    def batch_frames(self) -> int:
+        """Transitions in a batch."""
+        return self.num_envs * self.steps_per_batch
+
+
+class Learner:
+    """The workers, the replay buffer that they fill, and the agent that learns from it.
+
+    Attributes:
+        collector: iterates over the workers' batches [num_envs, steps_per_batch],
+            first come first served.
+        buffer: the replay buffer.
+        agent: the agent.
+        progress: steps so far, and the evaluations.
+    """
+
+    def __init__(self, args: Args, out: Path) -> None:
+        torch.manual_seed(args.seed)
+        self.args = args
+        # As many environments as a worker has: exploration noise has their shape.
+        self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
+        self.agent = make_agent(self.env, args)
+        capacity = args.total_steps + args.batch_frames
+        self.buffer = make_buffer(self.env, capacity, seed=args.seed)
+        self.progress = Progress()
+        self.curve = Curve(args.env_id, self.agent, out, device="cpu")
+        self.collector = make_collector(args, self.agent.explore)
+
+    def train(self, stop: object = False) -> None:
+        """Collect and learn until the last step or a stop signal.
+
+        Raises:
+            RayActorError: a worker died.
+        """
+        args, progress = self.args, self.progress
+        label = f"{args.env_id} {args.algo}"
+        self.curve.add(progress)  # the untrained policy
+        with tqdm(total=args.total_steps, unit="step", desc=label) as bar:
+            for data in self.collector:
+                before, progress.steps = progress.steps, progress.steps + data.numel()
+                self.learn(data)
+                self.send_weights(worker_of(data, args.num_workers))
+                bar.update(data.numel())
+                last = progress.steps >= args.total_steps or bool(stop)
+                if last or crossed(args.eval_interval, before, progress.steps):
+                    self.curve.add(progress)
+                    bar.set_postfix(success=progress.success)
+                if last:
+                    break
+
+    def learn(self, data: TensorDictBase) -> None:
+        """Store a worker's batch and take the gradient steps that are due."""
+        stored = self.buffer[self.buffer.extend(data.reshape(-1))]
+        self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
+        due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
+        for _ in range(due):
+            self.agent.update(self.buffer.sample(self.args.batch_size))
+
+    def send_weights(self, worker: int) -> None:
+        """Give a worker the weights and the normaliser for its next batch."""
+        weights = TensorDict.from_module(self.agent.explore).data
+        # It is idle until this batch is done with, so this is a matter of milliseconds.
+        remote = self.collector.remote_collectors[worker]
+        ray.get(remote.update_policy_weights_.remote(weights))
+
+    def close(self) -> None:
+        """End the workers and free the environments."""
+        self.collector.shutdown()
+        self.curve.close()
+        self.env.close()
+
+
+@dataclass
+class UniqueTrajectories:
+    """What a worker does to its batches: keep what is stored, and number it.
+
+    Every worker counts its trajectories from 0. In one buffer two workers' episodes
+    would be taken for one, and goals of one be given to the other.
+    """
+
+    worker: int
+    num_workers: int
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        """Make trajectory t of worker w number t * num_workers + w."""
+        data = data.select(*STORED_KEYS)
+        number = data[TRAJECTORY_KEY] * self.num_workers + self.worker
+        return data.set(TRAJECTORY_KEY, number)
+
+
+def worker_of(data: TensorDictBase, num_workers: int) -> int:
+    """The worker that collected a batch."""
+    return int(data[TRAJECTORY_KEY].flatten()[0]) % num_workers
+
+
+def make_env(
+    env_id: str, num_envs: int, num_threads: int, seed: int
+) -> torch_panda.RobotTaskEnv:
+    """A worker's environments; its exploration noise is seeded, too."""
+    torch.manual_seed(seed)
+    return torch_panda.make(
+        env_id, num_envs=num_envs, num_threads=num_threads, seed=seed
+    )
+
+
+def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
+    """Start the workers, spread over the machines, each with its own seed."""
+    workers = range(args.num_workers)
+    make = partial(make_env, args.env_id, args.num_envs, args.cpus_per_worker)
+    # torchrl's own way to send weights is a process group at the address that this
+    # machine's name resolves to, often 127.0.0.1, where no other machine reaches it.
+    # `send_weights` goes through Ray instead.
+    warnings.filterwarnings("ignore", message="RayCollector iteration started before")
+    return RayCollector(
+        [partial(make, draw_seed()) for _ in workers],
+        policy,
+        frames_per_batch=args.batch_frames,
+        total_frames=args.total_steps,
+        exploration_type=ExplorationType.RANDOM,
+        collector_kwargs=[
+            {
+                "postproc": UniqueTrajectories(worker, args.num_workers),
+                "auto_register_policy_transforms": True,
+            }
+            for worker in workers
+        ],
+        remote_configs={
+            "num_cpus": args.cpus_per_worker,
+            "scheduling_strategy": "SPREAD",
+        },
+        weight_sync_schemes={},
+    )
+
+
+def draw_seed() -> int:
+    """A seed that follows from torch's."""
+    return int(torch.randint(2**62, ()))
+
+
+def connect(args: Args) -> None:
+    """Join the cluster, or start one.
+
+    Raises:
+        ConnectionError: there is no cluster at the address.
+        ValueError: it has not enough CPUs for the workers.
+    """
+    local = args.address == "local"
+    ray.init(
+        address=args.address,
+        num_cpus=args.num_workers * args.cpus_per_worker if local else None,
+        include_dashboard=False if local else None,
+        logging_level=logging.WARNING,
+        log_to_driver=False,  # the collectors' long repr, at every line
+    )
+    room = sum(
+        int(node["Resources"].get("CPU", 0)) // args.cpus_per_worker
+        for node in ray.nodes()
+        if node["Alive"]
+    )
+    if room < args.num_workers:
+        raise ValueError(
+            f"the cluster has room for {room} workers of {args.cpus_per_worker} CPUs, "
+            f"not for {args.num_workers}"
+        )
+
+
+def main(args: Args) -> None:
+    """Train, and say where the policy is."""
+    out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
+    try:
+        check_limits(args)
+        check_exploration(args, args.num_envs)
+        check_folder(out, resume=False)
+        connect(args)
+        learner = Learner(args, out)
+        # Where a run is made is no way to train.
+        default = Args(
+            env_id=args.env_id,
+            address=args.address,
+            cpus_per_worker=args.cpus_per_worker,
+        )
+        write_options(out, args, default, preset="distributed")
+        learner.train(StopSignal())
+        learner.close()
+    except (OSError, ValueError) as error:
+        raise SystemExit(str(error)) from None
+    except RayActorError as error:
+        raise SystemExit(f"a worker died: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted") from None
+    finally:
+        ray.shutdown()  # ends the workers, and the cluster if it was started here
+    progress = learner.progress
+    print(f"success {progress.success} after {progress.steps} steps; see {out}")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Read the options and run the command."""
+    main(tyro.cli(Args, prog="python -m torch_panda distributed", args=arguments))

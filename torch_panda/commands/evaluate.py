@@ -1,0 +1,81 @@
+"""Evaluate a trained policy over many episodes, run in parallel.
+
+python -m torch_panda evaluate runs/PandaPush-v1-ddpg-relabel-0 --episodes 200
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import sqrt
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import torch_panda
+from torch_panda import PhysicsName
+from torch_panda.learning.evaluation import evaluate, wilson_interval
+from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
+from torch_panda.learning.policy_files import load_policy, read_checkpoint
+
+
+@dataclass
+class Args:
+    """Which policy to evaluate, and how long."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """folder of a run, or its checkpoint.pt"""
+    env_id: str | None = None
+    """another task with the same spaces; None means the one it was trained on"""
+    episodes: Positive = 200
+    """number of episodes"""
+    num_envs: Positive = 32
+    """environments that are stepped in parallel"""
+    num_threads: Positive | None = None
+    """threads that step them; None means one per core"""
+    seed: Seed = 1_000
+    """of the environments"""
+    task_options: dict[str, Finite] = field(default_factory=dict)
+    """numbers of the task that are others than in training, such as `play 0.0005`"""
+    physics: PhysicsName = "exact"
+    """how Bullet integrates: as panda-gym, or faster and coarser"""
+
+
+def main(args: Args) -> None:
+    """Print what the policy achieves, with 95 % intervals."""
+    try:
+        check_limits(args)
+        checkpoint = read_checkpoint(args.run)
+        env_id = args.env_id or checkpoint["env_id"]
+        with torch_panda.make(
+            env_id,
+            num_envs=min(args.num_envs, args.episodes),
+            num_threads=args.num_threads,
+            seed=args.seed,
+            physics=args.physics,
+            task_options=args.task_options,
+        ) as env:
+            policy = load_policy(checkpoint, env)
+            result = evaluate(env, policy, args.episodes)
+    except (ValueError, TypeError) as error:
+        raise SystemExit(str(error)) from None
+    changes = "".join(f", {key} {value}" for key, value in args.task_options.items())
+    print(f"{env_id}{changes}, {args.episodes} episodes, {args.physics} physics")
+    for name, flags in (
+        ("success at the end", result.success),
+        ("success at any time", result.ever),
+        ("solved at the start", result.at_start),
+    ):
+        low, high = wilson_interval(int(flags.sum()), args.episodes)
+        share = flags.float().mean()
+        print(f"{name:20s} {share:6.1%}  [{low:.1%}, {high:.1%}]")
+    mean = result.episode_return.mean()
+    interval = ""
+    if args.episodes > 1:
+        half = 1.96 * result.episode_return.std() / sqrt(args.episodes)
+        interval = f"  [{mean - half:.2f}, {mean + half:.2f}]"
+    print(f"{'return':20s} {mean:6.2f}{interval}")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Read the options and run the command."""
+    main(tyro.cli(Args, prog="python -m torch_panda evaluate", args=arguments))

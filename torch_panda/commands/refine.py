@@ -1,0 +1,206 @@
+"""Refine a policy by hindsight alone: it imitates itself, asked for what it achieved.
+
+    python -m torch_panda refine runs/PandaSlide-v1-ddpg-relabel-0 --out runs/slide
+
+A policy that nearly does what it is asked for does exactly what it achieves. So it
+plays, its episodes' goals become what they achieved at their end, and it imitates them:
+goal-conditioned supervised learning (arXiv 1912.06088), from where reinforcement
+learning stopped. There are no rewards, no demonstrations and no noise.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType
+from tqdm import tqdm
+
+import torch_panda
+from torch_panda.datasets.recording import play
+from torch_panda.learning.buffers import STORED_KEYS, make_buffer
+from torch_panda.learning.checkpoint import (
+    SAVE_INTERVAL,
+    Checkpoint,
+    Progress,
+    StopSignal,
+    check_folder,
+    crossed,
+    write_options,
+)
+from torch_panda.learning.curve import Curve, reseed
+from torch_panda.learning.limits import Positive, Seed, check_limits
+from torch_panda.learning.policy_files import load_agent, read_checkpoint
+from torch_panda.learning.pretraining import pretrain
+
+LEARNING_RATE = 0.3  # at first, of that of training
+
+
+@dataclass
+class Args:
+    """What to refine, how long, and where to write."""
+
+    policy: Annotated[Path, tyro.conf.Positional]
+    """folder of a run, or its checkpoint.pt"""
+    out: Path
+    """the folder of the results, as of train.py"""
+    env_id: str | None = None
+    """another task with the same spaces; None means the one it was trained on"""
+    steps: Positive = 640_000
+    """environment steps to play, in whole episodes; the last million is imitated"""
+    updates: Positive = 60_000
+    """gradient steps; the learning rate falls to 0 in them"""
+    batch_size: Positive = 1024
+    """transitions per gradient step"""
+    num_envs: Positive = 64
+    """environments that are stepped in parallel"""
+    seed: Seed = 0
+    """the seed of the environments and the sampling"""
+    resume: bool = False
+    """continue in that folder, with the same other options"""
+
+
+class Refinement:
+    """A policy, what it has played, and how far it is.
+
+    Args:
+        args: the options.
+
+    Raises:
+        ValueError: there is no such policy, or no such run to continue.
+    """
+
+    def __init__(self, args: Args) -> None:
+        self.args = args
+        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+        torch.manual_seed(args.seed)
+        saved = read_checkpoint(args.policy)
+        args.env_id = args.env_id or saved["env_id"]
+        self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
+        self.agent = load_agent(saved, self.env)
+        rng = np.random.default_rng(0)
+        goals = [self.env.task.sample_start(rng).goal for _ in range(100)]
+        self.varies = torch.from_numpy(np.ptp(goals, axis=0) > 0)
+        iteration = args.num_envs * self.env.max_episode_steps
+        self.buffer = make_buffer(self.env, args.steps + iteration, her="none")
+        self.curve = Curve(args.env_id, self.agent, args.out, device="cpu")
+        self.progress = Progress()
+        state = args.out / "resume.pt"
+        self.checkpoint = Checkpoint(
+            state, args, self.agent, self.buffer, self.progress
+        )
+        if args.resume:
+            self.checkpoint.load()
+
+    def run(self, stop: object = False) -> bool:
+        """Play, then imitate, until that is done or ``stop`` is true.
+
+        Returns:
+            whether it is done.
+
+        Raises:
+            ValueError: the policy achieves nothing that could be asked for.
+        """
+        args, progress, checkpoint = self.args, self.progress, self.checkpoint
+        if len(progress.curve) > 1:
+            return True
+        if not progress.curve:
+            self.curve.add(progress)  # the policy that was given
+            checkpoint.save()
+        self.play(stop)
+        checkpoint.save()
+        if stop:
+            return False
+        if not len(self.buffer):
+            raise ValueError("no episode achieved what a goal of the task can be")
+        pretrain(
+            checkpoint,
+            self.buffer,
+            updates=args.updates,
+            batch_size=args.batch_size,
+            learning_rate=LEARNING_RATE,
+            stop=stop,
+        )
+        if progress.pretrained < args.updates:
+            return False
+        self.curve.add(progress)
+        checkpoint.save()
+        return True
+
+    def play(self, stop: object) -> None:
+        """Store what the policy achieves."""
+        progress, last = self.progress, self.args.steps
+        bar = tqdm(desc="playing", initial=progress.steps, total=last, unit="step")
+        while progress.steps < last and not stop:
+            reseed(self.env)
+            policy = self.agent.policy
+            episodes = play(self.env, policy, ExplorationType.DETERMINISTIC)
+            asked = [ask_for_achieved(x, self.env.task, self.varies) for x in episodes]
+            if rows := [row for row in asked if row is not None]:
+                self.buffer.extend(TensorDict.cat(rows))
+            steps, before = sum(map(len, episodes)), progress.steps
+            progress.steps += steps
+            bar.update(steps)
+            if crossed(SAVE_INTERVAL, before, progress.steps):
+                self.checkpoint.save()
+        bar.close()
+
+    def close(self) -> None:
+        """Free the environments."""
+        self.env.close()
+        self.curve.close()
+
+
+def ask_for_achieved(
+    episode: TensorDictBase, task: torch_panda.Task, varies: Tensor
+) -> TensorDictBase | None:
+    """An episode (steps,) with what it achieved as its goal; None: that is no goal.
+
+    Args:
+        episode: with the goal that was asked for.
+        task: says whether the other goal is achieved at the end.
+        varies: (goal_dim,) bool, where goals of the task differ. Elsewhere they stay:
+            Slide's puck lies lower than all of its goals.
+    """
+    end = episode["next", "achieved_goal"][-1]
+    goal = torch.where(varies, end, episode["desired_goal"][0])
+    if not task.is_success(end, goal):
+        return None
+    episode = episode.select(*STORED_KEYS, strict=False)
+    for key in ("desired_goal", ("next", "desired_goal")):
+        episode[key] = goal.expand_as(episode[key])
+    return episode
+
+
+def main(args: Args) -> None:
+    """Refine, and say where the results are."""
+    try:
+        check_limits(args)
+        check_folder(args.out, resume=args.resume)
+        run = Refinement(args)
+        default = Args(args.policy, args.out, env_id=args.env_id)
+        more = {"algo": run.agent.hp.algo, "preset": "refined"}
+        write_options(args.out, args, default, **more)
+        stop = StopSignal()
+        finished = run.run(stop)
+    except (ValueError, OSError) as error:
+        raise SystemExit(str(error)) from None
+    stop.release()
+    run.close()
+    before, now = run.progress.curve[0]["success"], run.progress.success
+    print(f"success {now}, before {before:.0%}; see {args.out}")
+    if not finished:
+        print(
+            f"stopped and saved in {args.out}: the same command with --resume goes on"
+        )
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Read the options and run the command."""
+    main(tyro.cli(Args, prog="python -m torch_panda refine", args=arguments))

@@ -1,0 +1,75 @@
+"""Train DDPG, TD3, SAC or TQC with hindsight experience replay on any task.
+
+    python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
+
+The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687);
+where its table is silent they follow the HER of OpenAI Baselines. `--preset tuned`
+takes the task's recipe of `torch_panda.learning.recipes`.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+import torch_panda
+from torch_panda.datasets import read_demos
+from torch_panda.learning.checkpoint import StopSignal, check_folder, write_options
+from torch_panda.learning.options import Args, check, default_args
+from torch_panda.learning.training import Run
+from torch_panda.learning.video import record
+
+
+def parse(arguments: Sequence[str] | None = None) -> Args:
+    """Read the command line; preset and task say what other options default to."""
+    given = tyro.cli(Args, prog="python -m torch_panda train", args=arguments)
+    default = default_args(given.preset, given.env_id)
+    return tyro.cli(
+        Args, prog="python -m torch_panda train", args=arguments, default=default
+    )
+
+
+def make_run(args: Args, out: Path) -> Run:
+    """Start a training, with its demonstrations if there are any.
+
+    Raises:
+        ValueError: the options do not fit each other, the task or the files.
+    """
+    demos = None
+    if args.demos is not None:
+        with torch_panda.make(args.env_id) as env:
+            demos = read_demos(args.demos, env)
+    return Run(args, out, demos)
+
+
+def main(args: Args) -> None:
+    """Train, and say where the results are."""
+    out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
+    try:
+        check(args)
+        check_folder(out, resume=args.resume)
+        run = make_run(args, out)
+        write_options(out, args, default_args(args.preset, args.env_id))
+    except (ValueError, OSError) as error:
+        raise SystemExit(str(error)) from None
+    stop = StopSignal()
+    finished = run.train(stop)
+    stop.release()
+    run.close()
+    if finished and args.video:
+        try:
+            with torch_panda.make(
+                args.env_id, num_envs=6, seed=args.seed, device=args.device
+            ) as env:
+                record(env, run.agent.policy, out / "video.mp4")
+        except KeyboardInterrupt:
+            print("no video")
+    progress = run.progress
+    print(f"success {progress.success} after {progress.steps} steps; see {out}")
+    if not finished:
+        print(f"stopped and saved in {out}: the same command with --resume goes on")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Read the options and train."""
+    main(parse(arguments))

@@ -1,0 +1,156 @@
+"""Watch a policy: a video of environments side by side, a window, or a browser.
+
+python -m torch_panda watch --policy runs/PandaPush-v1-ddpg-relabel-0 --out push.mp4
+python -m torch_panda watch --policy expert --env-id PandaStack-v1 --out stack.gif
+python -m torch_panda watch --policy expert --env-id PandaStack-v1 --human
+python -m torch_panda watch --policy runs/PandaPush-v1-ddpg-relabel-0 --web
+"""
+
+import itertools
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import RandomPolicy
+
+import torch_panda
+from torch_panda.experts import make_expert
+from torch_panda.learning.limits import Port, Positive, Seed, check_limits
+from torch_panda.learning.policy_files import load_policy, read_checkpoint
+from torch_panda.learning.video import FPS, play, record
+
+CAMERA = torch_panda.Camera(distance=1.1)  # where a browser's view starts
+
+
+def show(
+    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase, episodes: int
+) -> None:
+    """Play episodes of the first environment in a window, in real time."""
+    with env.open_window() as window:
+        for episode in range(1, episodes + 1):
+            due = time.perf_counter()
+            success = False
+            for state in play(env, policy):
+                window.show(0)
+                success = bool(state["success"][0])
+                due += 1 / FPS
+                time.sleep(max(0.0, due - time.perf_counter()))
+                if state["done"][0]:
+                    break  # a -v3 episode ends at its first success
+            outcome = "success" if success else "no success"
+            print(f"episode {episode} of {episodes}: {outcome}", flush=True)
+
+
+def serve(
+    env: torch_panda.RobotTaskEnv,
+    policies: Iterator[TensorDictModuleBase],
+    *,
+    host: str,
+    port: int,
+) -> None:
+    """Play episodes in a browser, in real time, with the next policy for each.
+
+    Args:
+        env: all its environments can be looked at.
+        policies: one for each episode; with the last one it ends.
+        host: the address at which the page is.
+        port: or the next one that is free.
+    """
+    with env.open_viewer(CAMERA, host=host, port=port) as viewer:
+        print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+        for number, policy in enumerate(policies, 1):
+            viewer.write(f"episode {number}")
+            for _ in play(env, policy):
+                due = time.perf_counter() + 1 / FPS
+                viewer.update()
+                viewer.wait()
+                time.sleep(max(0.0, due - time.perf_counter()))
+
+
+def follow(path: Path, env: torch_panda.RobotTaskEnv) -> Iterator[TensorDictModuleBase]:
+    """The policy of a run, time and again; anew when a training has saved it.
+
+    Args:
+        path: folder of the run, or a checkpoint.
+        env: where it acts.
+    """
+    file = path / "checkpoint.pt" if path.is_dir() else path
+    seen = None
+    while True:
+        saved = file.stat().st_mtime_ns
+        if saved != seen:
+            policy, seen = load_policy(read_checkpoint(file), env), saved
+        yield policy
+
+
+@dataclass
+class Args:
+    """What to watch, and where to write it."""
+
+    policy: str = "expert"
+    """a run's folder or checkpoint, "random", or "expert" """
+    env_id: str | None = None
+    """task; None means the one the policy was trained on, or Push"""
+    num_envs: Positive = 6
+    """environments side by side; with a window, episodes one after the other"""
+    seed: Seed = 0
+    """of the environments and of random actions"""
+    out: Path = Path("watch.mp4")
+    """video to write, .mp4 or .gif"""
+    human: bool = False
+    """show it in a window of pybullet's GUI instead, at the speed of the real robot"""
+    web: bool = False
+    """show it in a browser instead (extra viewer), episode after episode; the policy of
+    a run that is training is read again as it changes"""
+    host: str = "127.0.0.1"
+    """with --web, the address to serve at; 0.0.0.0 lets other machines in"""
+    port: Port = 8080
+    """with --web, the port, or the next one that is free"""
+
+
+def main(args: Args) -> None:
+    """Record a policy, or show it."""
+    try:
+        check_limits(args)
+        torch.manual_seed(args.seed)
+        checkpoint = None
+        if args.policy not in ("random", "expert"):
+            if not Path(args.policy).exists():
+                raise ValueError(
+                    "a policy is random, expert, or the folder or checkpoint of a run, "
+                    f"such as examples/policies/PandaPush-v1.pt, got {args.policy!r}"
+                )
+            checkpoint = read_checkpoint(Path(args.policy))
+        env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
+        num_envs = 1 if args.human else args.num_envs
+        with torch_panda.make(env_id, num_envs=num_envs, seed=args.seed) as env:
+            policy: TensorDictModuleBase
+            if checkpoint:
+                policy = load_policy(checkpoint, env)
+            elif args.policy == "expert":
+                policy = make_expert(env_id)
+            else:
+                policy = RandomPolicy(env.action_spec)
+            if args.web:
+                policies: Iterator[TensorDictModuleBase] = itertools.repeat(policy)
+                if checkpoint:
+                    policies = follow(Path(args.policy), env)
+                serve(env, policies, host=args.host, port=args.port)
+            elif args.human:
+                show(env, policy, args.num_envs)
+            else:
+                record(env, policy, args.out)
+                print(f"wrote {args.out}")
+    except (ValueError, OSError, ImportError, torch_panda.BulletError) as error:
+        raise SystemExit(str(error)) from None
+    except KeyboardInterrupt:
+        raise SystemExit("stopped") from None
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Read the options and run the command."""
+    main(tyro.cli(Args, prog="python -m torch_panda watch", args=arguments))

@@ -1,0 +1,29 @@
+"""The scripted experts for Push: one for each friction of the table."""
+
+import torch
+from torch import Tensor
+
+from torch_panda.experts.moves import CUBE, go_over, norm, push_to
+
+ON_TOP = 0.01  # [m] above the cube's top: where the end-effector presses on it
+
+
+def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """Press on the cube from above and drag it to the goal.
+
+    On the slippery table of -v1 it follows; struck, it would slide too far.
+    """
+    ee, cube = observation[..., :3], achieved_goal
+    beside, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE / 2 + ON_TOP
+    pressing = (norm(beside) < CUBE / 2) & (ee[..., 2:] < top + 0.004)
+    step = 0.6 * (desired_goal - cube)[..., :2]
+    step = step / (norm(step) / 0.02).clamp(min=1.0)
+    drag = torch.cat((step, torch.full_like(top, -0.01)), -1) / 0.05
+    on_top = torch.cat((cube[..., :2], top - 0.003), -1)
+    return torch.where(pressing, drag, go_over(ee, on_top, 0.04))
+
+
+def push(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """Push the cube to the goal from behind: friction on the table of -v3 stops it."""
+    ee, velocity = observation[..., :3], observation[..., 12:14]
+    return push_to(ee, achieved_goal, velocity, desired_goal)

@@ -1,0 +1,61 @@
+"""The scripted expert for Stack."""
+
+import torch
+from torch import Tensor
+
+from torch_panda.experts.moves import CUBE, carry, is_held, norm, push_to
+
+
+def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+    """Carry the lower cube to its goal, then the upper one onto it.
+
+    A cube that leaves the fingers no room beside the lower one is pushed aside first.
+    """
+    ee, width = observation[..., :3], observation[..., 6:7]
+    lower, upper = achieved_goal.split(3, -1)
+    lower_speed, upper_speed = (norm(observation[..., k : k + 3]) for k in (13, 25))
+    lower_held, upper_held = is_held(ee, width, lower), is_held(ee, width, upper)
+    goal, top = desired_goal[..., :3], lower + lower.new_tensor((0.0, 0.0, CUBE))
+
+    def arrived(error: Tensor, speed: Tensor, held: Tensor, tolerance: float) -> Tensor:
+        return torch.where(held, (error < 0.01) & (speed < 0.1), error < tolerance)
+
+    placed = arrived(norm(lower - goal), lower_speed, lower_held, 0.025)
+    stacked = arrived(norm(upper - top), upper_speed, upper_held, 0.02)
+    to_lower, to_upper = norm(ee - lower), norm(ee - upper)
+    leave = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
+    leave = leave | placed & stacked & (ee[..., 2:] < 0.15)
+    # Rising while the fingers open would take the cube along.
+    upwards = torch.where((width < 0.02) | (width > 0.06), 1.0, 0.0)
+    rise = torch.cat((0 * ee[..., :2], upwards, 0.4 + 0 * width), -1)
+    finish = torch.where(stacked, 0.0, carry(ee, width, upper, top, clearance=0.06))
+    finish = torch.where(leave, rise, finish)
+
+    # The fingers need room beside the lower cube, where it lies and where it goes.
+    room = upper.new_tensor((0.045, 0.085))
+
+    def crowds(point: Tensor) -> Tensor:
+        return ((upper - point)[..., :2].abs() < room).all(-1, True)
+
+    at = torch.where(crowds(lower) | placed, lower, goal)
+    apart = (upper - at)[..., :2]
+    along_x = apart[..., :1].abs() > apart[..., 1:].abs()
+    # `push_to` may leave it 3 cm short of there.
+    sign = torch.where(apart < 0, -1.0, 1.0)
+    side = at[..., :2] + sign * apart.new_tensor((0.1, 0.125))
+    x, y, z = upper.split(1, -1)
+    x, y = (
+        torch.where(along_x, side[..., :1], x),
+        torch.where(along_x, y, side[..., 1:]),
+    )
+    aside = torch.cat((x, y, z), -1)
+    clear = push_to(ee, upper, observation[..., 25:27], aside)
+    clear = torch.cat((clear, 0 * width - 1), -1)
+    on_top = upper[..., 2:] > 0.03
+    blocked = crowds(at) & ~(lower_held | upper_held | placed & on_top)
+    action = torch.where(placed, finish, carry(ee, width, lower, goal))
+    action = torch.where(blocked, torch.where(leave, rise, clear), action)
+    # What is as it should be, held or not, is not touched again.
+    done = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.03
+    hold = torch.cat((0 * ee, torch.where(upper_held, -1.0, 0.0)), -1)
+    return torch.where(done, hold, action)

@@ -1,0 +1,159 @@
+"""What all agents share: inputs, exploration, gradient steps and target networks."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torch_panda import RobotTaskEnv
+from torch_panda.learning.augmentation import Augmentation
+from torch_panda.learning.fingers import check_fingers, from_fine, to_fine
+from torch_panda.learning.geometry import check_layout, read_geometry
+from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.transitions import Transitions
+
+STATE_KEYS = ["observation", "desired_goal"]
+LEARNING_RATE = 1e-3  # the panda-gym paper, for actor and critic
+TAU = 0.05  # how far a target network moves towards its network (Polyak 0.95)
+
+
+class Agent(nn.Module, ABC):
+    """A policy, how it explores, and how it learns.
+
+    Args:
+        env: the environment, for the sizes and the layout of its spaces.
+        hp: what to build.
+
+    Attributes:
+        normalizer: standardises observation and goal.
+        policy: TensorDictModule from ``observation`` and ``desired_goal`` to
+            ``action``; deterministic under ``ExplorationType.DETERMINISTIC``.
+        explore: the policy with the algorithm's exploration noise.
+        optimizer: of all networks that learn.
+        updates: gradient steps so far.
+    """
+
+    policy: TensorDictModuleBase
+    explore: TensorDictModuleBase
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
+        super().__init__()
+        self.hp = hp
+        if hp.fine_fingers:
+            check_fingers(env)
+        geometry = read_geometry(env)
+        sizes = [env.observation_spec[key].shape[-1] for key in STATE_KEYS]
+        if (hp.relative_inputs, hp.augmentation) != ("none", "none"):
+            check_layout(geometry, sizes)
+        self.normalizer = Normalizer(sum(sizes), geometry, hp.relative_inputs)
+        self.augmentation = Augmentation(geometry, hp.augmentation)
+        self.state_size = len(self.normalizer.mean)
+        self.action_size = env.action_spec.shape[-1]
+        self.gamma = hp.gamma or 1 - 1 / env.max_episode_steps
+        self.updates = 0
+
+    def assemble(
+        self,
+        actor: TensorDictModuleBase,
+        noise: Sequence[TensorDictModuleBase],
+        trained: Sequence[Tensor],
+    ) -> None:
+        """Put together what an algorithm has made, at the end of its constructor.
+
+        Args:
+            actor: from ``normalized`` to ``action``.
+            noise: modules that change ``action`` to explore.
+            trained: the parameters of the optimizer.
+        """
+        normalize = TensorDictModule(self.normalizer, STATE_KEYS, ["normalized"])
+        last: list[TensorDictModuleBase] = []
+        if self.hp.fine_fingers:
+            last = [TensorDictModule(from_fine, ["action"], ["action"])]
+        self.policy = TensorDictSequential(normalize, actor, *last)
+        self.explore = TensorDictSequential(normalize, actor, *noise, *last)
+        self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
+
+    def update(
+        self, batch: TensorDictBase, demos: TensorDictBase | None = None
+    ) -> dict[str, Tensor]:
+        """One gradient step on a batch of transitions, and one of demonstrations.
+
+        Returns:
+            the losses, scalars without gradients.
+        """
+        rows = Transitions.from_tensordict(batch)
+        num_demos = 0
+        if demos is not None:
+            num_demos = len(demos)
+            pairs = zip(rows, Transitions.from_tensordict(demos), strict=True)
+            rows = Transitions(*map(torch.cat, pairs))
+        rows = self._prepare(rows)
+        state = self.normalizer(rows.observation, rows.goal)
+        next_state = self.normalizer(rows.next_observation, rows.goal)
+        self.optimizer.zero_grad()
+        losses = self.backward(state, next_state, rows, num_demos)
+        self.optimizer.step()
+        self.updates += 1
+        if self.updates % self.hp.target_interval == 0:
+            self.move_targets()
+        return {key: loss.detach() for key, loss in losses.items()}
+
+    @abstractmethod
+    def backward(
+        self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
+    ) -> dict[str, Tensor]:
+        """Compute the losses and their gradients.
+
+        Args:
+            state: what the networks see of each row, (n, state size).
+            next_state: the same after the step, (n, state size).
+            rows: the transitions.
+            num_demos: how many of them are demonstrations, the last ones.
+
+        Returns:
+            the losses, scalars.
+        """
+
+    @abstractmethod
+    def move_targets(self) -> None:
+        """Move the target networks towards their networks, by TAU."""
+
+    def imitate(self, demos: TensorDictBase) -> Tensor:
+        """One gradient step of the policy alone, towards actions of demonstrations.
+
+        Differences are absolute, as in ACT (arXiv 2304.13705): where a demonstrator
+        does one of two things, what differs least from both is the more frequent one.
+        The least squares are between the two, where it does neither.
+
+        Returns:
+            the mean absolute difference, a scalar.
+        """
+        rows = self._prepare(Transitions.from_tensordict(demos))
+        states = dict(zip(STATE_KEYS, (rows.observation, rows.goal), strict=True))
+        normalize, actor = self.policy.module[:2]
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            td = normalize(demos.empty().update(states))
+            loss = nn.functional.l1_loss(actor(td)["action"], rows.action)
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.move_targets()
+        return loss.detach()
+
+    def _prepare(self, rows: Transitions) -> Transitions:
+        """Augment a batch, and scale its actions as networks see them."""
+        rows = self.augmentation(rows)
+        if self.hp.fine_fingers:
+            rows = rows._replace(action=to_fine(rows.action))
+        return rows
+
+    def set_learning_rate(self, factor: float) -> None:
+        """Let the next gradient steps have so much of the learning rate."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = factor * LEARNING_RATE

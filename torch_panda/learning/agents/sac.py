@@ -1,0 +1,79 @@
+"""Soft actor-critic (arXiv 1801.01290), over torchrl's loss."""
+
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
+from torchrl.objectives import LossModule, SACLoss, SoftUpdate
+
+from torch_panda import RobotTaskEnv
+from torch_panda.learning.agents.base import TAU, Agent
+from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.networks import make_mlp
+from torch_panda.learning.transitions import Transitions
+
+ALPHA = 0.2  # the entropy coefficient, which stays
+
+
+class SAC(Agent):
+    """A policy that draws its actions, rewarded for its entropy."""
+
+    critic_outputs = 1
+
+    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
+        super().__init__(env, hp)
+        inputs = self.state_size
+        net = make_mlp(inputs, 2 * self.action_size, hp.network)
+        parameters = nn.Sequential(net, NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(parameters, ["normalized"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+        )
+        critic = TensorDictModule(
+            make_mlp(inputs + self.action_size, self.critic_outputs, hp.network),
+            ["normalized", "action"],
+            ["state_action_value"],
+        )
+        self.loss = self.make_loss(
+            actor,
+            critic,
+            num_qvalue_nets=2 if hp.double_q else 1,
+            deactivate_vmap=True,  # faster on CPU
+            alpha_init=ALPHA,
+            fixed_alpha=True,
+            action_spec=env.action_spec_unbatched,
+        )
+        self.loss.make_value_estimator(gamma=self.gamma)
+        # A buffer, but only once it was asked for: in the states that runs save.
+        _ = self.loss.target_entropy
+        self.soft_update = SoftUpdate(self.loss, tau=TAU)
+        self.assemble(actor, [], trained=list(self.loss.parameters()))
+
+    def make_loss(
+        self,
+        actor: TensorDictModuleBase,
+        critic: TensorDictModuleBase,
+        **options: object,
+    ) -> LossModule:
+        """The losses of actor and critics."""
+        return SACLoss(actor, critic, loss_function="l2", **options)
+
+    def backward(
+        self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
+    ) -> dict[str, Tensor]:
+        """Descend torchrl's losses; demonstrations are transitions as any others."""
+        flags = {"terminated": rows.terminated, "done": rows.terminated}
+        following = {"normalized": next_state, "reward": rows.reward, **flags}
+        batch = {"normalized": state, "action": rows.action, "next": following}
+        every = self.loss(TensorDict(batch, [len(state)]))
+        losses = {
+            "critic_loss": every["loss_qvalue"],
+            "actor_loss": every["loss_actor"],
+        }
+        (losses["critic_loss"] + losses["actor_loss"]).backward()
+        return losses
+
+    def move_targets(self) -> None:
+        """Move the target networks towards their networks, by TAU."""
+        self.soft_update.step()

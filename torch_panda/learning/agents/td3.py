@@ -1,0 +1,27 @@
+"""Twin delayed DDPG (arXiv 1802.09477)."""
+
+import torch
+from torch import Tensor
+
+from torch_panda import RobotTaskEnv
+from torch_panda.learning.agents.ddpg import DDPG
+from torch_panda.learning.hyperparameters import Hyperparameters
+
+POLICY_NOISE = 0.2  # standard deviation of the noise on target actions
+NOISE_CLIP = 0.5
+
+
+class TD3(DDPG):
+    """DDPG with two critics, a delayed actor, and noise on target actions."""
+
+    actor_interval = 2
+
+    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
+        self.num_critics = 2 if hp.double_q else 1
+        super().__init__(env, hp)
+
+    def target_action(self, next_state: Tensor) -> Tensor:
+        """The target actor's action with clipped noise, (n, action size)."""
+        action = super().target_action(next_state)
+        noise = POLICY_NOISE * torch.randn_like(action)
+        return (action + noise.clamp_(-NOISE_CLIP, NOISE_CLIP)).clamp_(-1.0, 1.0)

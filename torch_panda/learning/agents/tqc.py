@@ -1,0 +1,25 @@
+"""Truncated quantile critics (arXiv 2005.04269), over torchrl's loss."""
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives import LossModule, TQCLoss
+
+from torch_panda.learning.agents.sac import SAC
+
+NUM_QUANTILES = 25  # of each critic
+DROPPED = 2  # of them, the highest, in the target
+
+
+class TQC(SAC):
+    """SAC whose critics learn the return's distribution, and mistrust its top."""
+
+    critic_outputs = NUM_QUANTILES
+
+    def make_loss(
+        self,
+        actor: TensorDictModuleBase,
+        critic: TensorDictModuleBase,
+        **options: object,
+    ) -> LossModule:
+        """The losses of actor and critics."""
+        dropped = DROPPED if self.hp.double_q else 0
+        return TQCLoss(actor, critic, top_quantiles_to_drop_per_net=dropped, **options)

@@ -1,0 +1,80 @@
+"""Data augmentation: transitions mirrored, moved over the table.
+
+Such transitions are as possible as those that were seen, nearly: see Invariant
+Transform Experience Replay (arXiv 1909.10707) for mirrors.
+"""
+
+import torch
+from torch import Tensor
+
+from torch_panda.learning.geometry import Geometry
+from torch_panda.learning.hyperparameters import AugmentationKind
+from torch_panda.learning.transitions import Transitions
+
+SHIFT = 0.15  # [m], at most, in x and y
+
+
+class Augmentation:
+    """Changes some rows of a batch.
+
+    Args:
+        geometry: of the task.
+        kind: what to do.
+
+    Raises:
+        ValueError: the robot is not controlled by its end-effector.
+    """
+
+    def __init__(self, geometry: Geometry, kind: AugmentationKind) -> None:
+        if kind != "none" and geometry.action is None:
+            raise ValueError(
+                f"augmentation {kind!r} is for end-effector control: with joint "
+                "control pass --augmentation none"
+            )
+        self.geometry, self.kind = geometry, kind
+
+    def __call__(self, rows: Transitions) -> Transitions:
+        """Augment a batch; what was given stays as it is."""
+        if self.kind != "none":
+            rows = mirror(rows, self.geometry)
+        if self.kind == "mirror-shift":
+            rows = shift(rows, self.geometry, SHIFT)
+        return rows
+
+
+def mirror(rows: Transitions, geometry: Geometry) -> Transitions:
+    """Mirror every second row."""
+    assert geometry.action is not None
+
+    def mirrored(values: Tensor, factors: tuple[float, ...]) -> Tensor:
+        values = values.clone()
+        values[::2] *= values.new_tensor(factors)
+        return values
+
+    return rows._replace(
+        observation=mirrored(rows.observation, geometry.observation),
+        goal=mirrored(rows.goal, geometry.goal),
+        action=mirrored(rows.action, geometry.action),
+        next_observation=mirrored(rows.next_observation, geometry.observation),
+    )
+
+
+def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions:
+    """Move half of the rows, at random, each by up to ``distance`` in x and y [m].
+
+    Hand, objects and goals move together, as if the robot stood elsewhere.
+    """
+    offset = torch.empty_like(rows.goal[:, :2]).uniform_(-distance, distance)
+    offset *= torch.rand_like(offset[:, :1]) < 0.5
+
+    def shifted(values: Tensor, starts: tuple[int, ...]) -> Tensor:
+        values = values.clone()
+        for start in starts:
+            values[:, start : start + 2] += offset
+        return values
+
+    return rows._replace(
+        observation=shifted(rows.observation, geometry.positions),
+        goal=shifted(rows.goal, geometry.goal_positions),
+        next_observation=shifted(rows.next_observation, geometry.positions),
+    )

@@ -1,0 +1,172 @@
+"""Saving a run and going on with it, bit for bit."""
+
+import json
+import signal
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.data import TensorDictReplayBuffer
+from tqdm import tqdm
+
+from torch_panda.learning import files
+from torch_panda.learning.agents import Agent
+from torch_panda.learning.policy_files import save_policy
+from torch_panda.learning.recipes import find_changes
+
+RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
+SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
+# Options in which a run and its continuation may differ.
+FREE_OPTIONS = {"resume", "out", "video"}
+
+
+@dataclass
+class Progress:
+    """How far a run is."""
+
+    steps: int = 0
+    """of the environments"""
+    pretrained: int = 0
+    """gradient steps that only imitated"""
+    seconds: float = 0.0
+    """spent on stepping and learning, without evaluations"""
+    curve: list[dict[str, float]] = field(default_factory=list)
+    """a row an evaluation"""
+
+    @property
+    def success(self) -> str:
+        """The last success rate."""
+        return f"{self.curve[-1]['success']:.0%}" if self.curve else "unknown"
+
+
+@dataclass
+class Checkpoint:
+    """What changes in a run; between two iterations it is all that there is to know.
+
+    Attributes:
+        path: of the file.
+        args: the run's options, a dataclass.
+        agent: with its optimizer.
+        buffer: of the run's own transitions.
+        progress: of the run.
+    """
+
+    path: Path
+    args: Any
+    agent: Agent
+    buffer: TensorDictReplayBuffer
+    progress: Progress
+
+    def save(self) -> None:
+        """Write the state, and the policy as it is: also one that still imitates."""
+        state = {
+            "args": fixed(self.args),
+            "agent": self.agent.state_dict(),
+            "optimizer": self.agent.optimizer.state_dict(),
+            "updates": self.agent.updates,
+            "buffer": self.buffer.state_dict(),
+            "random": torch.get_rng_state(),
+            "cuda_random": torch.cuda.get_rng_state_all(),
+            "progress": asdict(self.progress),
+        }
+        files.save(self.path, state)
+        policy = self.path.with_name("checkpoint.pt")
+        save_policy(policy, self.agent, self.args.env_id)
+
+    def load(self) -> None:
+        """Take what `save` wrote.
+
+        Raises:
+            ValueError: it is the state of a run with other options, or damaged.
+        """
+        keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
+        state = files.read(self.path, "the state of a run", keys)
+        theirs = state["args"]
+        differing = [
+            f"{key} was {theirs.get(key)!r}, is {value!r}"
+            for key, value in fixed(self.args).items()
+            if theirs.get(key) != value
+        ]
+        if differing:
+            raise ValueError(
+                f"cannot resume {self.path.parent}: {'; '.join(differing)}"
+            )
+        self.agent.load_state_dict(state["agent"])
+        self.agent.optimizer.load_state_dict(state["optimizer"])
+        self.agent.updates = state["updates"]
+        self.buffer.load_state_dict(state["buffer"])
+        for name, value in state["progress"].items():
+            setattr(self.progress, name, value)
+        # Last: nothing after this draws random numbers before the run goes on.
+        torch.set_rng_state(state["random"])
+        torch.cuda.set_rng_state_all(state["cuda_random"])
+
+
+def crossed(interval: int, before: int, after: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
+def fixed(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
+    """The options that a continuation must share."""
+    every = json.loads(json.dumps(asdict(args), default=str))
+    return {key: value for key, value in every.items() if key not in FREE_OPTIONS}
+
+
+def write_options(
+    out: Path,
+    args: Any,  # noqa: ANN401 (a dataclass)
+    default: Any,  # noqa: ANN401 (of the same)
+    **more: str,
+) -> None:
+    """Make a run's folder, with its options in args.json, for plots.
+
+    Args:
+        out: the folder.
+        args: the options.
+        default: what they are compared with, for ``changed``.
+        **more: what the folder is to say besides.
+    """
+    options = {**more, **asdict(args), "changed": find_changes(args, default)}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
+
+
+def check_folder(out: Path, *, resume: bool) -> None:
+    """Refuse to overwrite a run, and to continue none.
+
+    Raises:
+        ValueError: says what to do.
+    """
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"out must be a folder, got the file {out}")
+    if resume and not (out / "resume.pt").exists():
+        raise ValueError(f"there is no run to resume in {out}")
+    if not resume and any((out / name).exists() for name in RESULTS):
+        raise ValueError(
+            f"{out} holds a run: continue it with --resume, remove it, or choose "
+            "another folder with --out"
+        )
+
+
+class StopSignal:
+    """True after Ctrl-C or a SIGTERM; a second one ends the program as usual."""
+
+    def __init__(self) -> None:
+        self.received = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._receive)
+
+    def _receive(self, number: int, frame: object) -> None:
+        self.received = True
+        self.release()
+        tqdm.write("stopping after this iteration; again to stop at once")
+
+    def release(self) -> None:
+        """Let the signals act as usual."""
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def __bool__(self) -> bool:
+        return self.received

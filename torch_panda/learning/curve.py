@@ -1,0 +1,61 @@
+"""The evaluations of a run: a curve that is written, drawn and saved at every point."""
+
+import csv
+from pathlib import Path
+
+import torch
+
+import torch_panda
+from torch_panda.learning.agents import Agent
+from torch_panda.learning.checkpoint import Progress
+from torch_panda.learning.evaluation import evaluate
+from torch_panda.learning.plots import plot_curve
+from torch_panda.learning.policy_files import save_policy
+
+EPISODES = 80  # of an evaluation, all fresh
+NUM_ENVS = 16  # that play them
+
+
+class Curve:
+    """Evaluates an agent.
+
+    Args:
+        env_id: the task.
+        agent: whose policy is evaluated.
+        out: the folder of curve.csv, curve.png and checkpoint.pt.
+        device: of the environments.
+    """
+
+    def __init__(self, env_id: str, agent: Agent, out: Path, *, device: str) -> None:
+        self.env_id, self.agent, self.out = env_id, agent, out
+        self.env = torch_panda.make(env_id, num_envs=NUM_ENVS, device=device)
+
+    def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
+        """Evaluate, add a row to the run's curve, write and draw it."""
+        reseed(self.env)
+        result = evaluate(self.env, self.agent.policy, EPISODES)
+        row = {
+            "step": progress.steps,
+            "success": float(result.success.float().mean()),
+            "ever_success": float(result.ever.float().mean()),
+            "return": float(result.episode_return.mean()),
+            "updates": self.agent.updates,
+            "seconds": round(progress.seconds, 2),
+        }
+        progress.curve.append({**row, **(losses or {})})
+        with (self.out / "curve.csv").open("w", newline="") as file:
+            fields = {key: None for row in progress.curve for key in row}
+            writer = csv.DictWriter(file, fieldnames=list(fields))
+            writer.writeheader()
+            writer.writerows(progress.curve)
+        plot_curve(progress.curve, self.env_id, self.out / "curve.png")
+        save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
+
+    def close(self) -> None:
+        """Free the environments."""
+        self.env.close()
+
+
+def reseed(env: torch_panda.RobotTaskEnv) -> None:
+    """Make the next episodes follow from torch's random state, which runs save."""
+    env.set_seed(int(torch.randint(2**62, ())))

@@ -1,0 +1,171 @@
+"""Draws success curves: a panel a task, a line an algorithm and a way to train it.
+
+Reads every folder below the given ones that holds a run (args.json and curve.csv).
+Draws the median and the interquartile range over the seeds, as the panda-gym paper. A
+panel has four lines at most: a task with more has a panel for each algorithm.
+"""
+
+import csv
+import json
+import textwrap
+from pathlib import Path
+from typing import Literal
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display is needed
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+Curve = list[dict[str, float]]
+Metric = Literal["success", "ever_success", "return"]
+LINES = 4  # of a panel, at most
+COLUMNS = 3  # of panels, at most
+LABEL_WIDTH = 56  # characters; longer labels are broken: a legend takes room
+# Okabe and Ito's, which can be told apart by everybody; then with other dashes.
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+DASHES = ("-", "--", ":", "-.")
+
+Lines = dict[str, list[Curve]]  # of the seeds, by name
+# By way to train, within an algorithm, within a task.
+Runs = dict[str, dict[str, Lines]]
+
+
+def plot_curve(curve: Curve, title: str, path: Path) -> None:
+    """Draw one run's success over environment steps."""
+    figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
+    axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
+    _label(axes, title, "success")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
+    """Draw median and interquartile range over seeds.
+
+    Args:
+        runs: the curves.
+        metric: the column to draw.
+        path: where to write the picture.
+    """
+    panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
+    names = sorted({name for _, lines in panels for name in lines})
+    looks = {name: next_look(i) for i, name in enumerate(names)}
+    width = min(COLUMNS, len(panels))
+    height = -(-len(panels) // width)
+    figure, grid = plt.subplots(
+        height,
+        width,
+        figsize=(4.2 * width, 4.0 * height),  # legends are below
+        squeeze=False,
+        layout="constrained",
+    )
+    for axes in grid.flat[len(panels) :]:
+        axes.remove()
+    for axes, (title, lines) in zip(grid.flat, panels, strict=False):
+        draw_panel(axes, lines, metric, looks)
+        _label(axes, title, metric)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
+    """The panels of a task: titles, and at most `LINES` lines in each.
+
+    All algorithms share one where they fit, else each has its own.
+    """
+    own = {
+        algo: {f"{algo}, {way}": curves for way, curves in sorted(ways.items())}
+        for algo, ways in sorted(algorithms.items())
+    }
+    together = {
+        name: curves for lines in own.values() for name, curves in lines.items()
+    }
+    if len(together) <= LINES:
+        return [(task, together)]
+    return [
+        (f"{task}, {algo}", dict(list(lines.items())[first : first + LINES]))
+        for algo, lines in own.items()
+        for first in range(0, len(lines), LINES)
+    ]
+
+
+def next_look(number: int) -> dict[str, str]:
+    """Colour and dashes of a line: no two of the first 28 are alike."""
+    dashes, color = divmod(number, len(COLORS))
+    return {"color": COLORS[color], "linestyle": DASHES[dashes % len(DASHES)]}
+
+
+def draw_panel(
+    axes: plt.Axes,
+    lines: Lines,
+    metric: Metric,
+    looks: dict[str, dict[str, str]],
+) -> None:
+    """Draw lines, each with a band over its seeds."""
+    for name, curves in lines.items():
+        # Seeds that are still running end earlier: up to where all have come.
+        points = [{row["step"]: row[metric] for row in curve} for curve in curves]
+        steps = sorted(set.intersection(*map(set, points)))
+        values = np.array([[curve[step] for step in steps] for curve in points])
+        low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+        label = f"{name} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
+        label = textwrap.fill(label, LABEL_WIDTH)
+        marker = "o" if len(steps) == 1 else None
+        axes.plot(steps, median, marker=marker, label=label, **looks[name])
+        axes.fill_between(steps, low, high, color=looks[name]["color"], alpha=0.2, lw=0)
+    axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
+
+
+def read_runs(folders: list[Path]) -> Runs:
+    """Read the curves below some folders.
+
+    Raises:
+        ValueError: there is no run, or what one of them holds cannot be read.
+    """
+    runs: Runs = {}
+    for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
+        if not (path.parent / "args.json").exists():
+            continue
+        try:
+            args = json.loads((path.parent / "args.json").read_text())
+            task, algo = str(args["env_id"]), str(args["algo"]).upper()
+            line = line_label(str(args["preset"]), args.get("changed", {}))
+            with path.open() as file:
+                curve = [
+                    {key: float(value) for key, value in row.items() if value}
+                    for row in csv.DictReader(file)
+                ]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path.parent} holds no run: {error!r}") from None
+        if curve:
+            lines = runs.setdefault(task, {}).setdefault(algo, {})
+            lines.setdefault(line, []).append(curve)
+    if not runs:
+        names = ", ".join(map(str, folders))
+        raise ValueError(f"no run (args.json, curve.csv) below {names}")
+    return runs
+
+
+def line_label(preset: str, changed: dict[str, object]) -> str:
+    """Name what sets a run apart from others of its task and algorithm."""
+    parts = [preset]
+    for key, value in changed.items():
+        name = key.replace("_", " ")
+        if value is True or key == "demos":
+            parts.append(name)
+        elif value in (False, "none", 0):
+            parts.append(f"no {name}")
+        else:
+            parts.append(f"{name} {value}")
+    return ", ".join(parts)
+
+
+def _label(axes: plt.Axes, title: str, metric: Metric) -> None:
+    names = {"success": "success rate", "ever_success": "success rate at any step"}
+    axes.set(xlabel="environment steps", ylabel=names.get(metric, metric), title=title)
+    if metric in names:
+        axes.set_ylim(-0.05, 1.05)
+    axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 0))
+    axes.grid(alpha=0.3)

@@ -1,0 +1,191 @@
+"""The training loop: episodes of parallel environments, then gradient steps.
+
+An iteration is one episode of every environment, then the gradient steps due for it, so
+that between two iterations a run is its weights, its buffer and its random numbers, and
+`--resume` continues it bit for bit. Gradient steps use as many threads as
+OMP_NUM_THREADS says, or one.
+"""
+
+import os
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType
+from tqdm import tqdm
+
+import torch_panda
+from torch_panda import Randomization
+from torch_panda.learning.agents import make_agent
+from torch_panda.learning.buffers import make_buffer, select_episodes
+from torch_panda.learning.checkpoint import (
+    SAVE_INTERVAL,
+    Checkpoint,
+    Progress,
+    crossed,
+)
+from torch_panda.learning.curve import Curve, reseed
+from torch_panda.learning.options import Args
+from torch_panda.learning.pretraining import make_demo_buffer, pretrain
+from torch_panda.learning.starts import StartFrom, states_at_objects
+
+DEMO_RATIO = 0.25  # of each batch: what is drawn from the demonstrations, if any
+STARTED_STEPS = 50  # of an episode at most, where some begin in the course of the task
+KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
+
+
+class Run:
+    """A training: what it is made of, and the algorithm.
+
+    Args:
+        args: the options.
+        out: the folder of the results.
+        demos: transitions (n,) to learn from beside the run's own; see
+            `torch_panda.datasets.read_demos`.
+
+    Raises:
+        ValueError: options do not fit each other, the task or the files.
+    """
+
+    def __init__(
+        self, args: Args, out: Path, demos: TensorDictBase | None = None
+    ) -> None:
+        self.args, self.out = args, out
+        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+        # Permits bfloat16; on CPUs with AVX-512 it selects oneDNN, up to twice as fast.
+        torch.set_float32_matmul_precision("medium")
+        torch.manual_seed(args.seed)
+        randomize = None
+        if args.randomize > 1:
+            factors = (1 / args.randomize, args.randomize)
+            randomize = Randomization(
+                object_mass=factors, object_friction=factors, table_friction=factors
+            )
+        self.env = torch_panda.make(
+            args.env_id,
+            num_envs=args.num_envs,
+            device=args.device,
+            randomize=randomize,
+        )
+        self.agent = make_agent(self.env, args)
+        steps = self.env.max_episode_steps
+        if args.start_at_object:
+            steps = min(steps, STARTED_STEPS)
+        iteration = args.num_envs * steps
+        self.buffer = make_buffer(
+            self.env,
+            args.total_steps + iteration,
+            her=args.her,
+            desired_ratio=args.desired_ratio,
+            seed=args.seed,
+        )
+        self.num_demos = 0  # of each batch
+        if demos is not None:
+            demos = demos.to(self.env.device)
+            self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
+            self.demos = make_demo_buffer(demos)
+            self.num_demos = int(DEMO_RATIO * args.batch_size)
+        env: EnvBase = self.env
+        if args.start_at_object:
+            states = states_at_objects(args.env_id, seed=args.seed)
+            env = TransformedEnv(env, StartFrom(states, args.start_at_object))
+        # Whole episodes of all environments, one batch [num_envs, steps] each time.
+        self.collector = Collector(
+            env,
+            self.agent.explore,
+            frames_per_batch=iteration,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            exploration_type=ExplorationType.RANDOM,
+            auto_register_policy_transforms=True,
+        )
+        self.curve = Curve(args.env_id, self.agent, out, device=args.device)
+        self.progress = Progress()
+        self.checkpoint = Checkpoint(
+            out / "resume.pt", args, self.agent, self.buffer, self.progress
+        )
+        if args.resume:
+            self.checkpoint.load()
+
+    def train(self, stop: object = False) -> bool:
+        """Learn until the last step, or until ``stop`` is true after an iteration.
+
+        Returns:
+            whether the last step was reached.
+        """
+        args, progress, checkpoint = self.args, self.progress, self.checkpoint
+        if not progress.curve:
+            self.curve.add(progress)  # the untrained policy
+            checkpoint.save()
+        if progress.pretrained < args.pretrain_updates:
+            count, size = args.pretrain_updates, args.batch_size
+            pretrain(checkpoint, self.demos, updates=count, batch_size=size, stop=stop)
+            if progress.pretrained < count:
+                return False
+        if args.pretrain_updates and len(progress.curve) == 1:
+            self.curve.add(progress)  # what was imitated
+            checkpoint.save()
+
+        bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
+        bar.set_description(f"{args.env_id} {args.algo}")
+        finished = stopped = progress.steps >= args.total_steps
+        episodes = iter(self.collector)
+        while not stopped:
+            started, before = time.perf_counter(), progress.steps
+            reseed(self.env)
+            data = next(episodes)
+            progress.steps += data.numel()
+            self.store(data)
+            losses = self.learn()
+            progress.seconds += time.perf_counter() - started
+
+            bar.update(data.numel())
+            finished = progress.steps >= args.total_steps
+            if finished or crossed(args.eval_interval, before, progress.steps):
+                self.curve.add(progress, losses)
+            bar.set_postfix(success=progress.success)
+            stopped = finished or bool(stop)
+            if stopped or crossed(SAVE_INTERVAL, before, progress.steps):
+                checkpoint.save()
+        bar.close()
+        return finished
+
+    def store(self, data: TensorDictBase) -> None:
+        """Put episodes [num_envs, steps] into the buffer and into the statistics."""
+        keep_unmoved = KEEP_UNMOVED if self.args.preset == "tuned" else 1.0
+        data = select_episodes(data, keep_unmoved)
+        if len(data):
+            stored = self.buffer[self.buffer.extend(data.reshape(-1))]
+            # As in Baselines, the statistics are of relabelled episodes.
+            normalizer = self.agent.normalizer
+            normalizer.update(stored["observation"], stored["desired_goal"])
+
+    def learn(self) -> dict[str, float]:
+        """Take the gradient steps that are due.
+
+        Returns:
+            the mean of each loss.
+        """
+        args, agent = self.args, self.agent
+        losses: dict[str, list[Tensor]] = defaultdict(list)
+        due = int(self.progress.steps * args.updates_per_step) - agent.updates
+        for _ in range(due if len(self.buffer) else 0):
+            if args.anneal_lr:
+                last = args.updates_per_step * args.total_steps
+                # The last iteration may go beyond the last step.
+                agent.set_learning_rate(max(0.0, 1 - agent.updates / last))
+            batch = self.buffer.sample(args.batch_size - self.num_demos)
+            demos = self.demos.sample(self.num_demos) if self.num_demos else None
+            for key, loss in agent.update(batch, demos).items():
+                losses[key].append(loss)
+        return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
+
+    def close(self) -> None:
+        """Free the environments."""
+        self.collector.shutdown()
+        self.curve.close()

@@ -1,0 +1,94 @@
+"""Videos of a policy in several environments side by side.
+
+Goals are drawn translucent; every cell says its step and turns green on success.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import numpy.typing as npt
+import torch
+from PIL import Image, ImageDraw
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm import tqdm
+
+import torch_panda
+from torch_panda.learning.files import prepare
+
+CELL = (240, 320)  # height and width [pixels]
+FPS = 25  # real time: the control frequency
+BORDER = 4  # [pixels]
+GREEN, GREY = (40, 170, 70), (120, 120, 120)
+
+
+def record(
+    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase, path: Path
+) -> None:
+    """Write one episode of each environment into a video.
+
+    Args:
+        env: batched environment.
+        policy: gives ``action``; run without exploration noise.
+        path: an .mp4 or .gif file.
+
+    Raises:
+        ValueError: the file's name ends otherwise.
+        OSError: the file could not be written.
+    """
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"a video's name must end in .mp4 or .gif, got {path.name!r}")
+    prepare(path)
+    frames = [
+        draw(env, state, step)
+        for step, state in enumerate(
+            tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame")
+        )
+    ]
+    options = (
+        {"loop": 0, "duration": 1000 / FPS} if path.suffix == ".gif" else {"fps": FPS}
+    )
+    iio.imwrite(path, np.stack(frames), **options)
+
+
+def play(
+    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase
+) -> Iterator[TensorDictBase]:
+    """Run an episode: what it starts with, and what every step leads to."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        state = env.reset()
+        yield state
+        for _ in range(env.max_episode_steps):
+            state = step_mdp(env.step(policy(state)))
+            yield state
+
+
+def draw(
+    env: torch_panda.RobotTaskEnv, state: TensorDictBase, step: int
+) -> npt.NDArray[np.uint8]:
+    """All environments in one picture, with step and success, (height, width, 3)."""
+    cells = []
+    for pixels, success in zip(env.render(size=CELL), state["success"], strict=True):
+        cell = Image.fromarray(pixels.cpu().numpy())
+        pen = ImageDraw.Draw(cell)
+        color = GREEN if success else GREY
+        pen.rectangle((0, 0, CELL[1] - 1, CELL[0] - 1), outline=color, width=BORDER)
+        text = f"step {step}" + ("  success" if success else "")
+        pen.text((2 * BORDER, 2 * BORDER), text, fill=color)
+        cells.append(np.asarray(cell))
+    return tile(cells)
+
+
+def tile(cells: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
+    """Lay pictures of one size out in rows, about as many as columns."""
+    columns = int(np.ceil(np.sqrt(len(cells))))
+    rows = int(np.ceil(len(cells) / columns))
+    empty = np.full_like(cells[0], 255)
+    cells = cells + [empty] * (rows * columns - len(cells))
+    return np.vstack(
+        [np.hstack(cells[r * columns : (r + 1) * columns]) for r in range(rows)]
+    )
