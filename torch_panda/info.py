@@ -28,8 +28,8 @@ _PACKAGES = (
 _INSTALL = "pip install -c .ci/constraints.txt -e"
 # Extras: what they are for, and a module that each brings; see pyproject.toml.
 _EXTRAS = {
-    "examples": ("training, evaluating, videos, plots", "tyro"),
-    "viewer": ("env.open_viewer(), watch.py --web", "viser"),
+    "learning": ("training, evaluating, recording, videos, plots", "tyro"),
+    "viewer": ("env.open_viewer(), watch --web", "viser"),
     "minari": ("Minari data sets of demonstrations", "minari"),
     "lerobot": ("LeRobot data sets; see examples/README.md", "lerobot"),
     "ray": ("training on many machines", "ray"),
