@@ -1,12 +1,17 @@
 """Which ids the tests take."""
 
 import torch_panda
+from torch_panda.registry import find_registration
 
-# Those that differ in physics: sparse and dense rewards share theirs, which
+# One id for each physics. Sparse and dense rewards share theirs, which
 # `test_suite.test_reward_types_share_their_physics` shows for each.
-PHYSICS_IDS = tuple(env_id for env_id in torch_panda.ENV_IDS if "Dense" not in env_id)
+PHYSICS_IDS = tuple(
+    env_id
+    for env_id in torch_panda.ENV_IDS
+    if find_registration(env_id).make_task().reward_type == "sparse"
+)
 
 
 def dense(env_id):
     """The id of the same physics with dense rewards."""
-    return env_id.replace("-", "Dense-")
+    return "Dense-".join(env_id.rsplit("-", 1))

@@ -18,8 +18,6 @@ ROOMS = (
     ("sensors",),
     ("envs",),
     ("noise",),
-    ("versions",),
-    ("ids",),
     ("registry",),
     ("gymnasium_envs",),
 )

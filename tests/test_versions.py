@@ -1,37 +1,91 @@
-"""The table of both versions, and what it makes."""
+"""The page of numbers, and the tasks and robots of the ids -v1 and -v3."""
 
-import inspect
+import ast
+import re
+from pathlib import Path
 
 import pytest
 import torch
 
 import torch_panda
-from torch_panda.versions import ROBOT_ARGUMENTS, TASK_ARGUMENTS, arguments_of
+from tests.ids import PHYSICS_IDS
+from torch_panda.bullet.shapes import BLUE, RED
+from torch_panda.registry import find_registration
 
-TASKS = list(TASK_ARGUMENTS)
-
-
-def default(function, name):
-    return inspect.signature(function).parameters[name].default
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_the_defaults_are_those_of_v1(task):
-    task_class = getattr(torch_panda, task)
-    for name, (v1, _) in TASK_ARGUMENTS[task].items():
-        assert default(task_class, name) == v1, name
+PAGE = Path(torch_panda.__file__).parent / "tasks" / "README.md"
+COLORS = {"red": RED, "blue": BLUE}
 
 
-@pytest.mark.parametrize("task", TASKS)
+def read_value(cell):
+    code = re.match(r"`(.+?)`", cell)
+    return ast.literal_eval(code[1]) if code else COLORS[cell]
+
+
+def rows_of_the_page():
+    """(task, argument): (value in -v1, value in -v3), of tasks and of robots."""
+    row = r"^\| ([\w, ]+): `(\w+)`.*? \| (.+?) \| .+? \| (.+?) \|$"
+    tables = PAGE.read_text().split("| argument of the robot |")
+    return tuple(
+        {
+            (task, argument): (read_value(v1), read_value(v3))
+            for tasks, argument, v1, v3 in re.findall(row, table, re.MULTILINE)
+            for task in tasks.split(", ")
+        }
+        for table in tables
+    )
+
+
+def differences_in_the_code():
+    """The same of the registered ids."""
+    found = ({}, {})
+    for env_id in PHYSICS_IDS:
+        new = find_registration(env_id)
+        if new.version != "v3" or "Joints" in env_id:
+            continue
+        old = find_registration(env_id.replace("-v3", "-v1"))
+        pairs = (
+            (old.make_task(), new.make_task()),
+            (old.make_robot(), new.make_robot()),
+        )
+        for differences, (first, second) in zip(found, pairs, strict=True):
+            for name, value in vars(second).items():
+                if not name.startswith("_") and value != vars(first)[name]:
+                    differences[new.task_name, name] = (vars(first)[name], value)
+    return found
+
+
+def test_the_page_lists_all_arguments_that_differ():
+    assert rows_of_the_page() == differences_in_the_code()
+
+
 @pytest.mark.parametrize("version", ["v1", "v3"])
-def test_ids_have_their_version_of_every_argument(task, version):
-    with torch_panda.make(f"Panda{task}-{version}") as env:
-        for pairs, made in (
-            (TASK_ARGUMENTS[task], env.task),
-            (ROBOT_ARGUMENTS[task], env.robot),
-        ):
-            for name, value in arguments_of(pairs, version).items():
-                assert getattr(made, name) == value, name
+@pytest.mark.parametrize(
+    ("task", "name", "value"),
+    [
+        ("Push", "object_friction", 0.5),
+        ("Flip", "object_friction", 0.5),
+        ("Flip", "object_mass", 1.0),
+        ("Flip", "distance_threshold", 0.2),
+        ("Reach", "distance_threshold", 0.05),
+        ("Reach", "goal_range", 0.3),
+        ("PickAndPlace", "goal_z_range", 0.2),
+    ],
+)
+def test_both_versions_share_what_the_page_says(version, task, name, value):
+    made = find_registration(f"Panda{task}-{version}").make_task()
+    assert getattr(made, name) == value
+
+
+@pytest.mark.parametrize("task", ["Reach", "Push", "Slide", "PickAndPlace", "Stack"])
+def test_the_defaults_of_a_task_are_those_of_v1(task):
+    made = find_registration(f"Panda{task}-v1").make_task()
+    assert vars(made) == vars(type(made)())
+
+
+def test_flip_has_the_fingers_of_panda_gym_3():
+    for version in ("v1", "v3"):
+        robot = find_registration(f"PandaFlip-{version}").make_robot()
+        assert (robot.finger_friction, robot.finger_spinning_friction) == (1.0, 0.001)
 
 
 # How fast a body is after sliding for a while: friction brakes it by mu g.

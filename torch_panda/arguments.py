@@ -2,7 +2,7 @@
 
 import difflib
 import inspect
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 from typing_extensions import Self
 
@@ -16,10 +16,7 @@ class Configured:
 
     def __new__(cls, *args: object, **arguments: object) -> Self:
         """Refuse unknown arguments."""
-        parameters = inspect.signature(cls).parameters
-        # A class with `**options` reads them itself, or passes them to its base class.
-        if not _has_options(parameters):
-            check_names(cls.__name__, arguments, parameters)
+        check_call(cls.__name__, cls, arguments)
         return super().__new__(cls)
 
     def __repr__(self) -> str:
@@ -29,19 +26,40 @@ class Configured:
         return f"{type(self).__name__}({shown})"
 
 
+def check_call(
+    owner: str, function: Callable[..., object], names: Iterable[str]
+) -> None:
+    """Refuse arguments that a function or class does not have.
+
+    A function with ``**options`` reads them itself or passes them on, so it is not
+    checked.
+
+    Args:
+        owner: Name of the function, for the error.
+        function: Function or class that is going to be called.
+        names: Names of the arguments in the call.
+
+    Raises:
+        TypeError: A name is not accepted.
+    """
+    parameters = inspect.signature(function).parameters
+    if not _has_options(parameters):
+        check_names(owner, names, parameters)
+
+
 def check_names(
     owner: str,
     names: Iterable[str],
     accepted: Collection[str],
     advice: Mapping[str, str] | None = None,
 ) -> None:
-    """Refuse arguments that a function does not have.
+    """Refuse names of arguments that are not accepted.
 
     Args:
-        owner: Function or class, as the error names it.
-        names: Names of the arguments in a call.
+        owner: Name of the function, for the error.
+        names: Names of the arguments in the call.
         accepted: Names of the arguments that the function has.
-        advice: Unknown names that are a habit from elsewhere, with the fix for each.
+        advice: The fix for some names that the function does not have.
 
     Raises:
         TypeError: A name is not accepted.
@@ -49,14 +67,14 @@ def check_names(
     for name in names:
         if name in accepted:
             continue
-        hints = [f"{owner} has no argument {name!r}"]
         similar = difflib.get_close_matches(name, accepted, n=1)
+        hint = f"did you mean {similar[0]!r}? " if similar else ""
         if advice and name in advice:
-            hints.append(advice[name])
-        elif similar:
-            hints.append(f"did you mean {similar[0]!r}?")
-        hints.append(f"accepted are {', '.join(accepted) or 'none'}")
-        raise TypeError("; ".join(hints))
+            hint = f"{advice[name]}; "
+        raise TypeError(
+            f"{owner}: unknown argument {name!r}; {hint}"
+            f"accepted are {', '.join(accepted) or 'none'}"
+        )
 
 
 def _argument_names(owner: type) -> list[str]:

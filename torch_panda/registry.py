@@ -1,65 +1,212 @@
-"""The environments by name."""
+"""Registry: ids of environments, `make` and `register`."""
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
+from typing import Any, TypeVar
 
 import gymnasium
 import torch
 
+from torch_panda.arguments import check_call, check_names
+from torch_panda.bullet.shapes import BLUE
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.ids import ENV_IDS, SHIPPED_ENVS, Registration, describe_ids
 from torch_panda.rendering import Camera
-from torch_panda.robots import Robot
+from torch_panda.robots import Kuka, Panda, Robot, XArm6, XArm6Gripper
 from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import Task
+from torch_panda.tasks.drawer import Drawer
+from torch_panda.tasks.flip import Flip
+from torch_panda.tasks.peg_insertion import GRASP_WIDTH, PegInsertion
+from torch_panda.tasks.pick_and_place import PickAndPlace
+from torch_panda.tasks.push import Push
+from torch_panda.tasks.reach import Reach
+from torch_panda.tasks.slide import Slide
+from torch_panda.tasks.stack import Stack
 
-_ENVS = dict(SHIPPED_ENVS)
+Made = TypeVar("Made", Robot, Task)
+Options = Mapping[str, Any]
 
 
-def register(
-    env_id: str,
-    *,
-    robot: Callable[..., Robot],
-    task: Callable[..., Task],
-    max_episode_steps: int | None = None,
-    terminate_on_success: bool = False,
-) -> None:
-    """Give a robot at a task an id, for `make` and, as ``torch_panda/{id}``, Gymnasium.
+@dataclass(frozen=True)
+class Family:
+    """The ids of one robot at one task: ``{robot}{task}{,Joints}{,Dense}-v{1,3}``.
 
-    Registering an id of one's own once more replaces it. An id is known in the process
-    that has registered it: do so in a module, which workers import, too.
+    The names in the ids are those of the classes. The defaults of a task are those of
+    ``-v1``.
 
-    Args:
-        env_id: the id, such as ``"Shove-v0"``.
-        robot: makes the robot: a class or a function, called with the
-            ``robot_options`` of `make`.
-        task: makes the task, called with the ``task_options`` of `make`.
-        max_episode_steps: steps until ``truncated``; None means the task's number.
-        terminate_on_success: whether success ends an episode.
-
-    Raises:
-        ValueError: the id is one that torch_panda ships, or no id for Gymnasium; or
-            the number is below 1.
-        TypeError: the robot or the task is not made by a call.
+    Attributes:
+        robot: Class of the robot.
+        task: Class of the task.
+        robot_options: Arguments of the robot.
+        v3_task: Arguments of the task that ``-v3`` changes; None means that there is no
+            ``-v3``.
+        v3_robot: Arguments of the robot that ``-v3`` changes.
+        joints: Whether there are ids with joint control.
     """
-    if env_id in ENV_IDS:
-        raise ValueError(f"the id {env_id!r} is one that torch_panda ships")
-    for name, factory in (("robot", robot), ("task", task)):
-        if not callable(factory):
-            raise TypeError(
-                f"{name} must be a class or a function that makes one, got {factory!r}"
+
+    robot: type[Robot]
+    task: type[Task]
+    robot_options: Options = field(default_factory=dict)
+    v3_task: Options | None = None
+    v3_robot: Options = field(default_factory=dict)
+    joints: bool = True
+
+
+BLOCKED = {"block_gripper": True}
+FIRM = {"finger_friction": 5.0}
+SPINNING = {"finger_spinning_friction": 0.001}
+
+# The robots at the tasks. The page tasks/README.md shows both versions side by side,
+# with their sources.
+FAMILIES = (
+    Family(Panda, Reach, BLOCKED, v3_task={"table_friction": 0.5}, v3_robot=SPINNING),
+    Family(
+        Panda,
+        Push,
+        BLOCKED,
+        v3_task={"table_friction": 0.5, "object_mass": 1.0},
+        v3_robot=SPINNING,
+    ),
+    Family(
+        Panda,
+        Slide,
+        BLOCKED,
+        v3_task={
+            "table_friction": 0.5,
+            "object_mass": 1.0,
+            "object_friction": 0.04,
+            "goal_xy_range": 0.3,
+            "goal_x_offset": 0.4,
+            "table_length": 1.4,
+            "table_x_offset": -0.1,
+        },
+        v3_robot=SPINNING,
+    ),
+    Family(
+        Panda,
+        PickAndPlace,
+        FIRM,
+        v3_task={"table_friction": 0.5, "object_mass": 1.0, "object_friction": 0.5},
+        v3_robot={"finger_friction": 1.0, **SPINNING},
+    ),
+    Family(
+        Panda,
+        Stack,
+        FIRM,
+        v3_task={
+            "table_friction": 0.5,
+            "object_mass": (2.0, 1.0),
+            "object_friction": 0.5,
+            "distance_threshold": 0.1,
+            "per_object": False,
+            "lower_color": BLUE,
+        },
+        v3_robot={"finger_friction": 1.0, **SPINNING},
+    ),
+    # panda-gym 1.1.0 has no Flip, so its -v1 has the fingers of 3.0.7 too.
+    Family(Panda, Flip, SPINNING, v3_task={"table_friction": 0.5}),
+    Family(Panda, Drawer, BLOCKED),
+    Family(Panda, PegInsertion, BLOCKED | FIRM | {"fingers_width": GRASP_WIDTH}),
+    Family(Kuka, Reach, joints=False),
+    Family(XArm6, Reach, joints=False),
+    Family(XArm6Gripper, Reach, BLOCKED, joints=False),
+    Family(XArm6Gripper, PickAndPlace, FIRM, joints=False),
+)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How to make the robot and the task of an id.
+
+    Attributes:
+        env_id: The id, such as "PandaPush-v1".
+        robot: Class or function that makes the robot.
+        task: Class or function that makes the task.
+        max_episode_steps: Number of steps until ``truncated``.
+        terminate_on_success: Whether success ends an episode.
+    """
+
+    env_id: str
+    robot: Callable[..., Robot]
+    task: Callable[..., Task]
+    max_episode_steps: int
+    terminate_on_success: bool = False
+
+    def make_robot(self, options: Options | None = None) -> Robot:
+        """Make the robot of the id.
+
+        Args:
+            options: Arguments that replace those of the id.
+
+        Raises:
+            TypeError: The robot does not have one of these arguments.
+        """
+        return _call(self.robot, f"robot_options of {self.env_id}", options)
+
+    def make_task(self, options: Options | None = None) -> Task:
+        """Make the task of the id; see `make_robot`."""
+        return _call(self.task, f"task_options of {self.env_id}", options)
+
+    @property
+    def task_name(self) -> str:
+        """Name of the task's class, such as "Push"."""
+        return type(self.make_task()).__name__
+
+    @property
+    def robot_name(self) -> str:
+        """Name of the robot's class, such as "Panda"."""
+        return type(self.make_robot()).__name__
+
+    @property
+    def version(self) -> str:
+        """Version of the id, such as "v1"; empty if the id has none."""
+        return self.env_id.rpartition("-")[2] if "-" in self.env_id else ""
+
+
+def _shipped() -> Iterator[Registration]:
+    """The registrations of all families."""
+    for family in FAMILIES:
+        controls = ("", "Joints") if family.joints else ("",)
+        versions = ("v1",) if family.v3_task is None else ("v1", "v3")
+        for control, reward, version in product(controls, ("", "Dense"), versions):
+            robot_options = dict(family.robot_options)
+            task_options: dict[str, Any] = {}
+            if version == "v3":
+                robot_options |= family.v3_robot
+                task_options |= family.v3_task or {}
+            if control == "Joints":
+                robot_options["control_type"] = "joints"
+            if reward == "Dense":
+                task_options["reward_type"] = "dense"
+            name = f"{family.robot.__name__}{family.task.__name__}"
+            yield Registration(
+                f"{name}{control}{reward}-{version}",
+                partial(family.robot, **robot_options),
+                partial(family.task, **task_options),
+                family.task.max_episode_steps,
+                terminate_on_success=version == "v3",
             )
-    check_positive(max_episode_steps=max_episode_steps)
-    steps = max_episode_steps or task().max_episode_steps
-    registration = Registration(robot, task, steps, terminate_on_success)
-    try:
-        _register_with_gymnasium(env_id, registration)
-    except gymnasium.error.Error as error:
-        raise ValueError(f"{env_id!r} cannot be an id: {error}") from None
-    _ENVS[env_id] = registration
+
+
+_REGISTRATIONS = {registration.env_id: registration for registration in _shipped()}
+
+ENV_IDS: tuple[str, ...] = tuple(_REGISTRATIONS)
+"""The ids that torch_panda ships, which are those of `FAMILIES`."""
+
+# Arguments that `make` sets, and names from other libraries, with the fix for each.
+_ADVICE = {
+    "n_envs": "use num_envs",
+    "render_mode": "use env.render() for pictures, or env.open_viewer() to watch in a "
+    "browser",
+    "robot": "use an id, or RobotTaskEnv(robot=..., task=...)",
+    "task": "use an id, or RobotTaskEnv(robot=..., task=...)",
+    "observe_state": "use pixels_only",
+}
 
 
 def make(
@@ -76,48 +223,51 @@ def make(
     camera: Camera | None = None,
     render_size: int | tuple[int, int] | None = None,
     sensors: Sequence[Sensor | str] = (),
-    task_options: Mapping[str, Any] | None = None,
-    robot_options: Mapping[str, Any] | None = None,
+    task_options: Options | None = None,
+    robot_options: Options | None = None,
     **options: Any,  # noqa: ANN401 (those of RobotTaskEnv)
 ) -> RobotTaskEnv:
     """Make the environments of an id.
 
-    ``-v1`` follows the paper (arXiv 2106.13687) with the physical constants of
-    panda-gym 1.1.0, ``-v3`` equals panda-gym 3.0.7; see `torch_panda.versions`.
+    The ids ``-v1`` follow the paper (arXiv 2106.13687), with the physical constants of
+    panda-gym 1.1.0. The ids ``-v3`` equal panda-gym 3.0.7.
 
     Args:
-        env_id: one of `ENV_IDS`, or one that was given to `register`.
-        num_envs: see `RobotTaskEnv`, also for the next three.
-        num_threads: threads that step them.
-        seed: of all random draws.
-        device: where the outputs are placed.
-        from_pixels: observe ``pixels``, uint8 (*batch, height, width, 3).
-        pixels_only: leave ``observation`` out; the goals stay.
-        depth: observe ``depth``, float32 (*batch, height, width, 1) [m].
-        segmentation: observe ``segmentation``, int32 (*batch, height, width, 1), the
-            body ids of ``segmentation_ids``; see `CameraSensor`.
-        camera: of what is observed; None means panda-gym's view in 64 x 64 pixels.
-        render_size: height and width of what is observed [pixels], or both in one
-            number; None means the camera's.
-        sensors: "wrist_force_torque", "finger_contact" and "joint_torque", each
-            observed under its own key, float32; or other sensors.
-        task_options: arguments of the id's task, such as ``distance_threshold``.
-        robot_options: arguments of the id's robot, such as ``control_type``.
-        **options: the other arguments of `RobotTaskEnv`.
+        env_id: One of `ENV_IDS`, or an id that was registered with `register`.
+        num_envs: Number of environments stepped in parallel, for batch size
+            [num_envs]; None makes one environment with batch size [].
+        num_threads: Number of threads that step them; None means one per core, at most
+            ``num_envs``.
+        seed: Seed of all random draws.
+        device: Device of the outputs.
+        from_pixels: Observe ``pixels``, uint8 (*batch, height, width, 3).
+        pixels_only: Leave ``observation`` out; the goals stay.
+        depth: Observe ``depth``, float32 (*batch, height, width, 1) [m].
+        segmentation: Observe ``segmentation``, int32 (*batch, height, width, 1): body
+            ids that ``segmentation_ids`` names; see `CameraSensor`.
+        camera: Camera of these pictures; None means panda-gym's view in 64 x 64 pixels.
+        render_size: Height and width of these pictures [pixels], or one number for
+            both; None means the size of the camera.
+        sensors: Names of sensors ("joint_state", "wrist_force_torque",
+            "finger_contact", "joint_torque"), or `Sensor` objects.
+        task_options: Arguments of the task, such as ``distance_threshold``.
+        robot_options: Arguments of the robot, such as ``control_type``.
+        **options: Further arguments of `RobotTaskEnv`.
 
     Raises:
-        ValueError: the id is unknown, or an argument is out of range.
-        TypeError: the task or the robot has no such option.
+        ValueError: The id is unknown, or an argument is out of range.
+        TypeError: `make`, the task or the robot does not have such an argument.
     """
-    registration = _find(env_id)
+    registration = find_registration(env_id)
+    _check_options(registration, options)
     if pixels_only and not from_pixels:
         raise ValueError("pixels_only=True needs from_pixels=True")
     options.setdefault("terminate_on_success", registration.terminate_on_success)
     if options.get("max_episode_steps") is None:
         options["max_episode_steps"] = registration.max_episode_steps
     return RobotTaskEnv(
-        robot=_make(registration.robot, f"robot_options of {env_id}", robot_options),
-        task=_make(registration.task, f"task_options of {env_id}", task_options),
+        robot=registration.make_robot(robot_options),
+        task=registration.make_task(task_options),
         num_envs=num_envs,
         num_threads=num_threads,
         seed=seed,
@@ -135,61 +285,147 @@ def make(
     )
 
 
-def max_episode_steps(env_id: str) -> int:
-    """The number of steps after which an id's episodes are truncated.
+def register(
+    env_id: str,
+    *,
+    robot: Callable[..., Robot],
+    task: Callable[..., Task],
+    max_episode_steps: int | None = None,
+    terminate_on_success: bool = False,
+) -> None:
+    """Register an id for `make` and, as ``torch_panda/{env_id}``, for Gymnasium.
+
+    The id is known in the process that registered it. Call `register` in a module that
+    worker processes import too. Registering an id again replaces it.
+
+    Args:
+        env_id: The id, such as ``"Shove-v0"``.
+        robot: Class or function that makes the robot. It is called with the
+            ``robot_options`` of `make`.
+        task: Class or function that makes the task. It is called with the
+            ``task_options`` of `make`.
+        max_episode_steps: Number of steps until ``truncated``; None means the task's
+            number.
+        terminate_on_success: Whether success ends an episode.
 
     Raises:
-        ValueError: the id is unknown.
+        ValueError: The id belongs to torch_panda or is invalid for Gymnasium, or
+            ``max_episode_steps`` is below 1.
+        TypeError: ``robot`` or ``task`` cannot be called.
     """
-    return _find(env_id).max_episode_steps
+    if env_id in ENV_IDS:
+        raise ValueError(
+            f"{env_id!r} is an id that torch_panda ships; choose another one"
+        )
+    for name, factory in (("robot", robot), ("task", task)):
+        if not callable(factory):
+            raise TypeError(
+                f"{name} must be a class or a function that makes one, got {factory!r}"
+            )
+    check_positive(max_episode_steps=max_episode_steps)
+    steps = max_episode_steps or task().max_episode_steps
+    registration = Registration(env_id, robot, task, steps, terminate_on_success)
+    try:
+        _register_with_gymnasium(registration)
+    except gymnasium.error.Error as error:
+        raise ValueError(f"{env_id!r} cannot be an id: {error}") from None
+    _REGISTRATIONS[env_id] = registration
+
+
+def find_registration(env_id: str) -> Registration:
+    """Robot, task and episode length of an id.
+
+    Raises:
+        ValueError: The id is unknown.
+    """
+    if isinstance(env_id, str) and env_id in _REGISTRATIONS:
+        return _REGISTRATIONS[env_id]
+    similar = difflib.get_close_matches(str(env_id), _REGISTRATIONS, n=3)
+    hint = f"did you mean {' or '.join(similar)}? " if similar else ""
+    own = ", ".join(sorted(_REGISTRATIONS.keys() - set(ENV_IDS)))
+    raise ValueError(
+        f"unknown environment id {env_id!r}; {hint}accepted are {_id_patterns()}"
+        + (f" and the registered: {own}" if own else "")
+    )
+
+
+def max_episode_steps(env_id: str) -> int:
+    """Number of steps after which the episodes of an id are truncated.
+
+    Raises:
+        ValueError: The id is unknown.
+    """
+    return find_registration(env_id).max_episode_steps
 
 
 def register_with_gymnasium() -> None:
-    """Register ``torch_panda/{id}`` for every id, for ``make`` and ``make_vec``.
-
-    By name: the classes are imported when the first one is made. ``gymnasium.make``
-    truncates with its own ``TimeLimit``, so that its argument ``max_episode_steps``
-    works as for any other environment.
-    """
+    """Register ``torch_panda/{id}`` with Gymnasium for all shipped ids."""
     for env_id in ENV_IDS:
-        _register_with_gymnasium(env_id, _ENVS[env_id])
+        _register_with_gymnasium(_REGISTRATIONS[env_id])
 
 
-def _register_with_gymnasium(env_id: str, registration: Registration) -> None:
-    name = f"torch_panda/{env_id}"
-    gymnasium.registry.pop(name, None)  # or it would warn that it replaces it
+def _register_with_gymnasium(registration: Registration) -> None:
+    """Register an id for ``gymnasium.make`` and ``make_vec``.
+
+    The entry points are strings, so the classes are imported when the first environment
+    is made. ``gymnasium.make`` truncates with its own ``TimeLimit``, so that its
+    argument ``max_episode_steps`` works as for any other environment.
+    """
+    name = f"torch_panda/{registration.env_id}"
+    gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that it replaces.
     gymnasium.register(
         name,
         entry_point="torch_panda.gymnasium_envs:GoalEnv",
         vector_entry_point="torch_panda.gymnasium_envs:GoalVectorEnv",
         max_episode_steps=registration.max_episode_steps,
-        kwargs={"env": env_id},
+        kwargs={"env": registration.env_id},
     )
 
 
-def _find(env_id: str) -> Registration:
-    if not isinstance(env_id, str) or env_id not in _ENVS:
-        close = difflib.get_close_matches(str(env_id), _ENVS, n=3)
-        hint = f"did you mean {' or '.join(close)}? " if close else ""
-        own = ", ".join(sorted(_ENVS.keys() - SHIPPED_ENVS.keys()))
-        raise ValueError(
-            f"unknown environment id {env_id!r}; {hint}accepted are {describe_ids()}"
-            + (f" and what was registered: {own}" if own else "")
-        )
-    return _ENVS[env_id]
+def _id_patterns() -> str:
+    """Patterns of the shipped ids, for errors."""
+    tasks: dict[tuple[str, str], list[str]] = {}
+    for family in FAMILIES:
+        suffix = "{,Joints}{,Dense}" if family.joints else "{,Dense}"
+        suffix += "-v1" if family.v3_task is None else "-v{1,3}"
+        key = family.robot.__name__, suffix
+        tasks.setdefault(key, []).append(family.task.__name__)
+    return ", ".join(
+        f"{robot}{names[0]}{suffix}"
+        if len(names) == 1
+        else f"{robot}{{{','.join(names)}}}{suffix}"
+        for (robot, suffix), names in tasks.items()
+    )
 
 
-def _make(
-    factory: Callable[..., Any], name: str, options: Mapping[str, Any] | None
-) -> Any:  # noqa: ANN401 (a robot or a task)
-    """Call what makes a robot or a task, with options that it takes."""
+def _check_options(registration: Registration, options: Options) -> None:
+    """Refuse options of `make` that `RobotTaskEnv` does not have.
+
+    Raises:
+        TypeError: An option is unknown; the error says what to use instead.
+    """
+    advice = dict(_ADVICE)
+    for name, value in options.items():
+        for argument in ("task", "robot"):
+            factory = getattr(registration, argument)
+            if name in inspect.signature(factory).parameters:
+                advice[name] = f"use {argument}_options={{{name!r}: {value!r}}}"
+    dense_id = "Dense-".join(registration.env_id.rsplit("-", 1))
+    if "reward_type" in advice and dense_id in ENV_IDS:
+        advice["reward_type"] += f", or the id {dense_id} for dense rewards"
+    names = (
+        *inspect.signature(make).parameters,
+        *inspect.signature(RobotTaskEnv.__init__).parameters,
+    )
+    hidden = {"self", "options", *_ADVICE}
+    check_names(
+        "make", options, [n for n in dict.fromkeys(names) if n not in hidden], advice
+    )
+
+
+def _call(factory: Callable[..., Made], owner: str, options: Options | None) -> Made:
+    """Make a robot or a task with these arguments."""
     if options is not None and not isinstance(options, Mapping):
-        raise TypeError(f"{name} must be a mapping, got {options!r}")
-    options = dict(options or {})
-    signature = inspect.signature(factory)
-    try:
-        signature.bind(**options)
-    except TypeError as error:
-        accepted = ", ".join(signature.parameters) or "none"
-        raise TypeError(f"{name}: {error}; accepted are {accepted}") from None
-    return factory(**options)
+        raise TypeError(f"{owner} must be a mapping, got {options!r}")
+    check_call(owner, factory, options or {})
+    return factory(**options or {})

@@ -1,7 +1,7 @@
-"""What holds for every id; a new task is tested without being named here.
+"""What holds for every id. A new task is tested without being named here.
 
-What an id must have is read from its task and its robot. What the ids of the paper and
-of panda-gym must have is written down in `test_sizes_of_the_contract`.
+The expected sizes are read from the task and the robot of an id. The sizes of the ids
+of the paper and of panda-gym are fixed in `test_sizes_of_the_contract`.
 """
 
 from itertools import product
@@ -12,8 +12,9 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from tests.ids import PHYSICS_IDS, dense
+from torch_panda.registry import find_registration
 
-# Numbers of entries: observation, goal, action with end-effector control; and steps.
+# Observation, goal and action size with end-effector control, and steps.
 SIZES = {
     "Reach": (6, 3, 3, 50),
     "Push": (18, 3, 3, 50),
@@ -22,17 +23,12 @@ SIZES = {
     "Stack": (31, 6, 4, 100),
     "Flip": (20, 4, 4, 50),
 }
-# Those that panda-gym does not have, so without a -v3.
-OWN_SIZES = {
-    "Drawer": (11, 3, 3, 50),
-    "PegInsertion": (21, 3, 3, 50),
-}
 NUM_ENVS = 3
 
 
 @pytest.fixture(scope="module", params=PHYSICS_IDS)
 def made(request):
-    """An environment for all tests of an id."""
+    """One environment for all tests of an id."""
     with torch_panda.make(request.param, num_envs=NUM_ENVS, num_threads=2) as env:
         yield request.param, env
 
@@ -48,18 +44,12 @@ def env(made):
     return made[1]
 
 
-# Task, control and version.
-PARTS = [
-    *product(SIZES, ("", "Joints"), ("v1", "v3")),
-    *product(OWN_SIZES, ("", "Joints"), ("v1",)),
-]
-
-
-@pytest.mark.parametrize("parts", PARTS)
-def test_sizes_of_the_contract(parts):
-    task, control, version = parts
+@pytest.mark.parametrize(
+    ("task", "control", "version"), [*product(SIZES, ("", "Joints"), ("v1", "v3"))]
+)
+def test_sizes_of_the_contract(task, control, version):
     env_id = f"Panda{task}{control}-{version}"
-    observation, goal, action, steps = (SIZES | OWN_SIZES)[task]
+    observation, goal, action, steps = SIZES[task]
     assert {env_id, dense(env_id)} <= set(torch_panda.ENV_IDS)
     with torch_panda.make(env_id) as env:
         assert env.observation_spec["observation"].shape == (observation,)
@@ -72,6 +62,16 @@ def test_sizes_of_the_contract(parts):
 def test_ids_are_unique():
     ids = torch_panda.ENV_IDS
     assert len(ids) == len(set(ids)) == 2 * len(PHYSICS_IDS)
+    assert set(map(dense, PHYSICS_IDS)) | set(PHYSICS_IDS) == set(ids)
+
+
+def test_an_id_names_its_robot_its_task_and_its_version():
+    for env_id in torch_panda.ENV_IDS:
+        registration = find_registration(env_id)
+        control = {"joints": "Joints", "ee": ""}[registration.make_robot().control_type]
+        reward = {"dense": "Dense", "sparse": ""}[registration.make_task().reward_type]
+        name = registration.robot_name + registration.task_name
+        assert env_id == f"{name}{control}{reward}-{registration.version}"
 
 
 def test_specs(env):
@@ -106,28 +106,28 @@ def test_reward_success_and_ends_follow_from_the_goals(env):
 def test_reward_types_share_their_physics(env, env_id):
     actions = torch.rand(6, *env.action_spec.shape) * 2 - 1
 
-    def play(env):
+    def step_through(env):
         td, steps = env.reset(), []
         for action in actions:
             td = env.step(td.clone().set("action", action))["next"]
             steps.append(td)
         return torch.stack(steps)
 
-    sparse = play(env)
+    sparse = step_through(env)
     with torch_panda.make(dense(env_id), num_envs=NUM_ENVS, seed=0) as other:
         check_env_specs(other)
         other.set_seed(0)
-        found = play(other)
-        goals = found["achieved_goal"], found["desired_goal"]
-        assert torch.equal(found["reward"], other.compute_reward(*goals))
-        assert len(found["reward"].unique()) > len(sparse["reward"].unique())
-    assert (found.exclude("reward") == sparse.exclude("reward")).all()
+        rewarded = step_through(other)
+        goals = rewarded["achieved_goal"], rewarded["desired_goal"]
+        assert torch.equal(rewarded["reward"], other.compute_reward(*goals))
+        assert len(rewarded["reward"].unique()) > len(sparse["reward"].unique())
+    assert (rewarded.exclude("reward") == sparse.exclude("reward")).all()
 
 
 def test_episode_is_truncated(env):
     limit = env.max_episode_steps
     assert limit == env.task.max_episode_steps
-    # From one step before: what an episode's steps are is the history test's.
+    # Start two steps before the end, to save the time of a whole episode.
     env.reset()
     state = env.get_state()
     state["step_count"][:] = limit - 2
@@ -152,7 +152,7 @@ def test_observations_are_finite_and_vary(env):
     rollout = env.rollout(20, break_when_any_done=False)
     observation = rollout["next", "observation"]
     assert observation.isfinite().all()
-    # With the gripper free or blocked, every entry moves in some episode.
+    # The end-effector's position and velocity change in every episode.
     assert (observation[..., :6].std(dim=1) > 0).all()
 
 
@@ -164,16 +164,16 @@ def test_starts_differ(env):
 
 
 def test_same_seed_same_trajectory(env, env_id):
-    """And the number of threads changes nothing, nor what was before."""
+    """For any number of threads, and whatever the environment did before."""
     torch.manual_seed(0)
     expected = env.rollout(15, break_when_any_done=False)
     with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=1, seed=0) as other:
         torch.manual_seed(0)
-        found = other.rollout(15, break_when_any_done=False)
-    assert (found == expected).all()
+        repeated = other.rollout(15, break_when_any_done=False)
+    assert (repeated == expected).all()
 
 
-def test_an_exact_state_goes_on(env):
+def test_a_step_from_an_exact_state_repeats_bit_for_bit(env):
     torch.manual_seed(0)
     td = env.rollout(8, break_when_any_done=False)[:, -1]["next"].exclude("reward")
     state = env.get_state(exact=True)

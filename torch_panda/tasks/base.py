@@ -66,8 +66,7 @@ class Task(Configured, ABC):
     the state tensors of the simulation. Lengths are in metres, in the world frame.
 
     A task sets ``goal_dim``, ``observation_dim`` and, unless it is 50,
-    ``max_episode_steps``. Its numbers are by default those of the ids -v1;
-    `torch_panda.versions` has them beside those of -v3.
+    ``max_episode_steps``. The defaults of its arguments are those of the ids -v1.
 
     `randomize`, `reward`, `failure` and `extra_observation` are hooks: a task has those
     that it overrides, and the others are never called.
