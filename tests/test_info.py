@@ -33,7 +33,7 @@ def test_names_versions_ids_and_spaces(capsys):
 
 def test_says_how_to_get_what_is_missing(monkeypatch):
     monkeypatch.setattr(info, "find_spec", lambda name: None)
-    monkeypatch.setattr(info, "loop_name", lambda: "ctypes")
+    monkeypatch.setattr(info, "loop_problem", lambda: "there is no C compiler")
     monkeypatch.delenv("DISPLAY", raising=False)
     extras = "\n".join(info.extras())
     assert "pip install -c .ci/constraints.txt -e '.[viewer]'" in extras
@@ -47,7 +47,9 @@ def test_says_how_to_get_what_is_missing(monkeypatch):
 def test_knows_the_extras():
     """Those for users; `test` and `docs` are for who changes the package."""
     text = (ROOT / "pyproject.toml").read_text()
-    section = text.split("[project.optional-dependencies]")[1].split("\n[project.scripts]")[0]
+    section = text.split("[project.optional-dependencies]")[1].split(
+        "\n[project.scripts]"
+    )[0]
     declared = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
     declared -= {"test", "docs", "examples"}  # `examples` is `learning`, renamed
     assert declared == set(info._EXTRAS)

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 import torch
 
 import torch_panda
-from torch_panda.bullet.native import loop_name
+from torch_panda.bullet.native import loop_name, loop_problem
 
 _PACKAGES = (
     "torch_panda",
@@ -105,8 +105,8 @@ def extras() -> list[str]:
 def missing() -> list[str]:
     """What does not work here although it is installed, and what would help."""
     lines = []
-    if loop_name() != "native":
-        lines.append("the native loop: install a C compiler, then torch_panda anew")
+    if problem := loop_problem():
+        lines.append(f"the native loop: {problem}")
     if find_spec("eglRenderer") is None:
         lines.append('renderer="egl": this build of pybullet is without it')
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):

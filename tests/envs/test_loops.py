@@ -385,16 +385,3 @@ def test_own_control_is_called(loop):
             states.append(env.get_state())
     assert (states[0] == states[1]).all()
     assert robots[0].num_controlled == 4 * N
-
-
-def test_loops_that_there_are_not(monkeypatch):
-    monkeypatch.setenv(native.LOOP_VARIABLE, "fortran")
-    with pytest.raises(ValueError, match=r"one of \('native', 'ctypes'\), got 'fort"):
-        make()
-    monkeypatch.setattr(native, "LIBRARY", None)
-    monkeypatch.setenv(native.LOOP_VARIABLE, "native")
-    with pytest.raises(ValueError, match="without its native loop"):
-        make()
-    monkeypatch.delenv(native.LOOP_VARIABLE)
-    with make() as env:
-        assert env.episodes.simulation._native is None

@@ -9,6 +9,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+enum { LOOP_VERSION = 1 }; /* native.py refuses a library of another version */
+
 typedef void *handle;          /* of a client, a command or a status */
 typedef const double *doubles; /* to be read */
 
@@ -135,6 +137,9 @@ int client_reset(struct batch *batch, int env);
 
 /* Take so many substeps of a step; answer whether more of them are to be taken. */
 int client_take_piece(struct batch *batch, int env, int piece);
+
+/* LOOP_VERSION of the sources from which the library was compiled. */
+int loop_version(void);
 
 /* Roll, pitch and yaw of a quaternion xyzw; euler.py says more. */
 void euler_angles(doubles quaternion, double *angles);

@@ -16,6 +16,8 @@
 #include <signal.h>
 #include <stdlib.h>
 
+int loop_version(void) { return LOOP_VERSION; }
+
 enum {
     STACK_SIZE = 8 << 20, /* of a thread: as on Linux; macOS gives less */
     PIECE = 5             /* substeps; other threads begin with a cold cache */

@@ -1,12 +1,17 @@
-"""``client.c``, ``reset.c`` and ``loop.c`` as the package's installation compiled them.
+"""The compiled library of ``client.c``, ``reset.c`` and ``loop.c``: loading, structs.
 
-They are found, loaded and declared here. They are an optional part: without them,
-`VectorSimulation` steps its clients in Python.
+The library is optional. Without it, `VectorSimulation` steps its clients in Python
+threads.
 """
 
 import ctypes
+import functools
 import importlib.util
 import os
+import shlex
+import shutil
+import sysconfig
+import warnings
 from ctypes import (
     POINTER,
     Structure,
@@ -16,13 +21,18 @@ from ctypes import (
     c_int64,
     c_void_p,
 )
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 from torch_panda.bullet import capi
 
+# Version of the C sources, as ``loop_version`` in client.h: the library must have been
+# compiled from sources of this version.
+VERSION = 1
+
 LoopName = Literal["native", "ctypes"]
 
-# Chooses the loop of what is created from now on: for tests and comparisons.
+# Environment variable that chooses the loop of every simulation that is created.
 LOOP_VARIABLE = "TORCH_PANDA_LOOP"
 
 # ``enum arm_mode``
@@ -166,14 +176,21 @@ class Batch(Structure):
 
 
 class Library:
-    """The functions of all three. Calls release the GIL.
+    """The functions of the library. Calls release the GIL.
 
     Args:
-        path: of the compiled file.
+        path: Path of the compiled file.
+
+    Raises:
+        OSError: the file cannot be loaded.
     """
 
     def __init__(self, path: str) -> None:
         library = ctypes.CDLL(path)
+        self.path = path
+        self.version: int = 0  # a library that is older than the version numbers
+        if hasattr(library, "loop_version"):
+            self.version = library.loop_version()
         self.create = library.loop_create
         self.create.restype = c_void_p
         self.create.argtypes = (POINTER(Batch), c_int)
@@ -197,36 +214,83 @@ class Library:
         self.destroy.argtypes = (c_void_p,)
 
 
-def _find() -> Library | None:
-    # It has the name of an extension module, but knows nothing of Python.
+def load() -> Library | str:
+    """The library, or the reason why there is none."""
+    # The file has the name of an extension module, but does not use Python.
     spec = importlib.util.find_spec("torch_panda.bullet._loop")
-    return None if spec is None or spec.origin is None else Library(spec.origin)
+    if spec is None or spec.origin is None:
+        compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")[0]
+        if shutil.which(compiler) is None:
+            return f"it was not compiled, and there is no C compiler ({compiler!r})"
+        return "torch_panda/bullet/_loop*.so does not exist"
+    try:
+        return Library(spec.origin)
+    except OSError as error:
+        return f"it cannot be loaded ({error})"
 
 
-LIBRARY = _find()
+_loaded = load()
+LIBRARY = _loaded if isinstance(_loaded, Library) else None
+_reason_missing = _loaded if isinstance(_loaded, str) else None
 
 
 def loop_name() -> LoopName:
-    """The loop that steps what is created now.
+    """The loop of simulations that are created now. Warns once if it is the slow one.
 
     Raises:
-        ValueError: the environment variable asks for a loop that there is not.
+        ImportError: the library was compiled from other sources than these.
+        ValueError: the environment variable names a loop that does not exist, or the
+            native one without a library.
     """
-    name = os.environ.get(LOOP_VARIABLE)
-    if name is None:
-        return "ctypes" if LIBRARY is None else "native"
-    if name == "native" and LIBRARY is None:
+    name = os.environ.get(LOOP_VARIABLE) or None
+    if name not in (None, *get_args(LoopName)):
         raise ValueError(
-            f"{LOOP_VARIABLE}=native, but torch_panda was installed without its native "
-            f"loop: install it again where there is a C compiler"
+            f"{LOOP_VARIABLE} must be one of {get_args(LoopName)} or unset, "
+            f"got {name!r}"
         )
     if name == "ctypes":
         return "ctypes"
-    if name == "native":
-        return "native"
-    raise ValueError(
-        f"{LOOP_VARIABLE} must be one of {get_args(LoopName)}, got {name!r}"
+    if LIBRARY is None:
+        if name == "native":
+            raise ValueError(f"{LOOP_VARIABLE}=native, but {loop_problem()}")
+        _warn_of_slow_loop()
+        return "ctypes"
+    if LIBRARY.version != VERSION:
+        raise ImportError(loop_problem())
+    return "native"
+
+
+def loop_problem() -> str | None:
+    """Why the native loop cannot run, and the cure; None if it can."""
+    if LIBRARY is None:
+        return (
+            f"torch_panda has no compiled loop: {_reason_missing}. With a C compiler "
+            f"installed, compile it: {_reinstall_command()}"
+        )
+    if LIBRARY.version != VERSION:
+        return (
+            f"the compiled loop {LIBRARY.path} has version {LIBRARY.version}, but the "
+            f"sources of torch_panda have version {VERSION}. Compile it again: "
+            f"{_reinstall_command()}"
+        )
+    return None
+
+
+@functools.cache  # once per process
+def _warn_of_slow_loop() -> None:
+    warnings.warn(
+        f"steps take about 1.5 times as long as they could, because {loop_problem()}. "
+        f"{LOOP_VARIABLE}=ctypes silences this warning",
+        RuntimeWarning,
+        stacklevel=2,
     )
+
+
+def _reinstall_command() -> str:
+    root = Path(__file__).parents[2]
+    if (root / "pyproject.toml").is_file():
+        return f"pip install --no-deps -e {root}"
+    return "pip install --no-deps --force-reinstall --no-cache-dir torch_panda"
 
 
 def bullet_functions() -> Any:  # noqa: ANN401 (a ctypes array)

@@ -1,0 +1,133 @@
+"""The compiled loop: its version, and what happens without it."""
+
+import hashlib
+import re
+import shutil
+import subprocess
+import warnings
+from pathlib import Path
+
+import pytest
+
+import torch_panda
+from torch_panda.bullet import native
+
+FOLDER = Path(native.__file__).parent
+SOURCES = ("client.h", "client.c", "loop.c", "reset.c")
+# Hash of the C sources without comments and white space, by version.
+HASHES = {1: "0369eca1f4deac42"}
+
+
+def hash_of_sources():
+    code = "".join((FOLDER / name).read_text() for name in SOURCES)
+    code = re.sub(r"/\*.*?\*/|\s", "", code, flags=re.DOTALL)
+    return hashlib.sha256(code.encode()).hexdigest()[:16]
+
+
+@pytest.fixture
+def unset(monkeypatch):
+    """No environment variable, and no warning so far."""
+    monkeypatch.delenv(native.LOOP_VARIABLE, raising=False)
+    native._warn_of_slow_loop.cache_clear()
+    yield
+    native._warn_of_slow_loop.cache_clear()
+
+
+def test_the_version_belongs_to_the_sources():
+    assert HASHES[native.VERSION] == hash_of_sources(), (
+        "the C sources have changed: increase LOOP_VERSION in client.h and VERSION in "
+        "native.py, and replace HASHES by the new version with the new hash"
+    )
+    header = (FOLDER / "client.h").read_text()
+    assert f"LOOP_VERSION = {native.VERSION} }}" in header
+
+
+@pytest.mark.skipif(native.LIBRARY is None, reason="there is no compiled loop")
+def test_the_library_says_its_version():
+    assert native.LIBRARY.version == native.VERSION
+
+
+@pytest.mark.skipif(native.LIBRARY is None, reason="there is no compiled loop")
+@pytest.mark.parametrize("variable", [None, "", "native"])
+def test_a_library_of_another_version_is_refused(unset, monkeypatch, variable):
+    if variable is not None:
+        monkeypatch.setenv(native.LOOP_VARIABLE, variable)
+    monkeypatch.setattr(native, "VERSION", native.VERSION + 1)
+    message = r"loop .*_loop.*\.so has version \d+, .* Compile it again: pip install "
+    with pytest.raises(ImportError, match=message):
+        torch_panda.make("PandaReach-v1")
+    monkeypatch.setenv(native.LOOP_VARIABLE, "ctypes")
+    with torch_panda.make("PandaReach-v1") as env:
+        env.rollout(2)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_a_library_without_a_version_has_version_0(tmp_path):
+    """As if it were compiled from sources that are older than the version numbers."""
+    sources = [shutil.copy(FOLDER / name, tmp_path) for name in SOURCES]
+    loop = tmp_path / "loop.c"
+    loop.write_text(loop.read_text().replace("int loop_version", "static int version"))
+    path = tmp_path / "old.so"
+    command = ["cc", "-shared", "-fPIC", "-pthread", "-o", path, *sources[1:], "-lm"]
+    subprocess.run(command, check=True)
+    assert native.Library(str(path)).version == 0
+
+
+def missing(monkeypatch):
+    monkeypatch.setattr(native, "LIBRARY", None)
+    monkeypatch.setattr(native, "_reason_missing", "a test took it away")
+
+
+@pytest.mark.parametrize("variable", [None, ""])
+def test_a_missing_loop_warns_once(unset, monkeypatch, variable):
+    if variable is not None:
+        monkeypatch.setenv(native.LOOP_VARIABLE, variable)
+    missing(monkeypatch)
+    message = "1.5 times as long .* a test took it away.* pip install "
+    with pytest.warns(RuntimeWarning, match=message) as caught:
+        for _ in range(2):
+            with torch_panda.make("PandaReach-v1") as env:
+                assert env.episodes.simulation._native is None
+    assert len(caught) == 1
+
+
+def test_the_python_loop_that_was_asked_for_is_silent(unset, monkeypatch):
+    missing(monkeypatch)
+    monkeypatch.setenv(native.LOOP_VARIABLE, "ctypes")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        torch_panda.make("PandaReach-v1").close()
+
+
+def test_a_missing_loop_that_was_asked_for_is_refused(unset, monkeypatch):
+    missing(monkeypatch)
+    monkeypatch.setenv(native.LOOP_VARIABLE, "native")
+    with pytest.raises(ValueError, match="=native, but torch_panda has no compiled"):
+        torch_panda.make("PandaReach-v1")
+
+
+def test_an_empty_variable_means_unset(unset, monkeypatch):
+    expected = native.loop_name()
+    monkeypatch.setenv(native.LOOP_VARIABLE, "")
+    assert native.loop_name() == expected
+
+
+def test_an_unknown_loop_is_refused(monkeypatch):
+    monkeypatch.setenv(native.LOOP_VARIABLE, "fortran")
+    with pytest.raises(ValueError, match=r"one of \('native', 'ctypes'\) .*'fortran'"):
+        torch_panda.make("PandaReach-v1")
+
+
+def test_reasons_why_there_is_no_library(monkeypatch, tmp_path):
+    monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: None)
+    assert "_loop*.so does not exist" in native.load()
+    monkeypatch.setattr(native.shutil, "which", lambda name: None)
+    assert "no C compiler" in native.load()
+    broken = tmp_path / "_loop.so"
+    broken.write_bytes(b"no library")
+
+    class Spec:
+        origin = str(broken)
+
+    monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: Spec)
+    assert native.load().startswith("it cannot be loaded (")
