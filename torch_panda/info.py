@@ -10,6 +10,7 @@ from importlib.util import find_spec
 import torch
 
 import torch_panda
+from torch_panda.bullet import solver
 from torch_panda.bullet.native import loop_name, loop_problem
 
 _PACKAGES = (
@@ -130,6 +131,7 @@ def describe() -> str:
         "versions": [f"{name} {number}" for name, number in versions().items()],
         "threads": [f"{threads}, at most one an environment"],
         "stepping": [stepping()],
+        "solver": [str(solver.activate())],
         "renderers": renderers(),
         "extras": extras(),
         "missing": missing(),

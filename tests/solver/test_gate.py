@@ -1,0 +1,214 @@
+"""The gate: where a condition does not hold, Bullet's own functions run."""
+
+import ctypes
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from tests.solver.solvers import needs_packed
+from torch_panda.bullet import library
+from torch_panda.bullet.solver import SOLVER_VARIABLE, gate, native, self_test
+from torch_panda.bullet.solver.elf import Symbol, read_symbols
+
+pytestmark = needs_packed
+
+
+@pytest.fixture
+def closed(monkeypatch):
+    """A process in which nothing is replaced yet, and nothing may be enabled."""
+    solver = gate.load_library()
+    solver.uninstall()
+    slot = gate.find_slot(library.library_path())
+    monkeypatch.delenv(SOLVER_VARIABLE, raising=False)
+    monkeypatch.setattr(gate, "_status", None)
+    monkeypatch.setattr(
+        native.SolverLibrary, "enable", lambda self, on: pytest.fail("the gate opened")
+    )
+    yield
+    monkeypatch.undo()
+    assert gate.find_slot(library.library_path()) == slot  # Bullet's function is back
+    solver.install(*slot)
+
+
+def reason():
+    status = gate.activate()
+    assert status.name == "bullet"
+    assert str(status) == f"bullet: {status.reason}"
+    return status.reason
+
+
+def test_opens_here():
+    assert gate.activate() == gate.SolverStatus("packed")
+
+
+def test_variable_switches_it_off(closed, monkeypatch):
+    monkeypatch.setenv(SOLVER_VARIABLE, "bullet")
+    assert reason() == "TORCH_PANDA_SOLVER=bullet"
+
+
+def test_unknown_solver_is_refused(closed, monkeypatch):
+    monkeypatch.setenv(SOLVER_VARIABLE, "fast")
+    with pytest.raises(ValueError, match='must be "packed" or "bullet", got "fast"'):
+        gate.activate()
+
+
+def test_packed_can_be_demanded(closed, monkeypatch):
+    monkeypatch.setenv(SOLVER_VARIABLE, "packed")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    with pytest.raises(RuntimeError, match="=packed, but it needs x86-64 Linux"):
+        gate.activate()
+
+
+@pytest.mark.parametrize(
+    ("system", "machine"),
+    [("linux", "aarch64"), ("darwin", "x86_64"), ("win32", "AMD64")],
+)
+def test_platform(closed, monkeypatch, system, machine):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert f"this is {system} on {machine}" in reason()
+
+
+def test_version(closed, monkeypatch):
+    monkeypatch.setattr(library, "SUPPORTED_VERSION", "3.2.6")
+    assert reason() == "it needs pybullet 3.2.6, and 3.2.7 is installed"
+
+
+def test_no_compiled_library(closed, monkeypatch):
+    monkeypatch.setattr(gate, "_LIBRARY", "torch_panda.bullet.solver.missing")
+    assert "was installed without it" in reason()
+
+
+@pytest.mark.parametrize("name", ["_VTABLE", "_ITERATIONS"])
+def test_missing_symbol(closed, monkeypatch, name):
+    monkeypatch.setattr(gate, name, "_ZTV7missing")
+    assert reason() == "pybullet has no symbol _ZTV7missing"
+
+
+def test_stripped_module(closed, monkeypatch, tmp_path):
+    stripped = tmp_path / "pybullet.so"
+    header = bytearray(64)
+    header[:6] = b"\x7fELF\x02\x01"
+    stripped.write_bytes(header)
+    monkeypatch.setattr(library, "library_path", lambda: str(stripped))
+    assert "has no .symtab" in reason()
+
+
+def test_module_that_is_no_elf_file(closed, monkeypatch):
+    monkeypatch.setattr(library, "library_path", lambda: __file__)
+    assert "is not a 64-bit ELF file" in reason()
+
+
+def test_function_that_is_not_in_the_table(closed, monkeypatch):
+    monkeypatch.setattr(gate, "_VTABLE", "_ZTV21btMultiBodyJointMotor")
+    assert "holds the replaced function 0 times" in reason()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "wrong"),
+    [
+        ("time_step", 0.002, "m_timeStep"),
+        ("residual_threshold", 1e-7, "m_leastSquaresResidualThreshold"),
+        ("motor_impulse", 1.0, "limits of motors"),
+        ("friction", 0.5, "m_friction"),
+        ("num_iterations", 50, "m_numIterations"),
+        ("num_dofs", 9, "number of rows of motors and limits"),
+    ],
+)
+def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
+    # The scene contradicts the expectation, as it does where a field is elsewhere.
+    probe = native.SolverLibrary.set_mode
+
+    def set_mode(self, mode, expectation=None):
+        if expectation is not None:
+            setattr(expectation, field, value)
+        probe(self, mode, expectation)
+
+    monkeypatch.setattr(native.SolverLibrary, "set_mode", set_mode)
+    assert reason().startswith("Bullet's layout differs: ")
+    assert wrong in reason()
+
+
+def test_results_that_differ(closed, monkeypatch):
+    simulate = self_test._simulate
+    runs = []
+
+    def differ():
+        states = simulate()
+        runs.append(states)
+        if len(runs) == 2:
+            states[7] = states[7][:-1] + bytes([states[7][-1] ^ 1])
+        return states
+
+    monkeypatch.setattr(self_test, "_simulate", differ)
+    assert reason() == "the self-test differs from Bullet in step 7"
+
+
+def test_groups_that_are_left_to_bullet(closed, monkeypatch):
+    monkeypatch.setattr(self_test, "SOLVE", native.LEAVE)
+    assert reason() == "it did not solve all groups of the self-test"
+
+
+def test_decides_once(monkeypatch):
+    monkeypatch.setattr(gate, "open_gate", lambda: pytest.fail("decided again"))
+    monkeypatch.setenv(SOLVER_VARIABLE, "bullet")
+    assert gate.activate().name == "packed"
+
+
+def test_symbols_have_the_addresses_of_the_process():
+    path = library.library_path()
+    names = ("b3ConnectPhysicsDirect", "b3InitStepSimulationCommand", "missing")
+    symbols = read_symbols(path, names)
+    assert set(symbols) == set(names[:2])
+    assert all(isinstance(symbol, Symbol) for symbol in symbols.values())
+    first, second = (
+        ctypes.cast(getattr(library.WORK, name), ctypes.c_void_p).value
+        for name in names[:2]
+    )
+    assert second - first == symbols[names[1]].address - symbols[names[0]].address
+
+
+_HASH = """
+import hashlib, os, sys
+{before}
+import pybullet, pybullet_data
+from pybullet_utils.bullet_client import BulletClient
+client = BulletClient(pybullet.DIRECT)
+client.setAdditionalSearchPath(pybullet_data.getDataPath())
+client.setGravity(0, 0, -9.81)
+client.loadURDF("plane.urdf")
+arm = client.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
+cubes = [client.loadURDF("cube_small.urdf", (0.4, 0.01 * i, 0.1 * i)) for i in range(5)]
+digest = hashlib.sha256()
+for k in range(300):
+    for joint in range(7):
+        client.setJointMotorControl2(
+            arm, joint, pybullet.POSITION_CONTROL, 0.1 * joint, force=50
+        )
+    client.stepSimulation()
+    for body in (arm, *cubes):
+        digest.update(repr(client.getBasePositionAndOrientation(body)).encode())
+    digest.update(repr(client.getJointStates(arm, range(7))).encode())
+print("hash", digest.hexdigest(), {solver})
+"""
+
+
+def test_clients_of_a_user_are_the_same_without_us():
+    hashes = []
+    ours = "import torch_panda.bullet as b; ours = b.PhysicsClient()"
+    for before, solver in (("", "None"), (ours, "b.solver.activate()")):
+        code = _HASH.format(before=before, solver=solver)
+        result = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        line = result.stdout[result.stdout.index("hash ") :].split("\n")[0]
+        hashes.append(line.split()[1])
+    assert line.split()[2] == "packed:"
+    assert len(set(hashes)) == 1

@@ -1,0 +1,233 @@
+/*
+ * The few of Bullet's structs that the solver reads or writes.
+ *
+ * These are declarations of our own. They name only the fields that are used; the
+ * bytes between are padding. Each offset is the one of pybullet 3.2.7 on x86-64,
+ * built in double precision (BT_USE_DOUBLE_PRECISION), as its debug information
+ * gives it. The assertions below hold the declarations to these offsets, and the
+ * layout probe of hook.c compares the fields with a known scene at run time.
+ */
+#ifndef TORCH_PANDA_BULLET_TYPES_H
+#define TORCH_PANDA_BULLET_TYPES_H
+
+#include <stddef.h>
+
+/* btAlignedObjectArray<T> */
+struct array {
+    char allocator[4];
+    int size;
+    int capacity;
+    void *data;
+    char owns_memory;
+};
+
+/* btVector3 */
+struct vector3 {
+    double x, y, z, w;
+};
+
+/* btMatrix3x3 */
+struct matrix3 {
+    struct vector3 row[3];
+};
+
+/* btSpatialForceVector and btSpatialMotionVector */
+struct spatial {
+    struct vector3 top, bottom;
+};
+
+/* btMultibodyLink */
+struct link {
+    char pad0[40];
+    int parent;
+    char pad1[228];
+    struct spatial axes[6];
+    int dof_offset;
+    char pad2[36];
+    struct vector3 r_vector; /* m_cachedRVector */
+    char pad3[192];
+    double joint_position[7];
+    char pad4[112];
+    int flags;
+    int num_dofs;
+    int num_positions;
+    int joint_type;
+    void *joint_feedback;
+    struct matrix3 world_basis; /* m_cachedWorldTransform */
+    struct vector3 world_origin;
+    char pad5[72];
+};
+
+/* btMultiBody */
+struct multi_body {
+    char pad0[320];
+    struct array links; /* of struct link */
+    char pad1[32];
+    struct array delta_v; /* m_deltaV */
+    struct array real_buffer;
+    struct array vector_buffer;
+    struct array matrix_buffer;
+    char pad2[385];
+    char fixed_base;
+    char pad3[46];
+    int companion_id;
+    char pad4[45];
+    char pos_updated; /* __posUpdated */
+    char pad5[2];
+    int num_dofs;
+};
+
+/* btMultiBodySolverConstraint: one row */
+struct constraint_row {
+    int delta_vel_a, jac_a, delta_vel_b, jac_b;
+    struct vector3 relpos1_cross_normal, contact_normal1;
+    struct vector3 relpos2_cross_normal, contact_normal2;
+    struct vector3 angular_component_a, angular_component_b;
+    double applied_push_impulse, applied_impulse;
+    double friction, jac_diag_inv, rhs, cfm;
+    double lower_limit, upper_limit, rhs_penetration;
+    void *contact_point;
+    int override_iterations, friction_index;
+    int solver_body_a;
+    struct multi_body *multi_body_a;
+    int link_a;
+    int solver_body_b;
+    struct multi_body *multi_body_b;
+    int link_b;
+    struct constraint *constraint;
+    int constraint_row;
+};
+
+/* btMultiBodyJacobianData */
+struct jacobian_data {
+    struct array jacobians, unit_impulses, delta_velocities;
+    struct array scratch_r, scratch_v, scratch_m;
+    struct array *solver_bodies;
+    int fixed_body;
+};
+
+/* btMultiBodyConstraintSolver, and its base btSequentialImpulseConstraintSolver */
+struct solver {
+    void **vtable;
+    struct array solver_bodies;
+    struct array contact_rows, joint_rows, friction_rows, rolling_rows;
+    char pad0[128];
+    int max_override_iterations;
+    char pad1[68];
+    double residual; /* m_leastSquaresResidual */
+    char pad2[8];
+    struct {
+        int island, num_bodies, num_manifolds, num_calls, num_iterations;
+        double residual;
+    } analytics;
+    struct array multi_body_joint_rows; /* m_multiBodyNonContactConstraints */
+    struct array multi_body_normal_rows;
+    struct array multi_body_friction_rows;
+    struct array multi_body_torsional_rows;
+    struct array multi_body_spinning_rows;
+    struct jacobian_data data;
+};
+
+/* btContactSolverInfo */
+struct solver_info {
+    char pad0[24];
+    double time_step;
+    char pad1[8];
+    int num_iterations;
+    char pad2[20];
+    double erp, erp2;
+    char pad3[48];
+    int split_impulse;
+    double split_impulse_threshold;
+    char pad4[32];
+    int mode;
+    char pad5[28];
+    double residual_threshold;
+    char pad6[12];
+    int report_analytics;
+    int num_inner_iterations; /* m_numNonContactInnerIterations */
+};
+
+/* btCollisionObject */
+struct collision_object {
+    char pad0[416];
+    int companion_id;
+};
+
+/* enum btSolverMode */
+enum { TWO_FRICTION_DIRECTIONS = 16, NO_FRICTION_CONE = 2048 };
+
+#define AT(type, field, offset)                                                        \
+    _Static_assert(offsetof(struct type, field) == (offset), #type "." #field)
+#define SIZE(type, bytes) _Static_assert(sizeof(struct type) == (bytes), #type)
+
+AT(array, size, 4);
+AT(array, data, 16);
+SIZE(array, 32);
+AT(link, parent, 40);
+AT(link, axes, 272);
+AT(link, dof_offset, 656);
+AT(link, r_vector, 696);
+AT(link, joint_position, 920);
+AT(link, flags, 1088);
+AT(link, num_dofs, 1092);
+AT(link, joint_type, 1100);
+AT(link, joint_feedback, 1104);
+AT(link, world_basis, 1112);
+AT(link, world_origin, 1208);
+SIZE(link, 1312);
+AT(multi_body, links, 320);
+AT(multi_body, delta_v, 384);
+AT(multi_body, real_buffer, 416);
+AT(multi_body, vector_buffer, 448);
+AT(multi_body, matrix_buffer, 480);
+AT(multi_body, fixed_base, 897);
+AT(multi_body, companion_id, 944);
+AT(multi_body, pos_updated, 993);
+AT(multi_body, num_dofs, 996);
+AT(constraint_row, relpos1_cross_normal, 16);
+AT(constraint_row, applied_impulse, 216);
+AT(constraint_row, friction, 224);
+AT(constraint_row, jac_diag_inv, 232);
+AT(constraint_row, rhs, 240);
+AT(constraint_row, cfm, 248);
+AT(constraint_row, lower_limit, 256);
+AT(constraint_row, upper_limit, 264);
+AT(constraint_row, contact_point, 280);
+AT(constraint_row, friction_index, 292);
+AT(constraint_row, solver_body_a, 296);
+AT(constraint_row, multi_body_a, 304);
+AT(constraint_row, link_a, 312);
+AT(constraint_row, solver_body_b, 316);
+AT(constraint_row, multi_body_b, 320);
+AT(constraint_row, link_b, 328);
+AT(constraint_row, constraint, 336);
+AT(constraint_row, constraint_row, 344);
+SIZE(constraint_row, 352);
+AT(jacobian_data, scratch_r, 96);
+AT(jacobian_data, solver_bodies, 192);
+AT(jacobian_data, fixed_body, 200);
+AT(solver, contact_rows, 40);
+AT(solver, rolling_rows, 136);
+AT(solver, max_override_iterations, 296);
+AT(solver, residual, 368);
+AT(solver, analytics, 384);
+AT(solver, analytics.num_iterations, 400);
+AT(solver, analytics.residual, 408);
+AT(solver, multi_body_joint_rows, 416);
+AT(solver, multi_body_spinning_rows, 544);
+AT(solver, data, 576);
+AT(solver_info, time_step, 24);
+AT(solver_info, num_iterations, 40);
+AT(solver_info, erp, 64);
+AT(solver_info, split_impulse, 128);
+AT(solver_info, split_impulse_threshold, 136);
+AT(solver_info, mode, 176);
+AT(solver_info, residual_threshold, 208);
+AT(solver_info, num_inner_iterations, 232);
+AT(collision_object, companion_id, 416);
+
+#undef AT
+#undef SIZE
+
+#endif

@@ -1,0 +1,182 @@
+"""Decides whether Bullet's solver is replaced, and replaces it.
+
+The replacement depends on the layout of Bullet's objects in memory. It is used only if
+all of these conditions hold; otherwise Bullet's own functions run:
+
+1. ``TORCH_PANDA_SOLVER`` is not ``bullet``.
+2. The process runs on x86-64 Linux. Other compilers fuse multiply-adds.
+3. The installed pybullet has the supported version.
+4. torch_panda was installed with its C library.
+5. pybullet's extension module has the symbols that are needed, and the table of virtual
+   functions holds the function that is replaced exactly once.
+6. Bullet's objects in a known scene are laid out as ``bullet_types.h`` declares.
+7. The same scene comes out the same with and without the replacement, bit for bit.
+
+The last two conditions are the self-test; see `self_test.py`. Until it has passed, the
+replacement runs in the thread of the self-test only.
+
+A slot of a table of virtual functions is a pointer in data. No code is changed.
+"""
+
+import ctypes
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import sys
+import threading
+from ctypes import c_void_p
+from dataclasses import dataclass
+from typing import Literal
+
+from torch_panda.bullet import library
+from torch_panda.bullet.solver.elf import read_symbols
+from torch_panda.bullet.solver.native import GateError, SolverLibrary
+from torch_panda.bullet.solver.self_test import run_self_test
+
+SolverName = Literal["packed", "bullet"]
+
+# Chooses the solver of this process before its first client is created.
+SOLVER_VARIABLE = "TORCH_PANDA_SOLVER"
+
+_LIBRARY = "torch_panda.bullet.solver._solver"
+_VTABLE = "_ZTV27btMultiBodyConstraintSolver"
+_ITERATIONS = (
+    "_ZN35btSequentialImpulseConstraintSolver33solveGroupCacheFriendlyIterations"
+    "EPP17btCollisionObjectiPP20btPersistentManifoldiPP17btTypedConstrainti"
+    "RK19btContactSolverInfoP12btIDebugDraw"
+)
+_EXPORTED = "b3ConnectPhysicsDirect"  # its address is known in the process, too
+
+
+@dataclass(frozen=True)
+class SolverStatus:
+    """Which solver steps the clients of this process.
+
+    Attributes:
+        name: "packed" is this package's solver, "bullet" is Bullet's own.
+        reason: Why Bullet's own solver runs; empty for "packed".
+    """
+
+    name: SolverName
+    reason: str = ""
+
+    def __str__(self) -> str:
+        if self.name == "packed":
+            return "packed: faster than Bullet's own, the same bits"
+        return f"bullet: {self.reason}"
+
+
+def activate() -> SolverStatus:
+    """Replace Bullet's solver in this process, if the gate allows it.
+
+    The first call decides. Later calls return its result.
+
+    Raises:
+        ValueError: The environment variable names an unknown solver.
+        RuntimeError: The environment variable demands "packed", and the gate refuses.
+    """
+    global _status
+    if _status is None:
+        with _lock:
+            if _status is None:
+                _status = _decide()
+    return _status
+
+
+_status: SolverStatus | None = None
+_lock = threading.Lock()
+
+
+def _decide() -> SolverStatus:
+    choice = os.environ.get(SOLVER_VARIABLE)
+    if choice not in (None, "packed", "bullet"):
+        raise ValueError(
+            f'{SOLVER_VARIABLE} must be "packed" or "bullet", got "{choice}"'
+        )
+    if choice == "bullet":
+        return SolverStatus("bullet", f"{SOLVER_VARIABLE}=bullet")
+    try:
+        open_gate()
+    except GateError as error:
+        if choice == "packed":
+            raise RuntimeError(
+                f"{SOLVER_VARIABLE}=packed, but {error}; unset it to run Bullet's own "
+                f"solver"
+            ) from None
+        return SolverStatus("bullet", str(error))
+    return SolverStatus("packed")
+
+
+def open_gate() -> None:
+    """Check all conditions but the first, and enable the replacement.
+
+    Raises:
+        GateError: A condition does not hold. Bullet's own functions run.
+    """
+    check_platform()
+    check_version()
+    solver = load_library()
+    solver.install(*find_slot(library.library_path()))
+    try:
+        run_self_test(solver)
+    except GateError:
+        solver.uninstall()
+        raise
+    solver.enable(True)
+
+
+def check_platform() -> None:
+    """Check for x86-64 Linux."""
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        raise GateError(
+            f"it needs x86-64 Linux, and this is {sys.platform} on {platform.machine()}"
+        )
+
+
+def check_version() -> None:
+    """Check for the supported version of pybullet."""
+    version = importlib.metadata.version("pybullet")
+    if version != library.SUPPORTED_VERSION:
+        raise GateError(
+            f"it needs pybullet {library.SUPPORTED_VERSION}, and {version} is installed"
+        )
+
+
+def load_library() -> SolverLibrary:
+    """Load the compiled library."""
+    # It has the name of an extension module, but knows nothing of Python.
+    spec = importlib.util.find_spec(_LIBRARY)
+    if spec is None or spec.origin is None:
+        raise GateError(
+            "torch_panda was installed without it: install torch_panda again where "
+            "there is a C compiler"
+        )
+    return SolverLibrary(spec.origin)
+
+
+def find_slot(path: str) -> tuple[int, int]:
+    """Find what is replaced: the slot of a table, and Bullet's function in it.
+
+    Args:
+        path: Path of pybullet's extension module.
+    """
+    try:
+        symbols = read_symbols(path, (_VTABLE, _ITERATIONS, _EXPORTED))
+    except ValueError as error:
+        raise GateError(str(error)) from None
+    for name in (_VTABLE, _ITERATIONS, _EXPORTED):
+        if name not in symbols:
+            raise GateError(f"pybullet has no symbol {name}")
+    exported = ctypes.cast(getattr(library.WORK, _EXPORTED), c_void_p).value
+    assert exported is not None
+    base = exported - symbols[_EXPORTED].address
+    function = base + symbols[_ITERATIONS].address
+    table = base + symbols[_VTABLE].address
+    entries = (c_void_p * (symbols[_VTABLE].size // 8)).from_address(table)
+    slots = [i for i, entry in enumerate(entries) if entry == function]
+    if len(slots) != 1:
+        raise GateError(
+            f"{_VTABLE} holds the replaced function {len(slots)} times, expected once"
+        )
+    return table + 8 * slots[0], function

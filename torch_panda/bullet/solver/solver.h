@@ -1,0 +1,37 @@
+/* What the files of the solver know of one another. */
+#ifndef TORCH_PANDA_SOLVER_H
+#define TORCH_PANDA_SOLVER_H
+
+#include "bullet_types.h"
+
+/*
+ * The iterations of btSequentialImpulseConstraintSolver over the rows of one group.
+ *
+ * Returns 1 if the group is solved. Returns 0, with nothing changed, if Bullet's own
+ * function has to solve it.
+ */
+int solve_group(struct solver *solver, struct collision_object **bodies, int num_bodies,
+                int num_manifolds, int num_constraints, const struct solver_info *info);
+
+/* What the layout probe knows of the scene that it looks at. */
+struct expectation {
+    double time_step;
+    double residual_threshold;
+    double motor_impulse; /* of every motor: largest force times time step */
+    double friction;      /* of every contact */
+    int num_iterations;
+    int num_dofs; /* joints of the one body that has joints */
+};
+
+/*
+ * Compares fields with the scene before and after Bullet solves a group.
+ *
+ * Each returns NULL, or the name of the first field that is not as expected.
+ */
+const char *probe_rows(const struct solver *solver, const struct solver_info *info,
+                       const struct expectation *expected);
+const char *probe_result(const struct solver *solver,
+                         struct collision_object *const *bodies, int num_bodies,
+                         int num_manifolds, const struct solver_info *info);
+
+#endif
