@@ -281,3 +281,79 @@ def test_an_empty_task():
         td = env.reset()
         env.step(td.set("action", torch.zeros(2, 3)))
         assert isinstance(env.get_state(), TensorDict)
+
+
+# ---- numbers of the first steps ------------------------------------------------
+
+
+def task_that_fails(name, function, step):
+    """A Reach whose function returns other numbers from a step on."""
+    calls = {"n": 0}
+
+    def broken(self, *args):
+        value = getattr(Reach, name)(self, *args)
+        calls["n"] += 1
+        return function(value) if calls["n"] > step + 1 else value
+
+    return task_with(name, broken)
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("achieved_goal", float("nan")),
+        ("compute_reward", float("nan")),
+        ("compute_reward", -float("inf")),
+        ("reward", float("nan")),
+    ],
+)
+def test_nan_of_a_task_is_named_in_the_first_steps(name, number):
+    def break_row(value):
+        value = value.clone()
+        value[1] = number
+        return value
+
+    task = task_that_fails(name, break_row, step=5)
+    with (
+        make(task, num_envs=3) as env,
+        pytest.raises(
+            ValueError, match=rf"Own\.{name} must .*(nan|inf).* environment 1"
+        ),
+    ):
+        env.rollout(10)
+
+
+def test_nan_of_an_observation_is_named():
+    class Observing(Push):
+        def observation(self, simulation):
+            return super().observation(simulation) / 0
+
+    with (
+        make(Observing(), num_envs=2) as env,
+        pytest.raises(ValueError, match=r"Observing\.observation must return numbers"),
+    ):
+        env.reset()
+    infinite = task_with(
+        "extra_observation", lambda s, sim: {"distance": sim.ee_position / 0}
+    )
+    with make(infinite) as env:
+        assert env.reset()["distance"].isinf().all()
+    nan = task_with("extra_observation", lambda s, sim: {"a": sim.ee_velocity * 0 / 0})
+    with (
+        make(nan) as env,
+        pytest.raises(ValueError, match=r"Own\.extra_observation\['a'\] must return"),
+    ):
+        env.reset()
+
+
+def test_later_steps_are_not_checked():
+    """The checks cost nothing after the first steps."""
+    with make(Reach()) as env:
+        env.rollout(30)
+        env.episodes._observer._check_numbers = None
+        env.rollout(3)
+
+
+def test_more_environments_than_memory_are_refused_at_once():
+    with pytest.raises(ValueError, match=r"would take about 44,000,000 GB of memory"):
+        make(Reach(), num_envs=1_000_000_000)

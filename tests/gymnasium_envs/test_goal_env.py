@@ -31,6 +31,24 @@ def test_registered(env_id):
     assert spec.vector_entry_point is not None
 
 
+@pytest.mark.filterwarnings(NO_BOUNDS)
+@pytest.mark.filterwarnings(NOT_OLD)
+@pytest.mark.filterwarnings("error")
+def test_goals_that_are_observations():
+    env = gymnasium.make("torch_panda/PandaPush-v1", goal="observation")
+    try:
+        check_env(env.unwrapped, skip_render_check=True)
+        for key in ("achieved_goal", "desired_goal"):
+            assert env.observation_space[key].shape == (18,)
+        env.reset(seed=0)
+        observation, reward, *_ = env.step(env.action_space.sample())
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        assert np.array_equal(goals[0], observation["observation"])
+        assert env.unwrapped.compute_reward(*goals, {}) == reward
+    finally:
+        env.close()
+
+
 # Each task, control, reward and version once; what an id means is tested elsewhere.
 @pytest.mark.parametrize(
     "env_id",

@@ -24,6 +24,11 @@ from torch_panda.checks import (
     check_positive,
 )
 from torch_panda.envs.builder import RobotTaskBuilder
+from torch_panda.envs.goal_observation import (
+    GoalName,
+    GoalObserver,
+    find_goal_indices,
+)
 from torch_panda.envs.history import History
 from torch_panda.envs.observer import EpisodeObserver, Observed
 from torch_panda.envs.randomization import DomainRandomizer, Randomization
@@ -54,6 +59,9 @@ class Episodes:
         renderer: Draws the environments.
         seeds: Seeds of the episodes.
         entries: Observed entries beside ``observation`` and the goals, by key.
+        goal_indices: Entries of ``observation`` that are the task's achieved goal, or
+            None.
+        goal_dim: Number of entries of ``achieved_goal`` and ``desired_goal``.
     """
 
     # Tensors that are made in inference mode could be changed in that mode only.
@@ -73,6 +81,7 @@ class Episodes:
         renderer: RendererName = "tiny",
         on_divergence: OnDivergence = "raise",
         randomize: Randomization | None = None,
+        goal: GoalName = "task",
     ) -> None:
         check_instance("robot", robot, Robot)
         check_instance("task", task, Task)
@@ -85,8 +94,16 @@ class Episodes:
         )
         check_renderer(renderer)
         check_choice("on_divergence", on_divergence, get_args(OnDivergence))
+        check_choice("goal", goal, get_args(GoalName))
         n = num_envs or 1
         check_memory(n, _BYTES_PER_ENV)
+        self.goal_indices = find_goal_indices(robot, task)
+        if goal == "observation" and self.goal_indices is None:
+            raise ValueError(
+                f'goal="observation" needs a task that declares where the observation '
+                f"holds the achieved goal, but {type(task).__name__} has no "
+                f'goal_entries; set Task.goal_entries, or use goal="task"'
+            )
         self.robot, self.task = robot, task
         self._control = robot.controller
         self.batch_shape = () if num_envs is None else (n,)
@@ -111,6 +128,18 @@ class Episodes:
             randomizer = DomainRandomizer(
                 randomize, robot, task, self.simulation, self.physics
             )
+            self.goal_dim = task.goal_dim
+            self._goal_observer: GoalObserver | None = None
+            if goal == "observation" and self.goal_indices is not None:
+                self.goal_dim = robot.observation_dim + task.observation_dim
+                self._goal_observer = GoalObserver(
+                    robot,
+                    task,
+                    self.simulation,
+                    self.build_scene,
+                    self.physics,
+                    self.goal_indices,
+                )
             self._observer = EpisodeObserver(
                 robot,
                 task,
@@ -118,6 +147,7 @@ class Episodes:
                 self.renderer,
                 sensors=sensors,
                 randomizer=randomizer,
+                goal_indices=self.goal_indices,
                 max_episode_steps=self.max_episode_steps,
                 terminate_on_success=terminate_on_success,
             )
@@ -272,12 +302,18 @@ class Episodes:
         """Start episodes from the state tensors."""
         self._starts.place_markers(envs)
         self._history.begin(envs, self._starts.state())
+        if self._goal_observer is not None:
+            self._goal_observer.update(envs, self._starts.goal)
         self._starts.place(envs)
         self._observer.after_reset(envs)
 
     def _observe(self, action: Tensor | None = None) -> Observed:
         starts = self._starts
-        return self._observer.observe(starts.goal, starts.step_count, action)
+        observed = self._observer.observe(starts.goal, starts.step_count, action)
+        if self._goal_observer is not None:
+            observed["achieved_goal"] = observed["observation"].clone()
+            observed["desired_goal"] = self._goal_observer.desired.clone()
+        return observed
 
     def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
         """Advance the physics by one step; return the environments that diverged."""

@@ -14,6 +14,9 @@ from torch_panda.robots import Robot
 from torch_panda.sensors import Entry, Observer, Sensor, join_entries
 from torch_panda.tasks import Task
 
+# Number of vector observations whose numbers are checked. Later ones cost nothing.
+_NUM_CHECKED = 20
+
 Observed = dict[str, Tensor]
 """Observed entries of all environments, (n, ...) by key, in new tensors."""
 
@@ -28,6 +31,7 @@ class EpisodeObserver:
         renderer: Draws the pictures of camera sensors.
         sensors: The sensors.
         randomizer: Varies the physics, which may be observed.
+        goal_indices: Entries of the observation that are the achieved goal, or None.
         max_episode_steps: Number of steps after which an episode is ``truncated``.
         terminate_on_success: Whether success ends an episode.
 
@@ -49,12 +53,15 @@ class EpisodeObserver:
         *,
         sensors: Sequence[Sensor],
         randomizer: DomainRandomizer,
+        goal_indices: tuple[int, ...] | None,
         max_episode_steps: int,
         terminate_on_success: bool,
     ) -> None:
         self._robot, self._task, self._simulation = robot, task, simulation
         self._max_episode_steps = max_episode_steps
         self._terminate_on_success = terminate_on_success
+        self._goal_indices = None if goal_indices is None else list(goal_indices)
+        self._num_unchecked = _NUM_CHECKED
         # Hooks that the task leaves out are never called.
         self._has_reward = type(task).reward is not Task.reward
         self._has_failure = type(task).failure is not Task.failure
@@ -62,10 +69,9 @@ class EpisodeObserver:
         self._readings = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]
-        observers: list[Observer] = [
-            *self._readings,
-            ExtraObserver(task, simulation),
-        ]
+        extra = ExtraObserver(task, simulation)
+        self._extra_keys = tuple(extra.entries)
+        observers: list[Observer] = [*self._readings, extra]
         reserved = (*PHYSICAL, *PHYSICS, *EXACT_KEYS)
         self.entries = join_entries(observers, reserved) | randomizer.entries
         observers.append(randomizer)
@@ -95,6 +101,10 @@ class EpisodeObserver:
         Returns:
             Observation, goals, success and ends, and after a step ``reward``, (n, 1)
             float32.
+
+        Raises:
+            ValueError: One of the first observations or rewards is NaN or infinite, or
+                does not hold the achieved goal where the task says.
         """
         task, simulation = self._task, self._simulation
         observation = torch.cat(
@@ -115,6 +125,9 @@ class EpisodeObserver:
             observed["reward"] = self._reward(action, achieved_goal, desired_goal)
         for observer in self._observers:
             observed |= observer.observe()
+        if self._num_unchecked:
+            self._check_numbers(observed)
+            self._num_unchecked -= 1
         return observed
 
     def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
@@ -153,6 +166,47 @@ class EpisodeObserver:
             "truncated": truncated,
             "done": terminated | truncated,
         }
+
+    def _check_numbers(self, observed: Observed) -> None:
+        """Check what robot and task returned; see `observe`."""
+        robot, task = type(self._robot).__name__, type(self._task).__name__
+        num_robot = self._robot.observation_dim
+        observation = observed["observation"]
+        functions = {
+            f"{robot}.observation": observation[:, :num_robot],
+            f"{task}.observation": observation[:, num_robot:],
+            f"{task}.achieved_goal": observed["achieved_goal"],
+        }
+        if "reward" in observed:
+            name = "reward" if self._has_reward else "compute_reward"
+            functions[f"{task}.{name}"] = observed["reward"]
+        for function, values in functions.items():
+            self._check_valid(function, values, values.isfinite())
+        for key in self._extra_keys:  # infinity may mean that nothing is seen
+            function = f"{task}.extra_observation[{key!r}]"
+            self._check_valid(function, observed[key], ~observed[key].isnan())
+        if self._goal_indices is not None:
+            entries = observation[:, self._goal_indices]
+            achieved_goal = observed["achieved_goal"]
+            if not torch.allclose(entries, achieved_goal, equal_nan=True):
+                raise ValueError(
+                    f"the entries {self._goal_indices} of the observation must be the "
+                    f"achieved goal, as {task}.goal_entries says, but they differ: "
+                    f"{entries.tolist()} and {achieved_goal.tolist()}"
+                )
+
+    def _check_valid(self, function: str, values: Tensor, is_valid: Tensor) -> None:
+        """Check the numbers, (n, ...), that a function of robot or task returned."""
+        if is_valid.all():
+            return
+        invalid = (~is_valid).flatten(1).any(dim=1).nonzero().flatten().tolist()
+        # Where Bullet itself diverged, the functions are not to blame.
+        for env in sorted(set(invalid) - set(self._simulation.diverged())):
+            raise ValueError(
+                f"{function} must return numbers that are finite, but returned "
+                f"{values[env].tolist()} for environment {env}: look for a division by "
+                f"0 or a root of a negative number"
+            )
 
     def _check_functions(self) -> None:
         """Check that robot and task return the shapes that they declare."""

@@ -17,6 +17,7 @@ from typing_extensions import Self
 from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
+from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
@@ -83,6 +84,12 @@ class RobotTaskEnv(EnvBase):
             success, with the reward of the new start.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
+        goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
+            and ``desired_goal`` full observations: the desired goal is the observation
+            of a state in which the task's goal is reached, with the objects at their
+            goals and at rest, and the hand in its neutral pose (in Reach at the goal).
+            Reward and success stay the task's, computed from the entries at
+            `goal_indices`. States keep the task's goal.
 
     Raises:
         ValueError: An argument is out of range.
@@ -121,6 +128,7 @@ class RobotTaskEnv(EnvBase):
         renderer: RendererName = "tiny",
         on_divergence: OnDivergence = "raise",
         randomize: Randomization | None = None,
+        goal: GoalName = "task",
     ) -> None:
         device = check_device(device)
         episodes = Episodes(
@@ -136,6 +144,7 @@ class RobotTaskEnv(EnvBase):
             renderer=renderer,
             on_divergence=on_divergence,
             randomize=randomize,
+            goal=goal,
         )
         super().__init__(device=device, batch_size=episodes.batch_shape)
         self.episodes, self.num_envs = episodes, num_envs
@@ -144,6 +153,7 @@ class RobotTaskEnv(EnvBase):
         self.max_episode_steps = episodes.max_episode_steps
         self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
+        self.goal = goal
         self._observe_state = observe_state
         specs = Specs(episodes, device, observe_state=observe_state)
         self.observation_spec, self.action_spec = specs.observation, specs.action
@@ -157,14 +167,38 @@ class RobotTaskEnv(EnvBase):
         return self.episodes.simulation.num_threads
 
     @property
+    def goal_indices(self) -> tuple[int, ...] | None:
+        """Entries of ``observation`` that are the task's achieved goal, in its order.
+
+        None if the observation does not contain the achieved goal, or if the task does
+        not declare `Task.goal_entries`.
+        """
+        return self.episodes.goal_indices
+
+    @property
     def compute_reward(self) -> RewardFunction:
-        """The task's pure reward function; see `Task.compute_reward`."""
-        return self.task.compute_reward
+        """The pure reward function of ``achieved_goal`` and ``desired_goal``.
+
+        It maps (..., goal_dim) to (..., 1); see `Task.compute_reward`.
+        """
+        return self._of_goals(self.task.compute_reward)
 
     @property
     def is_success(self) -> RewardFunction:
-        """The task's pure success function; see `Task.is_success`."""
-        return self.task.is_success
+        """The pure success function of ``achieved_goal`` and ``desired_goal``.
+
+        It maps (..., goal_dim) to (..., 1); see `Task.is_success`.
+        """
+        return self._of_goals(self.task.is_success)
+
+    def _of_goals(self, function: RewardFunction) -> RewardFunction:
+        """A function of the task's goals as one of the observed goals."""
+        episodes = self.episodes
+        if self.goal == "task" or episodes.goal_indices is None:
+            return function
+        return ObservationGoalFunction(
+            function, episodes.goal_indices, episodes.goal_dim
+        )
 
     def __repr__(self) -> str:
         """The class with the arguments that differ from their defaults."""

@@ -23,8 +23,8 @@ class Specs:
         self._device = device
         robot, task = episodes.robot, episodes.task
         observed: dict[str, TensorSpec] = {
-            "achieved_goal": self._numbers(task.goal_dim),
-            "desired_goal": self._numbers(task.goal_dim),
+            "achieved_goal": self._numbers(episodes.goal_dim),
+            "desired_goal": self._numbers(episodes.goal_dim),
             "success": self._flag(),
         }
         if observe_state:

@@ -2,6 +2,8 @@
 
 from torch_panda.tasks.base import (
     Bodies,
+    GoalEntries,
+    ObjectState,
     RewardType,
     Start,
     Task,
@@ -21,6 +23,8 @@ __all__ = [
     "Bodies",
     "Drawer",
     "Flip",
+    "GoalEntries",
+    "ObjectState",
     "PegInsertion",
     "PickAndPlace",
     "Push",

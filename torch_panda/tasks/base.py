@@ -19,6 +19,8 @@ from torch_panda.tasks.table import create_table
 __all__ = [
     "NO_ROTATION",
     "Bodies",
+    "GoalEntries",
+    "ObjectState",
     "Start",
     "Task",
     "create_table",
@@ -57,6 +59,31 @@ class Start(NamedTuple):
     object_joint_position: Sequence[float] = (0.0,)
 
 
+class GoalEntries(NamedTuple):
+    """Where an observation holds the achieved goal.
+
+    Attributes:
+        part: "task" for entries of `Task.observation`, "robot" for entries of
+            `Robot.observation`, which begins with the end-effector's position.
+        indices: Indices in this part, in the order of the goal, (goal_dim,).
+    """
+
+    part: Literal["robot", "task"]
+    indices: tuple[int, ...]
+
+
+class ObjectState(NamedTuple):
+    """Poses and joint positions of the objects of n environments.
+
+    Attributes:
+        pose: Positions [m] and quaternions xyzw, world frame, (n, n_objects, 7).
+        joint_position: (n, n_object_joints) [rad] or [m].
+    """
+
+    pose: Tensor
+    joint_position: Tensor
+
+
 @dataclass(kw_only=True, eq=False, repr=False)
 class Task(Configured, ABC):
     """What is to be done: scene, goals, observation, success, reward.
@@ -82,6 +109,11 @@ class Task(Configured, ABC):
     goal_dim: ClassVar[int]
     observation_dim: ClassVar[int]
     max_episode_steps: ClassVar[int] = 50
+    goal_entries: ClassVar[GoalEntries | None] = None
+    """Where the observation holds the achieved goal; None if it does not.
+
+    `RobotTaskEnv.goal_indices` and ``goal="observation"`` need it. A subclass that
+    overrides `observation` or `achieved_goal` declares it anew."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
@@ -213,6 +245,34 @@ class Task(Configured, ABC):
     @abstractmethod
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """What has been achieved: (num_envs, goal_dim), float64."""
+
+    def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
+        """Where the objects are when goals are reached, for ``goal="observation"``.
+
+        By default a goal is one position for each object, which is not rotated. Where
+        the goal is a position of the end-effector, the objects stay where they start.
+
+        Args:
+            goal: Desired goals, (n, goal_dim) float64.
+            objects: The objects at the start of the episodes.
+
+        Returns:
+            The objects at rest, after the task was done.
+
+        Raises:
+            NotImplementedError: The default does not apply to this task.
+        """
+        if self.goal_entries is not None and self.goal_entries.part == "robot":
+            return objects
+        if goal.shape[1] != 3 * objects.pose.shape[1]:
+            raise NotImplementedError(
+                f'goal="observation" needs {type(self).__name__}.objects_at_goal: its '
+                f"goals are not one position for each object"
+            )
+        position = goal.unflatten(1, (-1, 3))
+        rotation = goal.new_tensor(NO_ROTATION).expand(*position.shape[:-1], 4)
+        pose = torch.cat((position, rotation), dim=-1)
+        return objects._replace(pose=pose)
 
     def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """How far the goal is, (..., 1); minus this is the dense reward."""

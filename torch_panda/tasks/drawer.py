@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.bullet.shapes import Box
 from torch_panda.rotations import NO_ROTATION, rotate
-from torch_panda.tasks.base import Bodies, Start, Task
+from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Start, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
 URDF = Path(__file__).with_name("drawer.urdf")
@@ -45,6 +45,7 @@ class Drawer(Task):
 
     goal_dim = 3
     observation_dim = 5
+    goal_entries = GoalEntries("task", (0, 1, 2))
 
     cabinet_x_range: float = 0.06
     cabinet_y_range: float = 0.2
@@ -96,3 +97,11 @@ class Drawer(Task):
         pose, opening = simulation.object_pose[:, 0], simulation.object_joint_position
         handle = pose.new_tensor(HANDLE) - opening * pose.new_tensor((1.0, 0.0, 0.0))
         return pose[:, :3] + rotate(pose[:, 3:], handle)
+
+    def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
+        """The cabinet where it stands, open until its handle is at the goal."""
+        pose = objects.pose[:, 0]
+        closed = pose[:, :3] + rotate(pose[:, 3:], pose.new_tensor(HANDLE))
+        outwards = rotate(pose[:, 3:], pose.new_tensor((-1.0, 0.0, 0.0)))
+        opening = ((goal - closed) * outwards).sum(dim=1, keepdim=True)
+        return objects._replace(joint_position=opening)

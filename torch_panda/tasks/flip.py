@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
-from torch_panda.rotations import NO_ROTATION, rotation_distance
-from torch_panda.tasks.base import Bodies, Task
+from torch_panda.rotations import NO_ROTATION, rotate, rotation_distance
+from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Task
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -44,6 +44,7 @@ class Flip(Task):
 
     goal_dim = 4
     observation_dim = 13
+    goal_entries = GoalEntries("task", (3, 4, 5, 6))
 
     distance_threshold: float = 0.2
     obj_xy_range: float = 0.3
@@ -85,6 +86,16 @@ class Flip(Task):
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """The cube's orientation: (num_envs, 4)."""
         return simulation.object_pose[:, 0, 3:]
+
+    def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
+        """The cube in the goal's orientation, with its lowest corner on the table."""
+        position = torch.zeros_like(goal[:, :3])
+        upwards = goal.new_tensor((0.0, 0.0, 1.0))
+        inverse = goal * goal.new_tensor((-1.0, -1.0, -1.0, 1.0))
+        # The table's normal in the cube's frame: its 1-norm is the corner's distance.
+        normal = rotate(inverse, upwards)
+        position[:, 2] = CUBE_SIZE / 2 * normal.abs().sum(dim=1)
+        return objects._replace(pose=torch.cat((position, goal), dim=1).unsqueeze(1))
 
     def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """1 - <q, q'>^2, in [0, 1]: (..., 1)."""

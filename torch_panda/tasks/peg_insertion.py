@@ -10,7 +10,14 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import RED, Box
 from torch_panda.rotations import NO_ROTATION, rotate
-from torch_panda.tasks.base import Bodies, Start, Task, object_observation
+from torch_panda.tasks.base import (
+    Bodies,
+    GoalEntries,
+    ObjectState,
+    Start,
+    Task,
+    object_observation,
+)
 from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_table
 
 URDF = Path(__file__).with_name("hole.urdf")
@@ -46,6 +53,7 @@ class PegInsertion(Task):
 
     goal_dim = 3
     observation_dim = 15
+    goal_entries = GoalEntries("task", (0, 1, 2))
 
     distance_threshold: float = 0.01
     depth: float = 0.03
@@ -111,3 +119,10 @@ class PegInsertion(Task):
         pose = simulation.object_pose[:, 0]
         end = pose.new_tensor((0.0, 0.0, -PEG_LENGTH / 2))
         return pose[:, :3] + rotate(pose[:, 3:], end)
+
+    def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
+        """The peg upright with its lower end at the goal, the hole where it is."""
+        pose = objects.pose.clone()
+        pose[:, 0, :3] = goal + goal.new_tensor((0.0, 0.0, PEG_LENGTH / 2))
+        pose[:, 0, 3:] = goal.new_tensor(NO_ROTATION)
+        return objects._replace(pose=pose)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import Bodies, Task, object_observation
+from torch_panda.tasks.base import Bodies, GoalEntries, Task, object_observation
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -35,6 +35,7 @@ class Push(Task):
 
     goal_dim = 3
     observation_dim = 12
+    goal_entries = GoalEntries("task", (0, 1, 2))
     # Where panda-gym creates the marker, before it moves to the first goal [m].
     marker_height = CUBE_SIZE / 2
 

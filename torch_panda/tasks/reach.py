@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation
-from torch_panda.tasks.base import Bodies, Task
+from torch_panda.tasks.base import Bodies, GoalEntries, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
 MARKER = Sphere(0.02)
@@ -26,6 +26,7 @@ class Reach(Task):
 
     goal_dim = 3
     observation_dim = 0
+    goal_entries = GoalEntries("robot", (0, 1, 2))
 
     goal_range: float = 0.3
     table_friction: float = TABLE_FRICTION

@@ -1,0 +1,212 @@
+"""Goals that are full observations, for ``RobotTaskEnv(goal="observation")``."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import PhysicsClient, PhysicsParams, Scene, VectorSimulation
+from torch_panda.bullet.euler import euler_angles
+from torch_panda.robots import Robot
+from torch_panda.tasks import Task
+from torch_panda.tasks.base import ObjectState, RewardFunction
+
+GoalName = Literal["task", "observation"]
+
+
+def find_goal_indices(robot: Robot, task: Task) -> tuple[int, ...] | None:
+    """Indices of the observation's entries that are the achieved goal, (goal_dim,).
+
+    Returns:
+        None if the task does not declare them, or if a subclass overrides one of the
+        functions that the declaration describes without declaring the entries anew.
+
+    Raises:
+        ValueError: The declaration does not fit the sizes of robot and task.
+    """
+    entries = task.goal_entries
+    if entries is None or not _is_current(task):
+        return None
+    if entries.part == "robot" and type(robot).observation is not Robot.observation:
+        return None
+    is_task = entries.part == "task"
+    size = task.observation_dim if is_task else robot.observation_dim
+    fits = all(0 <= index < size for index in entries.indices)
+    if len(entries.indices) != task.goal_dim or not fits:
+        raise ValueError(
+            f"{type(task).__name__}.goal_entries must hold {task.goal_dim} indices "
+            f"below {size}, got {entries.indices}"
+        )
+    offset = robot.observation_dim if is_task else 0
+    return tuple(offset + index for index in entries.indices)
+
+
+def _is_current(task: Task) -> bool:
+    """Whether ``goal_entries`` is declared where, or below where, its functions are."""
+    classes = type(task).__mro__
+    declared, observation, achieved_goal = (
+        next(level for level, base in enumerate(classes) if name in vars(base))
+        for name in ("goal_entries", "observation", "achieved_goal")
+    )
+    return declared <= observation and declared <= achieved_goal
+
+
+@dataclass(frozen=True)
+class ObservationGoalFunction:
+    """A function of two goals, applied to goals that are full observations.
+
+    It is pure, works on any device, and can be pickled.
+
+    Args:
+        function: The function of the task's goals.
+        goal_indices: The entries of an observation that are the task's goal.
+        observation_dim: Number of entries of an observation.
+    """
+
+    function: RewardFunction
+    goal_indices: tuple[int, ...]
+    observation_dim: int
+
+    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+        """Call the function with the task's goals.
+
+        Args:
+            achieved_goal: (..., observation_dim).
+            desired_goal: (..., observation_dim).
+
+        Returns:
+            (..., 1).
+
+        Raises:
+            ValueError: A goal is not a full observation.
+        """
+        sizes = (self.observation_dim,)
+        if achieved_goal.shape[-1:] != sizes or desired_goal.shape[-1:] != sizes:
+            raise ValueError(
+                f"achieved_goal and desired_goal must be full observations of shape "
+                f"(..., {self.observation_dim}), got {tuple(achieved_goal.shape)} and "
+                f"{tuple(desired_goal.shape)}"
+            )
+        indices = list(self.goal_indices)
+        return self.function(achieved_goal[..., indices], desired_goal[..., indices])
+
+
+class GoalObserver:
+    """Observations of states in which the desired goals are reached.
+
+    In such a state the objects are at their goals and at rest. The hand is in its
+    neutral pose, or at the goal if that is a position of the hand.
+
+    The state is written into the tensors of the simulation, observed, and taken out
+    again. Bullet's clients are not touched.
+
+    Args:
+        robot: The robot.
+        task: The task.
+        simulation: The environments.
+        build_scene: Builds the scene in a client.
+        physics: The integration parameters of the clients.
+        goal_indices: The entries of an observation that are the task's goal.
+
+    Attributes:
+        desired: Observations of the present episodes' goals, (n, observation_dim)
+            float32.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        task: Task,
+        simulation: VectorSimulation,
+        build_scene: Callable[[PhysicsClient], Scene],
+        physics: PhysicsParams,
+        goal_indices: tuple[int, ...],
+    ) -> None:
+        self._robot, self._task, self._simulation = robot, task, simulation
+        self._goal_indices = list(goal_indices)
+        self._hand_pose = _neutral_hand_pose(robot, build_scene, physics)
+        size = robot.observation_dim + task.observation_dim
+        self.desired = torch.zeros(
+            simulation.num_envs, size, dtype=torch.float32, device="cpu"
+        )
+
+    def update(self, envs: Sequence[int], goal: Tensor) -> None:
+        """Observe the goals of episodes that start.
+
+        Args:
+            envs: The environments whose episodes start. The tensors of the simulation
+                hold the poses of their objects.
+            goal: Desired goals of all environments, (n, goal_dim) float64.
+        """
+        simulation = self._simulation
+        tensors = (
+            simulation.joint_position,
+            simulation.joint_velocity,
+            simulation.ee_state,
+            simulation.ee_orientation,
+            simulation.object_pose,
+            simulation.object_state,
+            simulation.object_joint_position,
+            simulation.object_joint_velocity,
+        )
+        saved = [tensor.clone() for tensor in tensors]
+        try:
+            self._write(list(envs), goal)
+            observation = torch.cat(
+                (
+                    self._robot.observation(simulation),
+                    self._task.observation(simulation),
+                ),
+                dim=1,
+            )
+        finally:
+            for tensor, value in zip(tensors, saved, strict=True):
+                tensor.copy_(value)
+        desired = observation[envs].float()
+        # Exactly the goal, also where it is the hand's or the observation rounds.
+        desired[:, self._goal_indices] = goal[envs].float()
+        self.desired[envs] = desired
+
+    def _write(self, envs: list[int], goal: Tensor) -> None:
+        """Write the states in which the goals are reached into the tensors."""
+        simulation = self._simulation
+        objects = self._task.objects_at_goal(
+            goal[envs],
+            ObjectState(
+                simulation.object_pose[envs], simulation.object_joint_position[envs]
+            ),
+        )
+        neutral = goal.new_tensor(self._robot.neutral_joint_position)
+        simulation.joint_position[envs] = neutral
+        simulation.joint_velocity[envs] = 0.0
+        simulation.ee_position[envs] = self._hand_pose[:3]
+        simulation.ee_velocity[envs] = 0.0
+        simulation.ee_orientation[envs] = self._hand_pose[3:]
+        simulation.object_pose[envs] = objects.pose
+        simulation.object_joint_position[envs] = objects.joint_position
+        simulation.object_joint_velocity[envs] = 0.0
+        simulation.object_state[envs] = 0.0  # also the velocities
+        simulation.object_state[envs, :, :3] = objects.pose[..., :3]
+        for env, poses in zip(envs, objects.pose.tolist(), strict=True):
+            for index, pose in enumerate(poses):
+                angles = goal.new_tensor(euler_angles(*pose[3:]))
+                simulation.object_euler[env, index] = angles
+
+
+def _neutral_hand_pose(
+    robot: Robot,
+    build_scene: Callable[[PhysicsClient], Scene],
+    physics: PhysicsParams,
+) -> Tensor:
+    """Pose of the end-effector while the joints are neutral, (7,) float64."""
+    with PhysicsClient(physics=physics) as client:
+        scene = build_scene(client)
+        for joint, position in zip(
+            scene.joints, robot.neutral_joint_position, strict=True
+        ):
+            client.set_joint(scene.robot, joint, position, 0.0)
+        state = client.state(scene.robot, link_velocities=True)
+        pose = list(state.link_pose(scene.ee_link))
+    return torch.tensor(pose, dtype=torch.float64, device="cpu")
