@@ -117,11 +117,9 @@ class Episodes:
         # Environments that need a reset: new ones, and those whose last reset failed.
         self._needs_reset = set(range(n))
         sensors = read_sensors(sensors, robot)
+        build_scene = RobotTaskBuilder(robot, task, sensors)
         self.simulation = VectorSimulation(
-            RobotTaskBuilder(robot, task, sensors),
-            n,
-            num_threads=num_threads,
-            physics=self.physics,
+            build_scene, n, num_threads=num_threads, physics=self.physics
         )
         try:
             self.renderer = VectorRenderer(self.simulation, renderer=renderer)
@@ -136,7 +134,7 @@ class Episodes:
                     robot,
                     task,
                     self.simulation,
-                    self.build_scene,
+                    build_scene,
                     self.physics,
                     self.goal_indices,
                 )

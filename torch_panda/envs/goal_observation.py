@@ -141,17 +141,7 @@ class GoalObserver:
             goal: Desired goals of all environments, (n, goal_dim) float64.
         """
         simulation = self._simulation
-        tensors = (
-            simulation.joint_position,
-            simulation.joint_velocity,
-            simulation.ee_state,
-            simulation.ee_orientation,
-            simulation.object_pose,
-            simulation.object_state,
-            simulation.object_joint_position,
-            simulation.object_joint_velocity,
-        )
-        saved = [tensor.clone() for tensor in tensors]
+        saved = simulation.state.rows.clone()
         try:
             self._write(list(envs), goal)
             observation = torch.cat(
@@ -162,8 +152,7 @@ class GoalObserver:
                 dim=1,
             )
         finally:
-            for tensor, value in zip(tensors, saved, strict=True):
-                tensor.copy_(value)
+            simulation.state.rows.copy_(saved)
         desired = observation[envs].float()
         # Exactly the goal, also where it is the hand's or the observation rounds.
         desired[:, self._goal_indices] = goal[envs].float()
