@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,10 @@ def test_importing_registers_ids_and_is_cheap():
         assert done.returncode == 0, done.stderr
         seconds.append(float(done.stdout))
     assert min(seconds) < 0.3
+
+
+def test_the_version_is_that_of_the_installed_package():
+    assert torch_panda.__version__ == version("torch_panda")
 
 
 def imported_rooms(path):

@@ -25,6 +25,8 @@ from torch_panda.tasks import (
     Task,
 )
 
+__version__ = "0.1.0"
+
 __all__ = [
     "ENV_IDS",
     "BulletError",
@@ -53,6 +55,7 @@ __all__ = [
     "WorkerError",
     "XArm6",
     "XArm6Gripper",
+    "__version__",
     "make",
     "max_episode_steps",
     "register",

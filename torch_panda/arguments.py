@@ -11,7 +11,8 @@ class Configured:
     """Base of classes whose objects are configured by keyword arguments.
 
     An unknown argument raises a `TypeError` that lists the accepted ones. The ``repr``
-    of an object shows its arguments, which it keeps as attributes of the same names.
+    of an object shows its arguments, which it keeps as attributes of the same names,
+    or of these names after an underscore.
     """
 
     def __new__(cls, *args: object, **arguments: object) -> Self:
@@ -20,10 +21,13 @@ class Configured:
         return super().__new__(cls)
 
     def __repr__(self) -> str:
-        attributes = vars(self)
-        names = [name for name in _argument_names(type(self)) if name in attributes]
-        shown = ", ".join(f"{name}={attributes[name]!r}" for name in names)
-        return f"{type(self).__name__}({shown})"
+        shown = [
+            f"{name}={vars(self)[attribute]!r}"
+            for name in _argument_names(type(self))
+            for attribute in (name, f"_{name}")
+            if attribute in vars(self)
+        ]
+        return f"{type(self).__name__}({', '.join(shown)})"
 
 
 def check_call(

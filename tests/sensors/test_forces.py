@@ -142,13 +142,13 @@ def test_only_what_was_asked_for():
 def test_unknown_sensors_are_named():
     with pytest.raises(ValueError, match=r"'finger_contact', 'joint_torque'.*smell"):
         torch_panda.make("PandaPush-v1", sensors=("smell",))
-    with pytest.raises(ValueError, match=r"among \('joint_torque',\)"):
+    with pytest.raises(ValueError, match=r"among \('joint_state', 'joint_torque'\)"):
         RobotTaskEnv(robot=make_kuka(), task=Reach(), sensors=("finger_contact",))
     with RobotTaskEnv(
         robot=make_kuka(), task=Reach(), seed=0, sensors=("joint_torque",)
     ) as env:
         assert env.rollout(2)["next", "joint_torque"].shape == (2, 7)
-    # Bullet reports no torques that are applied: the sensor would read 0.
+    # Bullet does not report torques that actions apply.
     robot = make_kuka(control_type="joint_torque", wrist_joint=6)
-    with pytest.raises(ValueError, match=r"\('wrist_force_torque',\).*'joint_torque'"):
+    with pytest.raises(ValueError, match=r"'wrist_force_torque'\).*got 'joint_torque'"):
         RobotTaskEnv(robot=robot, task=Reach(), sensors=("joint_torque",))

@@ -11,7 +11,7 @@ from torch_panda.envs.randomization import PHYSICS, DomainRandomizer
 from torch_panda.envs.state import EXACT_KEYS, PHYSICAL
 from torch_panda.rendering import VectorRenderer
 from torch_panda.robots import Robot
-from torch_panda.sensors import Entry, Observer, Sensor, join_entries
+from torch_panda.sensors import Entry, JointState, Observer, Sensor, join_entries
 from torch_panda.tasks import Task
 
 # Number of vector observations whose numbers are checked. Later ones cost nothing.
@@ -72,7 +72,9 @@ class EpisodeObserver:
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._readings, extra]
-        reserved = (*PHYSICAL, *PHYSICS, *EXACT_KEYS)
+        reserved = {*PHYSICAL, *PHYSICS, *EXACT_KEYS}
+        if any(isinstance(sensor, JointState) for sensor in sensors):
+            reserved -= {"joint_position", "joint_velocity"}
         self.entries = join_entries(observers, reserved) | randomizer.entries
         observers.append(randomizer)
         self._observers = [observer for observer in observers if observer.entries]

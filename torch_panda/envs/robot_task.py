@@ -246,7 +246,7 @@ class RobotTaskEnv(EnvBase):
         """
         # torchrl also resets within a rollout, with observations, and says so.
         if set_state is None and not kwargs.get("select_reset_only", False):
-            set_state = is_state(tensordict)
+            set_state = is_state(tensordict, self.episodes.entries)
         if set_state and tensordict is not None:
             # torchrl writes the observations into it, the goal as float32.
             tensordict = tensordict.copy()

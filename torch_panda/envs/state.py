@@ -1,6 +1,6 @@
 """Reads and checks the state from which a reset starts."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -91,17 +91,27 @@ class StartState:
                 )
 
 
-def is_state(entries: Mapping[str, Any] | None) -> bool:
+def is_state(
+    entries: Mapping[str, Any] | None, observed_keys: Collection[str] = ()
+) -> bool:
     """Whether the argument of a reset is a state, if ``set_state`` is not given.
 
     The tensordict of an ordinary reset may hold a ``desired_goal`` too, and torchrl's
-    `StepCounter` writes a ``step_count`` into it. It then holds an ``achieved_goal``.
+    `StepCounter` writes a ``step_count`` into it. It then holds an ``achieved_goal``,
+    and entries of a state that the environment observes (the sensor "joint_state").
+
+    Args:
+        entries: The argument of the reset.
+        observed_keys: Keys of sensors, which are observations beside an
+            ``achieved_goal``.
 
     Raises:
         ValueError: The argument holds a state and observations.
     """
     keys = set() if entries is None else set(entries.keys())
     is_observed = "achieved_goal" in keys
+    if is_observed:
+        keys -= set(observed_keys)
     if not keys.intersection(PHYSICAL):
         return "desired_goal" in keys and not is_observed
     if is_observed:

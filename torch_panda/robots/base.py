@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from torch_panda.arguments import Configured
 from torch_panda.bullet import (
     Control,
     MotorControl,
@@ -21,11 +22,10 @@ from torch_panda.checks import check_quaternion
 from torch_panda.robots.control_type import ACTION_SCALES, ARM_MODES, ControlType
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
+    NO_ROTATION,
     quaternion_product,
     rotation_vector_to_quaternion,
 )
-
-NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 # Lowest and highest x, y, z, world frame [m].
 Workspace = tuple[Sequence[float], Sequence[float]]
@@ -33,7 +33,7 @@ _FAR = math.inf
 ABOVE_THE_TABLE: Workspace = ((-_FAR, -_FAR, 0.0), (_FAR, _FAR, _FAR))
 
 
-class Robot:
+class Robot(Configured):
     """A robot arm on a fixed base, described by a URDF, with or without a gripper.
 
     One description serves all clients of a simulation. An action has the arm's numbers,

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 from torch_panda.bullet import PhysicsClient
-from torch_panda.robots.base import ABOVE_THE_TABLE, NO_ROTATION, Robot, Workspace
+from torch_panda.robots.base import ABOVE_THE_TABLE, Robot, Workspace
 from torch_panda.robots.control_type import ControlType
 from torch_panda.robots.gripper import Gripper
+from torch_panda.rotations import NO_ROTATION
 
 # The same in panda-gym 1.1.0 and 3.0.7.
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
@@ -67,6 +68,7 @@ class Panda(Robot):
             wrist_joint=WRIST_JOINT,
             finger_links=FINGER_LINKS,
         )
+        self._fingers_width = fingers_width
         self.finger_friction = finger_friction
         self.finger_spinning_friction = finger_spinning_friction
 

@@ -1,21 +1,22 @@
 """The UFACTORY xArm 6, with and without its gripper."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import Tool
-from torch_panda.robots.base import Robot
+from torch_panda.robots.base import ABOVE_THE_TABLE, Robot, Workspace
+from torch_panda.robots.control_type import ControlType
 from torch_panda.robots.gripper import Gripper
+from torch_panda.rotations import NO_ROTATION
 
-# Hands above the table that point down [rad].
+# The hand is above the table and points down [rad].
 NEUTRAL_ARM = (0.0, 0.22, -0.83, 0.0, 0.61, 0.0)
 NEUTRAL_ARM_WITH_GRIPPER = (0.0, -0.06, -1.01, 0.0, 1.07, 0.0)
-ARM_FORCES = (50.0, 50.0, 32.0, 32.0, 32.0, 20.0)  # the URDF's [N m]
-# Its reach is 0.7 m.
+ARM_FORCES = (50.0, 50.0, 32.0, 32.0, 32.0, 20.0)  # from the URDF [N m]
+# Nearer to the goals than the Panda's base, because the reach is only 0.7 m.
 BASE_POSITION = (-0.45, 0.0, 0.0)  # [m]
 
-# The first joint drives; the real gripper couples the others to it.
+# In the real gripper the first joint drives the others.
 GRIPPER = Gripper(
     closed=(0.85,) * 6, opened=(0.0,) * 6, width=0.089, followers=(1, 2, 3, 4, 5)
 )
@@ -27,26 +28,35 @@ FINGER_LINKS = (9, 12)
 
 
 class XArm6(Robot):
-    """The xArm 6: 6 joints, no gripper.
+    """The xArm 6: 6 joints and no gripper.
 
     Args:
-        base_position: of the base, world frame [m].
-        **options: of `Robot`, but for those of the URDF and the gripper.
+        control_type: Meaning of an action; see `Robot`.
+        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
+        base_position: Position of the base, world frame [m].
+        base_orientation: Orientation of the base, quaternion xyzw.
+        workspace: Box in which actions can send the end-effector; see `Robot`.
     """
 
     def __init__(
         self,
         *,
+        control_type: ControlType = "ee",
+        action_scale: float | None = None,
         base_position: Sequence[float] = BASE_POSITION,
-        **options: Any,  # noqa: ANN401 (of Robot)
+        base_orientation: Sequence[float] = NO_ROTATION,
+        workspace: Workspace = ABOVE_THE_TABLE,
     ) -> None:
         super().__init__(
             urdf="xarm/xarm6_robot.urdf",
             neutral_joint_position=NEUTRAL_ARM,
             joint_forces=ARM_FORCES,
             ee_link=6,
+            control_type=control_type,
+            action_scale=action_scale,
             base_position=base_position,
-            **options,
+            base_orientation=base_orientation,
+            workspace=workspace,
         )
 
 
@@ -54,33 +64,45 @@ class XArm6Gripper(Robot):
     """The xArm 6 with its gripper: 6 joints of the arm and 6 of the fingers.
 
     Args:
-        base_position: of the base, world frame [m].
-        finger_friction: lateral friction of the fingers.
-        **options: of `Robot`, but for those of the URDF.
+        control_type: Meaning of an action; see `Robot`.
+        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
+        block_gripper: Keep the fingers closed.
+        base_position: Position of the base, world frame [m].
+        base_orientation: Orientation of the base, quaternion xyzw.
+        workspace: Box in which actions can send the end-effector; see `Robot`.
+        finger_friction: Lateral friction of the fingers.
     """
 
     def __init__(
         self,
         *,
+        control_type: ControlType = "ee",
+        action_scale: float | None = None,
+        block_gripper: bool = False,
         base_position: Sequence[float] = BASE_POSITION,
+        base_orientation: Sequence[float] = NO_ROTATION,
+        workspace: Workspace = ABOVE_THE_TABLE,
         finger_friction: float = 1.0,
-        **options: Any,  # noqa: ANN401 (of Robot)
     ) -> None:
         super().__init__(
             urdf="xarm/xarm6_with_gripper.urdf",
             neutral_joint_position=(*NEUTRAL_ARM_WITH_GRIPPER, *GRIPPER.closed),
             joint_forces=(*ARM_FORCES, *GRIPPER_FORCES),
             ee_link=TOOL_LINK,
-            base_position=base_position,
+            control_type=control_type,
+            action_scale=action_scale,
             gripper=GRIPPER,
+            block_gripper=block_gripper,
+            base_position=base_position,
+            base_orientation=base_orientation,
+            workspace=workspace,
             tool=TOOL,
             finger_links=FINGER_LINKS,
-            **options,
         )
         self.finger_friction = finger_friction
 
     def build(self, client: PhysicsClient) -> int:
-        """Load the arm, and let its fingers grip."""
+        """Load the robot and set the friction of its fingers."""
         body = super().build(client)
         for link in FINGER_LINKS:
             client.set_friction(body, link, lateral=self.finger_friction)

@@ -1,22 +1,23 @@
-"""Sensors: each is an object that an environment is given."""
+"""Sensors: observations beside the state of robot and task."""
 
 from torch_panda.sensors.base import Entry, Observer, Reading, Sensor, join_entries
 from torch_panda.sensors.cameras import CameraSensor
 from torch_panda.sensors.forces import (
-    FORCE_SENSORS,
     FingerContact,
     ForceSensor,
     JointTorque,
     WristForceTorque,
 )
-from torch_panda.sensors.keywords import read_keywords, read_sensors
+from torch_panda.sensors.joints import JointState
+from torch_panda.sensors.keywords import SENSORS, read_keywords, read_sensors
 
 __all__ = [
-    "FORCE_SENSORS",
+    "SENSORS",
     "CameraSensor",
     "Entry",
     "FingerContact",
     "ForceSensor",
+    "JointState",
     "JointTorque",
     "Observer",
     "Reading",

@@ -1,4 +1,4 @@
-"""What an environment can observe beyond the state of robot and task."""
+"""Base classes of sensors, and the entries that they observe."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
@@ -7,18 +7,19 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from torch_panda.arguments import Configured
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rendering import VectorRenderer
 from torch_panda.robots import Robot
 
 
 class Entry(NamedTuple):
-    """An entry of what is observed of one environment.
+    """An observed entry of one environment.
 
     Attributes:
-        shape: its shape.
-        dtype: its dtype.
-        high: the largest value, where 0 is the smallest; None: there are no bounds.
+        shape: Its shape.
+        dtype: Its dtype.
+        high: Its largest value, if its smallest is 0; None means no bounds.
     """
 
     shape: tuple[int, ...]
@@ -26,80 +27,96 @@ class Entry(NamedTuple):
     high: float | None = None
 
 
-class Reading(Protocol):
-    """What a sensor says of the n environments of a simulation."""
+class Observer(Protocol):
+    """Observes entries of all n environments of a simulation.
+
+    Attributes:
+        entries: The entries of one environment, by key.
+    """
 
     entries: dict[str, Entry]
 
+    def observe(self) -> dict[str, Tensor]:
+        """The present values in all environments, (n, ...) by key, in new tensors."""
+
+
+class Reading(Observer, Protocol):
+    """A sensor in all n environments of a simulation."""
+
     def after_reset(self, envs: Sequence[int]) -> None:
-        """Episodes have started in these environments."""
+        """Update the values of environments whose episodes have started."""
 
     def after_step(self, envs: Sequence[int]) -> None:
-        """Time has passed in these environments."""
-
-    def observe(self) -> dict[str, Tensor]:
-        """What is sensed now in all environments, by entry: (n, ...), new tensors."""
+        """Update the values of environments that have made a step."""
 
 
-class Sensor(ABC):
-    """A sensor, as environments are given it: what it observes, and nothing else.
+class Sensor(Configured, ABC):
+    """Description of a sensor, which several environments may share.
 
-    One description serves several environments; what it reads in one of them is a
-    `Reading`.
+    `attach` makes the `Reading` that holds the values of one environment batch.
     """
 
-    def check(self, robot: Robot) -> None:  # noqa: B027 (most sensors fit all robots)
-        """Make sure that a robot can have this sensor.
+    def check(self, robot: Robot) -> None:
+        """Refuse a robot that cannot have this sensor.
 
         Raises:
-            ValueError: it cannot.
+            ValueError: The robot cannot have it.
         """
 
-    def build(self, client: PhysicsClient, body: int, robot: Robot) -> None:  # noqa: B027 (most need nothing)
-        """Add to a client, in which the robot is ``body``, what the sensor needs."""
+    def build(self, client: PhysicsClient, body: int, robot: Robot) -> None:
+        """Prepare one client for the sensor.
+
+        Args:
+            client: The client, in which the robot was built.
+            body: Body id of the robot.
+            robot: The robot.
+        """
 
     @abstractmethod
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Read the sensor in all environments of a simulation."""
+        """Read the sensor in all environments of a simulation.
+
+        Args:
+            simulation: The environments.
+            renderer: Draws pictures of them.
+            robot: The robot.
+        """
 
 
-class Observer(Protocol):
-    """What observes something beside the state of robot and task."""
-
-    entries: dict[str, Entry]
-
-    def observe(self) -> dict[str, Tensor]:
-        """What is observed now in all environments, by entry: (n, ...), new tensors."""
-
-
-# What an environment observes and returns in any case, and torchrl's.
-_OWN = {"observation", "achieved_goal", "desired_goal", "success", "action", "reward"}
-_OWN |= {"terminated", "truncated", "done", "next", "_reset", "_step"}
+# Keys of an environment's outputs, and keys that torchrl uses.
+_ENVIRONMENT_KEYS = {
+    *("observation", "achieved_goal", "desired_goal", "success", "action", "reward"),
+    *("terminated", "truncated", "done", "next", "_reset", "_step"),
+}
 
 
 def join_entries(
     observers: Sequence[Observer], reserved: Collection[str] = ()
 ) -> dict[str, Entry]:
-    """The entries of all observers.
+    """Join the entries of all observers.
 
     Args:
-        observers: what observes.
-        reserved: names that have another meaning.
+        observers: The observers.
+        reserved: Further keys that no observer may use.
 
     Raises:
-        ValueError: two observe the same, or one what the environment does; or a name is
-            reserved, or no text.
+        ValueError: Two observers use the same key, or a key is reserved or not text.
     """
     entries: dict[str, Entry] = {}
     for observer in observers:
         for key in observer.entries:
             if not isinstance(key, str):
-                raise ValueError(f"the name of an entry must be text, got {key!r}")
-        if own := (_OWN | set(reserved)) & observer.entries.keys():
-            raise ValueError(f"{sorted(own)} are the environment's own, not a sensor's")
-        if twice := entries.keys() & observer.entries.keys():
-            raise ValueError(f"two sensors observe {sorted(twice)}")
+                raise ValueError(f"the key of an entry must be text, got {key!r}")
+        if taken := (_ENVIRONMENT_KEYS | set(reserved)) & observer.entries.keys():
+            raise ValueError(
+                f"{sorted(taken)} are the environment's own keys; sensors and "
+                "extra_observation need other keys"
+            )
+        if shared := entries.keys() & observer.entries.keys():
+            raise ValueError(
+                f"two sensors observe {sorted(shared)}; give cameras different names"
+            )
         entries |= observer.entries
     return entries

@@ -17,16 +17,17 @@ PIXELS_CAMERA = Camera(width=64, height=64)
 
 @dataclass(frozen=True)
 class CameraSensor(Sensor):
-    """A camera that sees every environment after every reset and step.
+    """A camera that takes a picture of every environment after each reset and step.
 
     Attributes:
-        camera: the same for all; by default panda-gym's view, in a size to learn from.
-        pixels: observe ``pixels``, (height, width, 3) uint8.
-        depth: observe ``depth``, (height, width, 1) float32: the distance along the
-            line of sight [m], ``camera.far`` where nothing is.
-        segmentation: observe ``segmentation``, (height, width, 1) int32: the body ids
-            that `segmentation_ids` names, -1 where nothing is.
-        name: of the camera, where there are several: ``wrist`` observes
+        camera: View and size, the same in all environments. The default is panda-gym's
+            view in 64 x 64 pixels.
+        pixels: Observe ``pixels``, (height, width, 3) uint8.
+        depth: Observe ``depth``, (height, width, 1) float32: the distance along the
+            line of sight [m], or ``camera.far`` where there is nothing.
+        segmentation: Observe ``segmentation``, (height, width, 1) int32: the body ids
+            that ``segmentation_ids`` names, or -1 where there is nothing.
+        name: Name of the camera if there are several. The name "wrist" observes
             ``wrist_pixels``, ``wrist_depth`` and ``wrist_segmentation``.
     """
 
@@ -39,12 +40,12 @@ class CameraSensor(Sensor):
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """See all environments of a simulation."""
-        return _Pictures(self, simulation.num_envs, renderer)
+        """Take pictures of all environments; see `Sensor.attach`."""
+        return _CameraReading(self, simulation.num_envs, renderer)
 
 
-class _Pictures:
-    """The latest pictures of n environments."""
+class _CameraReading:
+    """The latest pictures of all environments."""
 
     def __init__(
         self, sensor: CameraSensor, num_envs: int, renderer: VectorRenderer
@@ -58,16 +59,16 @@ class _Pictures:
             segmentation=sensor.segmentation,
         )
         size = (sensor.camera.height, sensor.camera.width)
-        found: dict[str, Entry] = {}
+        images: dict[str, Entry] = {}
         if sensor.pixels:
-            found["pixels"] = Entry((*size, 3), torch.uint8, high=255)
+            images["pixels"] = Entry((*size, 3), torch.uint8, high=255)
         if sensor.depth:
-            found["depth"] = Entry((*size, 1), torch.float32, high=sensor.camera.far)
+            images["depth"] = Entry((*size, 1), torch.float32, high=sensor.camera.far)
         if sensor.segmentation:
-            found["segmentation"] = Entry((*size, 1), torch.int32)
+            images["segmentation"] = Entry((*size, 1), torch.int32)
         prefix = "" if sensor.name is None else f"{sensor.name}_"
-        self._sources = {prefix + key: key for key in found}
-        self.entries = {prefix + key: entry for key, entry in found.items()}
+        self._image_of_key = {prefix + image: image for image in images}
+        self.entries = {prefix + image: entry for image, entry in images.items()}
 
     def after_reset(self, envs: Sequence[int]) -> None:
         """Draw these environments."""
@@ -78,8 +79,8 @@ class _Pictures:
         self._renderer.draw(envs, self._camera, self._frames, envs)
 
     def observe(self) -> dict[str, Tensor]:
-        """The latest pictures of all environments."""
+        """The latest pictures of all environments, (n, ...) by key, in new tensors."""
         return {
-            key: getattr(self._frames, source).clone()
-            for key, source in self._sources.items()
+            key: getattr(self._frames, image).clone()
+            for key, image in self._image_of_key.items()
         }

@@ -1,7 +1,7 @@
 """Force sensors.
 
-They read what Bullet computed in the last substep (2 ms) of a step, not an average over
-it. All are zero at a reset: no time has passed.
+They read the values of the last substep (2 ms) of a step, which is not an average over
+the step. After a reset all of them are zero, because no time has passed.
 """
 
 from abc import abstractmethod
@@ -20,83 +20,91 @@ from torch_panda.sensors.base import Entry, Reading, Sensor
 
 
 class ForceSensor(Sensor):
-    """A sensor that a robot has or has not, observed under its own name.
+    """A sensor with one entry, which is read in each client after each step.
 
     Attributes:
-        name: of the entry, (*shape) float32.
+        name: Key of the entry.
     """
 
     name: str
 
     @abstractmethod
     def shape(self, robot: Robot) -> tuple[int, ...] | None:
-        """Shape of what it reads; None: the robot cannot have it."""
+        """Shape of the entry, or None if the robot cannot have the sensor."""
 
     @abstractmethod
     def read(
         self, client: PhysicsClient, scene: Scene, robot: Robot
     ) -> npt.NDArray[np.float64]:
-        """What it reads in a client, in that shape."""
+        """Read the sensor in one client.
+
+        Returns:
+            An array of `shape`, which is observed as float32.
+        """
 
     def check(self, robot: Robot) -> None:
-        """Make sure that a robot has this sensor; see `Sensor.check`."""
+        """Refuse a robot that cannot have the sensor; see `Sensor.check`."""
         if self.shape(robot) is None:
             raise ValueError(
-                f"sensors must be among {force_sensors_of(robot)} for this robot, got "
-                f"{self.name!r}"
+                f"{type(robot).__name__} cannot have the sensor {self.name!r}; see "
+                f"{type(self).__name__} for what it needs"
             )
 
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Feel in all environments of a simulation."""
-        return _Forces(self, simulation, robot)
+        """Read the sensor in all environments; see `Sensor.attach`."""
+        return _ForceReading(self, simulation, robot)
 
 
 @dataclass(frozen=True)
 class WristForceTorque(ForceSensor):
     """Force [N] and torque [N m] that the arm exerts on the hand: (6,).
 
-    At the robot's ``wrist_joint`` and in the hand's frame (the Panda's z axis points
-    from the mount to the fingertips). At rest it bears the weight of the hand and of
-    what the hand holds.
+    They act at the robot's ``wrist_joint`` and are given in the hand's frame. The z
+    axis of the Panda's hand points from the mount to the fingertips. At rest the wrist
+    bears the weight of the hand and of the object in it.
+
+    The robot needs a ``wrist_joint``.
     """
 
     name = "wrist_force_torque"
 
     def shape(self, robot: Robot) -> tuple[int, ...] | None:
-        """(6,)."""
+        """(6,), or None without a ``wrist_joint``."""
         return None if robot.wrist_joint is None else (6,)
 
     def build(self, client: PhysicsClient, body: int, robot: Robot) -> None:
-        """Have the forces through the wrist computed."""
-        assert robot.wrist_joint is not None  # checked before
+        """Let Bullet compute the forces through the wrist."""
+        assert robot.wrist_joint is not None  # `check` has refused such a robot.
         client.enable_wrench_sensor(body, robot.wrist_joint)
 
     def read(
         self, client: PhysicsClient, scene: Scene, robot: Robot
     ) -> npt.NDArray[np.float64]:
-        """Of the last substep: (6,)."""
+        """Force and torque of the last substep: (6,)."""
         return client.state(scene.robot).wrenches[robot.wrist_joint]
 
 
 @dataclass(frozen=True)
 class FingerContact(ForceSensor):
-    """Sum of normal and friction forces on each finger, world frame [N]: (fingers, 3).
+    """Contact force on each finger: (n_fingers, 3), world frame [N].
 
-    Whatever the finger touches.
+    It is the sum of normal and friction forces over all contacts of the finger.
+
+    The robot needs ``finger_links``.
     """
 
     name = "finger_contact"
 
     def shape(self, robot: Robot) -> tuple[int, ...] | None:
-        """(n_fingers, 3)."""
+        """(n_fingers, 3), or None without ``finger_links``."""
         return (len(robot.finger_links), 3) if robot.finger_links else None
 
     def read(
         self, client: PhysicsClient, scene: Scene, robot: Robot
     ) -> npt.NDArray[np.float64]:
-        """Of the last substep: (n_fingers, 3)."""
+        """Contact forces of the last substep: (n_fingers, 3)."""
         fingers = robot.finger_links
         forces = np.zeros((len(fingers), 3))
         for contact in client.contact_points(scene.robot):
@@ -107,39 +115,28 @@ class FingerContact(ForceSensor):
 
 @dataclass(frozen=True)
 class JointTorque(ForceSensor):
-    """What the motor of each movable joint exerts [N m], of a sliding one [N].
+    """Torque [N m] of the motor of each movable joint, or force [N] of a sliding one.
 
-    Not for a robot of the control type "joint_torque": Bullet reports what its motors
-    exert, not the torques that actions apply.
+    The robot needs another control type than "joint_torque". Bullet reports the torques
+    of its motors, but not the torques that such actions apply.
     """
 
     name = "joint_torque"
 
     def shape(self, robot: Robot) -> tuple[int, ...] | None:
-        """(n_joints,)."""
+        """(n_joints,), or None under the control type "joint_torque"."""
         is_torque = robot.control_type == "joint_torque"
         return None if is_torque else (len(robot.joint_forces),)
 
     def read(
         self, client: PhysicsClient, scene: Scene, robot: Robot
     ) -> npt.NDArray[np.float64]:
-        """Of the last substep: (n_joints,)."""
+        """Torques of the last substep: (n_joints,)."""
         return client.state(scene.robot).motor_forces[list(scene.joints)]
 
 
-FORCE_SENSORS: dict[str, ForceSensor] = {
-    sensor.name: sensor
-    for sensor in (WristForceTorque(), FingerContact(), JointTorque())
-}
-
-
-def force_sensors_of(robot: Robot) -> tuple[str, ...]:
-    """Names of the force sensors that a robot can have."""
-    return tuple(name for name, sensor in FORCE_SENSORS.items() if sensor.shape(robot))
-
-
-class _Forces:
-    """The latest forces of all environments."""
+class _ForceReading:
+    """The latest values of a force sensor in all environments."""
 
     def __init__(
         self, sensor: ForceSensor, simulation: VectorSimulation, robot: Robot
@@ -148,20 +145,20 @@ class _Forces:
         self._simulation = simulation
         self._robot = robot
         shape = sensor.shape(robot)
-        assert shape is not None  # checked before
+        assert shape is not None  # `check` has refused such a robot.
         self.entries = {sensor.name: Entry(shape, torch.float32)}
         self._values = torch.zeros(simulation.num_envs, *shape, device="cpu").float()
 
     def after_reset(self, envs: Sequence[int]) -> None:
-        """Nothing is felt yet in these environments."""
+        """Set the values of these environments to zero."""
         self._values[envs] = 0.0
 
     def after_step(self, envs: Sequence[int]) -> None:
-        """Read the sensors of these environments."""
+        """Read the sensor in these environments."""
         self._simulation.run(self._read, envs)
 
     def observe(self) -> dict[str, Tensor]:
-        """The latest forces of all environments, float32."""
+        """The latest values of all environments, (n, ...) float32, in a new tensor."""
         return {self._sensor.name: self._values.clone()}
 
     def _read(self, env: int) -> None:

@@ -1,4 +1,4 @@
-"""Sensors by the keywords of `torch_panda.make`."""
+"""Sensors by name, and by the keywords of `torch_panda.make`."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,28 @@ from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
 from torch_panda.sensors.base import Sensor
 from torch_panda.sensors.cameras import CameraSensor
-from torch_panda.sensors.forces import FORCE_SENSORS, force_sensors_of
+from torch_panda.sensors.forces import FingerContact, JointTorque, WristForceTorque
+from torch_panda.sensors.joints import JointState
+
+SENSORS: dict[str, Sensor] = {
+    "joint_state": JointState(),
+    "wrist_force_torque": WristForceTorque(),
+    "finger_contact": FingerContact(),
+    "joint_torque": JointTorque(),
+}
+"""Sensors that ``make(..., sensors=...)`` accepts by name."""
+
+
+def sensors_of(robot: Robot) -> tuple[str, ...]:
+    """Names of the sensors that a robot can have."""
+    names = []
+    for name, sensor in SENSORS.items():
+        try:
+            sensor.check(robot)
+        except ValueError:
+            continue
+        names.append(name)
+    return tuple(names)
 
 
 def read_keywords(
@@ -19,13 +40,16 @@ def read_keywords(
     render_size: int | tuple[int, int] | None = None,
     sensors: Sequence[Sensor | str] = (),
 ) -> Sequence[Sensor | str]:
-    """The sensors that some keywords ask for; see `torch_panda.make`.
+    """Turn keywords of `torch_panda.make` into sensors.
+
+    Returns:
+        ``sensors``, and a camera sensor before them if the keywords ask for pictures.
 
     Raises:
-        ValueError: they contradict each other, or a size is out of range.
+        ValueError: The keywords contradict each other, or a size is out of range.
     """
     if isinstance(sensors, str):
-        return sensors  # which `read_sensors` refuses
+        return sensors  # `read_sensors` refuses it.
     if not (from_pixels or depth or segmentation):
         if camera is not None or render_size is not None:
             raise ValueError(
@@ -38,21 +62,25 @@ def read_keywords(
 
 
 def read_sensors(sensors: Sequence[Sensor | str], robot: Robot) -> tuple[Sensor, ...]:
-    """Sensors, those that were given by name among them, which a robot can have.
+    """Look up sensors that are given by name, and check that the robot can have them.
 
     Raises:
-        ValueError: the robot cannot have one of them.
-        TypeError: one is neither a sensor nor a name.
+        ValueError: A name is unknown, or the robot cannot have a sensor.
+        TypeError: An item is neither a sensor nor a name.
     """
-    known = force_sensors_of(robot)
-    named = [sensor for sensor in sensors if isinstance(sensor, str)]
-    if isinstance(sensors, str) or not set(named) <= set(known):
+    if isinstance(sensors, str):
         raise ValueError(
-            f"sensors must be among {known} for this robot, got {sensors!r}"
+            f"sensors must be a sequence, such as ({sensors!r},), got {sensors!r}"
         )
-    found = tuple(FORCE_SENSORS[s] if isinstance(s, str) else s for s in sensors)
-    for sensor in found:
-        if not isinstance(sensor, Sensor):
+    for sensor in sensors:
+        if isinstance(sensor, str) and sensor not in sensors_of(robot):
+            raise ValueError(
+                f"sensors must be among {sensors_of(robot)} for this robot, or Sensor "
+                f"objects, got {sensor!r}"
+            )
+        if not isinstance(sensor, Sensor | str):
             raise TypeError(f"a sensor must be a Sensor or a name, got {sensor!r}")
+    read = [SENSORS[item] if isinstance(item, str) else item for item in sensors]
+    for sensor in read:
         sensor.check(robot)
-    return found
+    return tuple(read)
