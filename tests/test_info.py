@@ -6,6 +6,7 @@ from pathlib import Path
 import torch_panda
 from torch_panda import info
 from torch_panda.__main__ import main
+from torch_panda.extras import EXTRAS
 from torch_panda.info import stepping
 
 ROOT = Path(__file__).parents[1]
@@ -36,9 +37,9 @@ def test_says_how_to_get_what_is_missing(monkeypatch):
     monkeypatch.setattr(info, "loop_problem", lambda: "there is no C compiler")
     monkeypatch.delenv("DISPLAY", raising=False)
     extras = "\n".join(info.extras())
-    assert "pip install -c .ci/constraints.txt -e '.[viewer]'" in extras
+    assert "pip install 'torch_panda[viewer]'" in extras
     monkeypatch.setattr(info.sys, "version_info", (3, 10))
-    assert "demonstrations): missing: needs Python 3.11" in "\n".join(info.extras())
+    assert "Minari's format): missing: needs Python 3.11" in "\n".join(info.extras())
     missing = "\n".join(info.missing())
     assert "C compiler" in missing
     assert "egl" in missing
@@ -52,4 +53,4 @@ def test_knows_the_extras():
     )[0]
     declared = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
     declared -= {"test", "docs", "examples"}  # `examples` is `learning`, renamed
-    assert declared == set(info._EXTRAS)
+    assert declared == set(EXTRAS)

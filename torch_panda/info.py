@@ -12,6 +12,7 @@ import torch
 import torch_panda
 from torch_panda.bullet import solver
 from torch_panda.bullet.native import loop_name, loop_problem
+from torch_panda.extras import EXTRAS, install_command
 
 _PACKAGES = (
     "torch_panda",
@@ -25,19 +26,6 @@ _PACKAGES = (
     "stable-baselines3",
     "gymnasium-robotics",
 )
-
-_INSTALL = "pip install -c .ci/constraints.txt -e"
-# Extras: what they are for, and a module that each brings; see pyproject.toml.
-_EXTRAS = {
-    "learning": ("training, evaluating, recording, videos, plots", "tyro"),
-    "viewer": ("env.open_viewer(), watch --web", "viser"),
-    "minari": ("Minari data sets of demonstrations", "minari"),
-    "lerobot": ("LeRobot data sets; see examples/README.md", "lerobot"),
-    "ray": ("training on many machines", "ray"),
-    "bench": ("what `bench` compares with", "gymnasium_robotics"),
-}
-# Where their libraries take no older Python.
-_OLDEST_PYTHON = {"minari": (3, 11), "lerobot": (3, 12)}
 
 
 def num_cores() -> int:
@@ -87,19 +75,18 @@ def renderers() -> list[str]:
 
 
 def extras() -> list[str]:
-    """A line for each extra: what it is for, and how to get what is missing."""
+    """A line for each extra: its purpose, and whether it is installed."""
     lines = []
-    for extra, (purpose, module) in _EXTRAS.items():
-        oldest = _OLDEST_PYTHON.get(extra, (3, 10))
-        if find_spec(module) is not None:
-            get = "installed"
-        elif sys.version_info < oldest:
-            get = "missing: needs Python {}.{}".format(*oldest)
-        elif extra == "lerobot":  # other releases than our constraints'
-            get = f"missing: pip install -e '.[{extra}]' in an environment of its own"
+    for name, extra in EXTRAS.items():
+        if find_spec(extra.modules[0]) is not None:
+            state = "installed"
+        elif sys.version_info < extra.oldest_python:
+            state = "missing: needs Python {}.{}".format(*extra.oldest_python)
+        elif name == "lerobot":  # it needs an older torch than the other extras
+            state = f"missing: {install_command(name)}, in an environment of its own"
         else:
-            get = f"missing: {_INSTALL} '.[{extra}]'"
-        lines.append(f"{extra} ({purpose}): {get}")
+            state = f"missing: {install_command(name)}"
+        lines.append(f"{name} ({extra.purpose}): {state}")
     return lines
 
 

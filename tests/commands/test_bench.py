@@ -118,7 +118,7 @@ def test_buffers_are_compared(capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--ids", "PandaFly-v1"], "--ids: 'PandaFly-v1' is no environment"),
+        (["--ids", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
         (["--num-envs", "4", "0"], "--num-envs must be at least 1, got 0"),
         (["--rounds", "0"], "--rounds must be at least 1, got 0"),
         (["--plot", "no/such/folder.png"], "--plot must be a file in an existing"),

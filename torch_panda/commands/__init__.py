@@ -1,12 +1,14 @@
 """The commands of ``python -m torch_panda``, a module each.
 
-A module has its options, ``Args``, and ``main(args)``. It is imported when its command
-runs, because commands need libraries that the environments do not.
+A module has its options, ``Args``, and the function ``main(args)``. It is imported when
+its command runs, because commands need libraries that the environments do not need.
 """
 
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+
+from torch_panda.extras import explain_missing
 
 # Names of commands, and what they do.
 COMMANDS = {
@@ -35,7 +37,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if name not in COMMANDS:
         raise SystemExit(f"unknown command {name!r}\n\n{describe()}")
-    import_module(f"torch_panda.commands.{name}").run(arguments[1:])
+    try:
+        import_module(f"torch_panda.commands.{name}").run(arguments[1:])
+    except ModuleNotFoundError as error:
+        explanation = explain_missing(error)
+        if explanation is None:
+            raise
+        raise SystemExit(explanation) from None
 
 
 def describe() -> str:

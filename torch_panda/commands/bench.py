@@ -33,6 +33,12 @@ from tqdm import tqdm
 import torch_panda
 from torch_panda.bullet.native import loop_name
 from torch_panda.info import num_cores
+from torch_panda.learning.user_modules import (
+    Imports,
+    UserModule,
+    import_modules,
+    read_modules,
+)
 from torch_panda.transforms import HindsightRelabel
 
 OURS = "torch_panda"
@@ -63,6 +69,8 @@ class Args:
     """measure replay buffers with and without hindsight instead of environments"""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """picture of the speeds to write, for instance speed.png"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
 
 
 @dataclass(frozen=True)
@@ -74,12 +82,14 @@ class Setting:
         num_envs: Number of environments stepped in parallel.
         num_threads: Number of threads of contenders that use threads.
         render_size: Width and height of observed pictures [pixels]; None means none.
+        modules: Modules of the user that register ids.
     """
 
     env_id: str
     num_envs: int
     num_threads: int
     render_size: int | None = None
+    modules: tuple[UserModule, ...] = ()
 
 
 class Running(NamedTuple):
@@ -356,6 +366,7 @@ def measure(name: str, setting: Setting, steps: int) -> Measurement:
 
 def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     torch.set_num_threads(1)
+    import_modules(setting.modules)
     # pybullet prints on stdout whenever it loads a robot.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     make = CONTENDERS[name].make
@@ -625,11 +636,7 @@ def check(args: Args) -> None:
         ValueError: Names the option and what it accepts.
     """
     for env_id in args.ids:
-        if env_id not in torch_panda.ENV_IDS:
-            raise ValueError(
-                f"--ids: {env_id!r} is no environment; `python -m torch_panda info` "
-                "lists all"
-            )
+        torch_panda.max_episode_steps(env_id)  # refuses an unknown id
     for option, value in (
         ("--num-envs", min(args.num_envs, default=0)),
         ("--num-threads", args.num_threads),
@@ -651,6 +658,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
     """
     args = tyro.cli(Args, args=arguments, prog="python -m torch_panda bench")
     try:
+        modules = read_modules(args.imports)
+        import_modules(modules)
         check(args)
     except ValueError as error:
         sys.exit(str(error))
@@ -658,7 +667,13 @@ def run(arguments: Sequence[str] | None = None) -> None:
         print(compare_buffers(args.rounds))
         return
     settings = [
-        Setting(env_id, n, min(n, args.num_threads or num_cores()), args.render_size)
+        Setting(
+            env_id,
+            n,
+            min(n, args.num_threads or num_cores()),
+            args.render_size,
+            modules,
+        )
         for env_id in args.ids
         for n in args.num_envs
     ]

@@ -23,8 +23,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import ray
 import torch
 import tyro
+from ray.exceptions import RayActorError
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
@@ -44,14 +46,12 @@ from torch_panda.learning.checkpoint import (
 from torch_panda.learning.curve import Curve
 from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
 from torch_panda.learning.options import check_exploration
-
-try:
-    import ray
-    from ray.exceptions import RayActorError
-except ModuleNotFoundError:
-    raise SystemExit(
-        "this needs Ray: pip install -c .ci/constraints.txt -e '.[ray]'"
-    ) from None
+from torch_panda.learning.user_modules import (
+    Imports,
+    UserModule,
+    import_modules,
+    read_modules,
+)
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
 
@@ -83,6 +83,8 @@ class Args(Hyperparameters):
     """environment steps between evaluations"""
     seed: Seed = 0
     """the seed of the environments, the networks and the sampling"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
     out: Path | None = None
     """the folder of the results; None means runs/<env-id>-<algo>-distributed-<seed>"""
 
@@ -183,9 +185,22 @@ def worker_of(data: TensorDictBase, num_workers: int) -> int:
 
 
 def make_env(
-    env_id: str, num_envs: int, num_threads: int, seed: int
+    modules: tuple[UserModule, ...],
+    env_id: str,
+    num_envs: int,
+    num_threads: int,
+    seed: int,
 ) -> torch_panda.RobotTaskEnv:
-    """A worker's environments; its exploration noise is seeded, too."""
+    """Make a worker's environments, and seed its exploration noise.
+
+    Args:
+        modules: Modules of the user that register ids.
+        env_id: The task.
+        num_envs: Number of environments.
+        num_threads: Number of threads that step them.
+        seed: Seed of the environments and of the noise.
+    """
+    import_modules(modules)
     torch.manual_seed(seed)
     return torch_panda.make(
         env_id, num_envs=num_envs, num_threads=num_threads, seed=seed
@@ -195,7 +210,13 @@ def make_env(
 def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
     """Start the workers, spread over the machines, each with its own seed."""
     workers = range(args.num_workers)
-    make = partial(make_env, args.env_id, args.num_envs, args.cpus_per_worker)
+    make = partial(
+        make_env,
+        read_modules(args.imports),
+        args.env_id,
+        args.num_envs,
+        args.cpus_per_worker,
+    )
     # torchrl's own way to send weights is a process group at the address that this
     # machine's name resolves to, often 127.0.0.1, where no other machine reaches it.
     # `send_weights` goes through Ray instead.
@@ -258,6 +279,7 @@ def main(args: Args) -> None:
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
+        import_modules(read_modules(args.imports))
         check_exploration(args, args.num_envs)
         check_folder(out, resume=False)
         connect(args)

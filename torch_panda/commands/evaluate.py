@@ -16,6 +16,7 @@ from torch_panda import PhysicsName
 from torch_panda.learning.evaluation import evaluate, wilson_interval
 from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
 from torch_panda.learning.policy_files import load_policy, read_checkpoint
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 
 @dataclass
@@ -38,12 +39,15 @@ class Args:
     """numbers of the task that are others than in training, such as `play 0.0005`"""
     physics: PhysicsName = "exact"
     """how Bullet integrates: as panda-gym, or faster and coarser"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
 
 
 def main(args: Args) -> None:
     """Print what the policy achieves, with 95 % intervals."""
     try:
         check_limits(args)
+        import_modules(read_modules(args.imports))
         checkpoint = read_checkpoint(args.run)
         env_id = args.env_id or checkpoint["env_id"]
         with torch_panda.make(

@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from torch_panda.learning.plots import Metric, plot_panels, read_runs
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 
 @dataclass
@@ -23,12 +24,15 @@ class Args:
     """column of the curves"""
     out: Path = Path("curves.png")
     """picture to write"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
 
 
 def main(args: Args) -> None:
     """Draw the runs."""
     out = args.out if args.out.suffix else args.out.with_suffix(".png")
     try:
+        import_modules(read_modules(args.imports))
         out.parent.mkdir(parents=True, exist_ok=True)
         plot_panels(read_runs(args.runs), args.metric, out)
     except (ValueError, OSError) as error:

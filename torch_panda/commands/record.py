@@ -21,6 +21,7 @@ from torch_panda.datasets.recording import TensorWriter, disturb, play
 from torch_panda.experts import make_expert
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.limits import Finite, Positive, Seed, Weight, check_limits
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 
 @dataclass
@@ -49,6 +50,8 @@ class Args:
     """the file; for minari the data set's id, for lerobot its folder"""
     image_size: Positive = 128
     """height and width of lerobot's pictures [pixels]"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
 
 
 def print_success(env_id: str, success: list[Tensor]) -> None:
@@ -87,6 +90,7 @@ def main(args: Args) -> None:
     """Run the episodes, print the success rates, save the transitions."""
     try:
         check_limits(args)
+        import_modules(read_modules(args.imports))
         expert: TensorDictModuleBase = make_expert(args.env_id)
         if args.noise_eps and args.format == "minari":
             raise ValueError("minari's episodes hold what was executed: no noise_eps")

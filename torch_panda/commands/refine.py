@@ -38,6 +38,7 @@ from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.limits import Positive, Seed, check_limits
 from torch_panda.learning.policy_files import load_agent, read_checkpoint
 from torch_panda.learning.pretraining import pretrain
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 LEARNING_RATE = 0.3  # at first, of that of training
 
@@ -62,6 +63,8 @@ class Args:
     """environments that are stepped in parallel"""
     seed: Seed = 0
     """the seed of the environments and the sampling"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
     """continue in that folder, with the same other options"""
 
@@ -182,6 +185,7 @@ def main(args: Args) -> None:
     """Refine, and say where the results are."""
     try:
         check_limits(args)
+        import_modules(read_modules(args.imports))
         check_folder(args.out, resume=args.resume)
         run = Refinement(args)
         default = Args(args.policy, args.out, env_id=args.env_id)

@@ -17,16 +17,23 @@ from torch_panda.datasets import read_demos
 from torch_panda.learning.checkpoint import StopSignal, check_folder, write_options
 from torch_panda.learning.options import Args, check, default_args
 from torch_panda.learning.training import Run
+from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.learning.video import record
 
 
 def parse(arguments: Sequence[str] | None = None) -> Args:
-    """Read the command line; preset and task say what other options default to."""
-    given = tyro.cli(Args, prog="python -m torch_panda train", args=arguments)
-    default = default_args(given.preset, given.env_id)
-    return tyro.cli(
-        Args, prog="python -m torch_panda train", args=arguments, default=default
-    )
+    """Read the command line.
+
+    Preset and task determine the defaults of the other options, so they are read first.
+
+    Raises:
+        ValueError: A module that should be imported does not exist.
+    """
+    prog = "python -m torch_panda train"
+    first = tyro.cli(Args, prog=prog, args=arguments)
+    import_modules(read_modules(first.imports))
+    default = default_args(first.preset, first.env_id)
+    return tyro.cli(Args, prog=prog, args=arguments, default=default)
 
 
 def make_run(args: Args, out: Path) -> Run:
@@ -72,4 +79,8 @@ def main(args: Args) -> None:
 
 def run(arguments: Sequence[str]) -> None:
     """Read the options and train."""
-    main(parse(arguments))
+    try:
+        args = parse(arguments)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
+    main(args)

@@ -21,6 +21,7 @@ import torch_panda
 from torch_panda.experts import make_expert
 from torch_panda.learning.limits import Port, Positive, Seed, check_limits
 from torch_panda.learning.policy_files import load_policy, read_checkpoint
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 from torch_panda.learning.video import FPS, play, record
 
 CAMERA = torch_panda.Camera(distance=1.1)  # where a browser's view starts
@@ -110,12 +111,15 @@ class Args:
     """with --web, the address to serve at; 0.0.0.0 lets other machines in"""
     port: Port = 8080
     """with --web, the port, or the next one that is free"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
 
 
 def main(args: Args) -> None:
     """Record a policy, or show it."""
     try:
         check_limits(args)
+        import_modules(read_modules(args.imports))
         torch.manual_seed(args.seed)
         checkpoint = None
         if args.policy not in ("random", "expert"):

@@ -18,7 +18,7 @@ from torch_panda.learning.recipes import find_changes
 RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
 SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
 # Options in which a run and its continuation may differ.
-FREE_OPTIONS = {"resume", "out", "video"}
+FREE_OPTIONS = {"resume", "out", "video", "imports"}
 
 
 @dataclass

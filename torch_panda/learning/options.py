@@ -17,6 +17,7 @@ from torch_panda.learning.limits import (
     check_limits,
 )
 from torch_panda.learning.recipes import find_recipe
+from torch_panda.learning.user_modules import Imports
 
 
 @dataclass
@@ -63,6 +64,8 @@ class Args(Hyperparameters):
     """environment steps between evaluations"""
     out: Path | None = None
     """the folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
     """continue the run in that folder, with the same other options"""
     device: str = "cpu"

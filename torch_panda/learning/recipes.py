@@ -22,7 +22,7 @@ OBJECT: dict[str, Any] = {
 # What is no other way to train: other runs of the same line in a plot.
 PLAIN_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
-    *("out", "resume", "device", "video"),
+    *("out", "resume", "device", "video", "imports"),
 }
 # What joint control cannot do.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")

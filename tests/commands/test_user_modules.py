@@ -1,0 +1,103 @@
+"""The option --import: commands know the ids that a user's module registers."""
+
+import sys
+
+import pytest
+
+from torch_panda import registry
+from torch_panda.commands import main
+
+MODULE = """
+import torch_panda
+from torch_panda import Panda, Reach
+
+torch_panda.register(
+    "Near-v0",
+    robot=lambda: Panda(block_gripper=True),
+    task=lambda: Reach(goal_range=0.1),
+    max_episode_steps=10,
+)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder: it holds a module of a user and nothing else."""
+    (tmp_path / "near_task.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "near_task", raising=False)
+    # Forget the id after the test.
+    known = dict(registry._REGISTRATIONS)
+    monkeypatch.setattr(registry, "_REGISTRATIONS", known)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("module", ["near_task.py", "near_task"])
+def test_a_registered_task_is_trained_evaluated_watched_and_plotted(
+    folder, capsys, module
+):
+    train = ["--total-steps", "200", "--no-video", "--out", "run"]
+    main(["train", "--env-id", "Near-v0", "--import", module, *train])
+    main(["evaluate", "run", "--episodes", "4", "--import", module])
+    assert "success at the end" in capsys.readouterr().out
+    watch = ["--policy", "run", "--num-envs", "1", "--out", "watch.gif"]
+    main(["watch", "--import", module, *watch])
+    main(["plot", ".", "--import", module])
+    assert (folder / "watch.gif").stat().st_size
+    assert (folder / "curves.png").stat().st_size
+
+
+def test_worker_processes_import_the_module(folder, capsys):
+    bench = ["--num-envs", "1", "--rounds", "1", "--steps", "2", "--others", "fast"]
+    main(["bench", "--ids", "Near-v0", "--import", "near_task.py", *bench])
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert any(
+        row[:8] == ["|", "Near-v0", "|", "1", "|", "1", "|", "torch_panda"]
+        for row in rows
+    )
+
+
+def test_several_modules_are_imported_in_turn(folder, capsys):
+    (folder / "first.py").write_text("print('first')")
+    (folder / "second.py").write_text("print('second')")
+    modules = ["--import", "first.py", "--import", "second.py"]
+    with pytest.raises(SystemExit, match=r"^there is no "):
+        main(["evaluate", "nothing", *modules])
+    assert capsys.readouterr().out.splitlines() == ["first", "second"]
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "watch", "record", "bench"])
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        ("nothing.py", "cannot import the file nothing.py: .*No such file"),
+        ("nothing", "cannot import 'nothing': there is no such module; --import takes"),
+    ],
+)
+def test_a_missing_module_is_one_error(folder, command, module, message):
+    arguments = ["run"] if command == "evaluate" else []
+    with pytest.raises(SystemExit, match=message):
+        main([command, *arguments, "--import", module])
+
+
+def test_an_error_inside_the_module_is_shown(folder):
+    (folder / "broken.py").write_text("import there_is_no_such_library")
+    with pytest.raises(ModuleNotFoundError, match="there_is_no_such_library"):
+        main(["evaluate", "run", "--import", "broken"])
+
+
+def test_a_missing_extra_is_one_error_with_its_command(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("torch_panda.c")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "tyro", None)
+    message = r"tyro is not installed; it comes with the extra 'learning': "
+    message += r"pip install 'torch_panda\[learning\]'"
+    with pytest.raises(SystemExit, match=message):
+        main(["plot", "."])
+
+
+def test_an_unknown_command_lists_the_commands():
+    with pytest.raises(SystemExit, match=r"unknown command 'trian'(.|\n)*evaluate"):
+        main(["trian"])

@@ -1,0 +1,50 @@
+"""Optional libraries, by the extra of ``pip install`` that brings them."""
+
+from typing import NamedTuple
+
+
+class Extra(NamedTuple):
+    """An extra of the package; pyproject.toml lists the versions.
+
+    Attributes:
+        purpose: What it is for.
+        modules: Modules that it brings; the first one tells whether it is installed.
+        oldest_python: Oldest version of Python for which its libraries exist.
+    """
+
+    purpose: str
+    modules: tuple[str, ...]
+    oldest_python: tuple[int, int] = (3, 10)
+
+
+EXTRAS = {
+    "learning": Extra(
+        "train, evaluate, record, watch, plot",
+        ("tyro", "tqdm", "matplotlib", "imageio", "imageio_ffmpeg", "PIL", "filelock"),
+    ),
+    "viewer": Extra("env.open_viewer() and watch --web", ("viser", "trimesh")),
+    "minari": Extra("data sets in Minari's format", ("minari", "h5py"), (3, 11)),
+    "lerobot": Extra("data sets in LeRobot's format", ("lerobot",), (3, 12)),
+    "ray": Extra("training on several machines", ("ray",)),
+    "bench": Extra(
+        "the other environments of bench",
+        ("gymnasium_robotics", "panda_gym", "stable_baselines3", "envpool"),
+    ),
+}
+
+
+def install_command(extra: str) -> str:
+    """The shell command that installs an extra."""
+    return f"pip install 'torch_panda[{extra}]'"
+
+
+def explain_missing(error: ModuleNotFoundError) -> str | None:
+    """Say which extra brings a module that is missing; None if none of them does."""
+    module = (error.name or "").partition(".")[0]
+    for name, extra in EXTRAS.items():
+        if module in extra.modules:
+            return (
+                f"{module} is not installed; it comes with the extra {name!r}: "
+                f"{install_command(name)}"
+            )
+    return None
