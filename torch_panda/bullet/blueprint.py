@@ -14,15 +14,17 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class LoadURDF:
-    """Loads a URDF. The new body gets the next id.
+    """Loads a URDF.
 
     Attributes:
+        body: Id that the new body got.
         file: Path of the file, with the tool if one was added.
         position: Position of the base, world frame [m].
         orientation: Orientation of the base, quaternion xyzw.
         fixed_base: Whether the base cannot move.
     """
 
+    body: int
     file: str
     position: Vector
     orientation: Quaternion
@@ -31,9 +33,10 @@ class LoadURDF:
 
 @dataclass(frozen=True)
 class CreateBody:
-    """Creates a body of one shape. The new body gets the next id.
+    """Creates a body of one shape.
 
     Attributes:
+        body: Id that the new body got.
         shape: Shape of the body; None for a marker that nothing shows.
         mass: Mass [kg]; 0 for a body that never moves.
         position: Position of its centre, world frame [m].
@@ -41,6 +44,7 @@ class CreateBody:
         is_marker: Whether the body is a marker, which touches nothing.
     """
 
+    body: int
     shape: Shape | None
     mass: float
     position: Vector

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Sequence
 
 from torch_panda.bullet import capi
-from torch_panda.bullet.blueprint import LoadURDF, Vector
+from torch_panda.bullet.blueprint import Vector
 from torch_panda.bullet.connection import Connection, doubles
 from torch_panda.rotations import NO_ROTATION
 
@@ -15,16 +15,26 @@ NO_SHAPE = -1
 _IMPORTER = threading.Lock()
 
 
-def load_urdf(connection: Connection, urdf: LoadURDF, flags: int) -> int:
+def load_urdf(
+    connection: Connection,
+    file: str,
+    position: Sequence[float],
+    orientation: Sequence[float],
+    *,
+    fixed_base: bool,
+    flags: int,
+) -> int:
     """Load a URDF with flags of ``enum eURDF_Flags`` and return its body id."""
-    command = capi.urdf_init(connection.handle, urdf.file.encode())
-    capi.urdf_set_position(command, *urdf.position)
-    capi.urdf_set_orientation(command, *urdf.orientation)
-    capi.urdf_set_fixed_base(command, int(urdf.fixed_base))
+    command = capi.urdf_init(connection.handle, file.encode())
+    capi.urdf_set_position(command, *position)
+    capi.urdf_set_orientation(command, *orientation)
+    capi.urdf_set_fixed_base(command, int(fixed_base))
     capi.urdf_set_flags(command, flags)
     with _IMPORTER:
         status = connection.submit(
-            command, capi.CMD_URDF_LOADING_COMPLETED, f"load {urdf.file}"
+            command,
+            capi.CMD_URDF_LOADING_COMPLETED,
+            f"load {file} (it prints the reason)",
         )
     return int(capi.status_body(status))
 

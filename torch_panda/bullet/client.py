@@ -13,6 +13,7 @@ from torch_panda.bullet.blueprint import (
     Command,
     CreateBody,
     LoadURDF,
+    Quaternion,
     SetBase,
     SetJoints,
     SetPhysics,
@@ -32,7 +33,7 @@ from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
 from torch_panda.bullet.urdf import (
     Tool,
-    check_collision_filters,
+    check_urdf,
     find_urdf,
     urdf_with_tool,
 )
@@ -150,20 +151,26 @@ class PhysicsClient:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file sets collision groups or masks, which Bullet does not
-                report and `BroadPhase` could therefore not restore.
-            BulletError: Bullet cannot read the file.
+            ValueError: the URDF is broken, lacks a mesh, or sets collision groups,
+                which `BroadPhase` could not restore; see `urdf.check_urdf`.
+            BulletError: Bullet cannot load the file. It prints the reason.
         """
+        check_quaternion("orientation", orientation)
         file = find_urdf(path)
+        check_urdf(file)
         if tool is not None:
             file = urdf_with_tool(file, tool)
-        check_collision_filters(file)
-        check_quaternion("orientation", orientation)
-        x, y, z, w = map(float, orientation)
-        urdf = LoadURDF(file, _vector(position), (x, y, z, w), fixed_base)
-        body = building.load_urdf(self.connection, urdf, capi.URDF_IGNORE_VISUAL_SHAPES)
+        place, rotation = _vector(position), _quaternion(orientation)
+        body = building.load_urdf(
+            self.connection,
+            file,
+            place,
+            rotation,
+            fixed_base=fixed_base,
+            flags=capi.URDF_IGNORE_VISUAL_SHAPES,
+        )
         self._bodies.append(body)
-        self._record(urdf)
+        self._record(LoadURDF(body, file, place, rotation, fixed_base))
         return body
 
     def create_box(
@@ -244,7 +251,7 @@ class PhysicsClient:
             self.connection, place, mass=mass, collision_shape=collision_shape
         )
         self._bodies.append(body)
-        self._record(CreateBody(shape, mass, place, visual, is_marker))
+        self._record(CreateBody(body, shape, mass, place, visual, is_marker))
         return body
 
     def _create_collision_shape(self, shape: Shape) -> int:
@@ -455,8 +462,8 @@ class PhysicsClient:
             angular_velocity,
         )
         if self._is_recording:
-            x, y, z, w = map(float, orientation)
-            self._record(SetBase(body, _vector(position), (x, y, z, w)))
+            pose = _vector(position), _quaternion(orientation)
+            self._record(SetBase(body, *pose))
 
     def set_gravity(self, gravity: float) -> None:
         """Set gravity along the world's z axis [m/s^2]."""
@@ -654,3 +661,8 @@ _DYNAMICS_SETTERS = {
 def _vector(values: Sequence[float]) -> Vector:
     x, y, z = map(float, values)
     return x, y, z
+
+
+def _quaternion(values: Sequence[float]) -> Quaternion:
+    x, y, z, w = map(float, values)
+    return x, y, z, w

@@ -1,12 +1,33 @@
-"""URDF files: where they are, what they must not say, and a link that they lack."""
+"""URDF files: finding them, checking them, and adding a link to them."""
 
 import functools
 import importlib.util
+import re
 import tempfile
 import threading
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
+
+_JOINT_TYPES = (
+    "revolute",
+    "continuous",
+    "prismatic",
+    "fixed",
+    "floating",
+    "planar",
+    "spherical",
+)
+# Geometries that Bullet knows, and the attributes that they need.
+_SIZES = {
+    "box": ("size",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "plane": ("normal",),
+    "mesh": ("filename",),
+    "cdf": ("filename",),
+}
 
 _SCRATCH_LOCK = threading.Lock()
 
@@ -34,30 +55,157 @@ def find_urdf(path: str | Path) -> str:
     shipped = Path(spec.origin).parent
     for candidate in (Path(path), shipped / path):
         if candidate.is_file():
-            return str(candidate)
+            return str(candidate.absolute())
     raise FileNotFoundError(f"no URDF file at {path}, nor at {shipped / path}")
 
 
-def check_collision_filters(file: str) -> None:
-    """Raise ValueError if a URDF chooses its own collision groups or masks."""
+def parse_urdf(file: str | Path) -> ElementTree.Element:
+    """The ``<robot>`` element of a URDF.
+
+    Like Bullet's own parser, this ignores text before and after the element.
+
+    Raises:
+        ValueError: the file has no such element, or is not XML.
+    """
+    text = Path(file).read_text(errors="replace")
+    first, end = re.search(r"<robot\b", text), "</robot>"
+    if first is None:
+        raise ValueError(f"{file} is not a URDF: it has no <robot> element")
+    last = text.rfind(end) + len(end) if end in text else None
     try:
-        tree = ElementTree.parse(file)
-    except ElementTree.ParseError:
-        return  # Bullet says what is wrong
-    for shape in tree.iter("collision"):
-        chosen = {"group", "mask"} & set(shape.attrib)
-        if chosen:
+        # Empty lines instead of the text before keep the line numbers of errors.
+        lines = "\n" * text.count("\n", 0, first.start())
+        return ElementTree.fromstring(lines + text[first.start() : last])
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{file} is not XML: {error}") from None
+
+
+def check_urdf(file: str) -> None:
+    """Make sure that Bullet can load a URDF.
+
+    Bullet crashes where links do not form one tree. Where it refuses a file, its status
+    code tells no reason.
+
+    Raises:
+        ValueError: Bullet would crash or refuse the file, or the file sets collision
+            groups. The error names the file and the element.
+    """
+    robot = parse_urdf(file)
+    for tag in ("link", "joint"):
+        _check_names(file, robot, tag)
+    _check_tree(file, robot)
+    for link in robot.findall("link"):
+        for inertial in link.findall("inertial"):
+            owner = f"{file}: the <inertial> of link {link.get('name')!r}"
+            for tag in ("mass", "inertia"):
+                if inertial.find(tag) is None:
+                    raise ValueError(f"{owner} has no <{tag}>")
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            _check_shape(file, link, shape)
+
+
+def _check_names(file: str, robot: ElementTree.Element, tag: str) -> None:
+    names = set()
+    for element in robot.findall(tag):
+        name = element.get("name")
+        if not name:
+            raise ValueError(f"{file}: a <{tag}> has no name")
+        if name in names:
             raise ValueError(
-                f"the collision shapes of a URDF must not have a group or a mask, "
-                f"got {sorted(chosen)} in {file}"
+                f"{file}: two {tag}s have the name {name!r}, which must be unique"
             )
+        names.add(name)
+
+
+def _check_tree(file: str, robot: ElementTree.Element) -> None:
+    """Make sure that joints attach all links to one base."""
+    links = [str(link.get("name")) for link in robot.findall("link")]
+    if not links:
+        raise ValueError(f"{file}: a URDF needs at least one <link>")
+    parents: dict[str, str] = {}
+    for joint in robot.findall("joint"):
+        parent, child = _ends(file, joint, links)
+        if child in parents:
+            raise ValueError(
+                f"{file}: link {child!r} is the child of two joints, the second is "
+                f"{joint.get('name')!r}; a link has one parent"
+            )
+        parents[child] = parent
+    for link in links:
+        ancestors = [link]
+        while (parent := parents.get(ancestors[-1], "")) in links:
+            if parent in ancestors:
+                raise ValueError(f"{file}: joints form a loop through link {link!r}")
+            ancestors.append(parent)
+    base, *others = (link for link in links if link not in parents)
+    if others:
+        raise ValueError(
+            f"{file}: no joint attaches link {others[0]!r} to the base {base!r}: add a "
+            f"joint whose child is {others[0]!r}, or remove the link"
+        )
+
+
+def _ends(file: str, joint: ElementTree.Element, links: list[str]) -> tuple[str, str]:
+    """Parent and child of a joint, which Bullet must be able to build."""
+    owner = f"{file}: joint {joint.get('name')!r}"
+    joint_type = joint.get("type")
+    if joint_type not in _JOINT_TYPES:
+        raise ValueError(
+            f"{owner} must have one of the types {_JOINT_TYPES}, got {joint_type!r}"
+        )
+    if joint_type in ("revolute", "prismatic") and joint.find("limit") is None:
+        raise ValueError(f"{owner} is {joint_type} and needs a <limit>")
+    ends = []
+    for tag in ("parent", "child"):
+        element = joint.find(tag)
+        link = None if element is None else element.get("link")
+        if link not in links:
+            raise ValueError(
+                f"{owner} must have a link of the file as its {tag}, got {link!r}"
+            )
+        ends.append(str(link))
+    return ends[0], ends[1]
+
+
+def _check_shape(
+    file: str, link: ElementTree.Element, shape: ElementTree.Element
+) -> None:
+    owner = f"{file}: a <{shape.tag}> of link {link.get('name')!r}"
+    filters = sorted({"group", "mask"} & set(shape.attrib))
+    if filters:
+        raise ValueError(
+            f"{owner} must not set {filters}: Bullet does not report collision groups "
+            f"and masks, so a reset could not restore them"
+        )
+    geometry = shape.find("geometry/*")
+    if geometry is None or geometry.tag not in _SIZES:
+        found = "nothing" if geometry is None else f"<{geometry.tag}>"
+        raise ValueError(
+            f"{owner} must have one of {sorted(_SIZES)} as its geometry, got {found}"
+        )
+    for attribute in _SIZES[geometry.tag]:
+        if geometry.get(attribute) is None:
+            raise ValueError(f"{owner} has a <{geometry.tag}> without {attribute!r}")
+    mesh = geometry.get("filename", "")
+    if geometry.tag == "mesh" and find_mesh(mesh, Path(file)) is None:
+        raise ValueError(
+            f"{owner} has the mesh {mesh!r}, which does not exist. Without its prefix, "
+            f"such as package://, the name must be a path from the folder of the URDF "
+            f"or from a folder above it"
+        )
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """A mesh of a URDF, looked for where Bullet does: in all folders above it."""
-    name = name.removeprefix("package://").removeprefix("file://")
-    candidates = [parent / name for parent in urdf.parents]
-    return next((path for path in candidates if path.is_file()), None)
+    """The file of a mesh, or None. It is searched where Bullet searches.
+
+    These are the folder of the URDF, all folders above it, the working directory and
+    two folders above that.
+    """
+    for prefix in ("package://", "model://", "file://"):
+        name = name.removeprefix(prefix)
+    folders = (*urdf.absolute().parents, Path(), Path(".."), Path("../.."))
+    candidates = [folder / name for folder in folders]
+    return next((path.absolute() for path in candidates if path.is_file()), None)
 
 
 @functools.cache
@@ -78,22 +226,21 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     """A URDF file with one more link, the last one, named "tool".
 
     Raises:
-        ValueError: there is no link for it to be fixed to.
+        ValueError: the URDF has no link of the name to which the tool is fixed.
     """
     source = Path(file).absolute()
-    tree = ElementTree.parse(source)
-    robot = tree.getroot()
+    robot = parse_urdf(source)
     links = [link.get("name") for link in robot.findall("link")]
     if tool.link not in links:
         raise ValueError(f"a tool must be fixed to one of {links}, got {tool.link!r}")
-    for mesh in tree.iter("mesh"):
-        if (found := find_mesh(mesh.get("filename", ""), source)) is not None:
-            mesh.set("filename", str(found))
-    # A link without this would weigh 1 kg, Bullet's default.
-    nothing = (
+    for mesh in robot.iter("mesh"):
+        if (path := find_mesh(mesh.get("filename", ""), source)) is not None:
+            mesh.set("filename", str(path))
+    # A link without <inertial> would have Bullet's default mass, 1 kg.
+    massless = (
         "<mass value='0'/><inertia ixx='0' iyy='0' izz='0' ixy='0' ixz='0' iyz='0'/>"
     )
-    link = f"<link name='tool'><inertial>{nothing}</inertial></link>"
+    link = f"<link name='tool'><inertial>{massless}</inertial></link>"
     robot.append(ElementTree.fromstring(link))
     x, y, z = tool.position
     robot.append(
@@ -102,6 +249,6 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
             f"<child link='tool'/><origin xyz='{x} {y} {z}'/></joint>"
         )
     )
-    path = make_scratch_folder() / source.name
-    tree.write(path)
-    return str(path)
+    target = make_scratch_folder() / source.name
+    ElementTree.ElementTree(robot).write(target)
+    return str(target)

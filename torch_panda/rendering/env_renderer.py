@@ -3,7 +3,7 @@
 import numpy as np
 
 from torch_panda.bullet import VectorSimulation
-from torch_panda.bullet.blueprint import CreateBody, LoadURDF
+from torch_panda.bullet.blueprint import CreateBody
 from torch_panda.rendering.camera import Camera, to_metres
 from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.frames import Frames, blend
@@ -35,8 +35,8 @@ class EnvRenderer:
         self._simulation = simulation
         blueprint = simulation.blueprint
         opacity = {
-            body: command.visual.opacity
-            for body, command in _bodies(simulation).items()
+            command.body: command.visual.opacity
+            for command in blueprint
             if isinstance(command, CreateBody) and command.is_marker
         }
         self._solids = VisualClient(
@@ -100,14 +100,7 @@ def segmentation_ids(simulation: VectorSimulation) -> dict[str, int]:
     names = {scene.robot: "robot"}
     for k, body in enumerate(scene.objects):
         names[body] = "object" if len(scene.objects) == 1 else f"object{k + 1}"
-    for body, command in _bodies(simulation).items():
+    for command in simulation.blueprint:
         if isinstance(command, CreateBody) and command.visual.name is not None:
-            names[body] = command.visual.name
+            names[command.body] = command.visual.name
     return {"nothing": BACKGROUND} | {names[body]: body for body in sorted(names)}
-
-
-def _bodies(simulation: VectorSimulation) -> dict[int, LoadURDF | CreateBody]:
-    """The commands that made the bodies, by body id."""
-    commands = simulation.blueprint
-    makers = [x for x in commands if isinstance(x, LoadURDF | CreateBody)]
-    return dict(zip(simulation.clients[0].bodies, makers, strict=True))

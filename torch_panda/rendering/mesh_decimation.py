@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from torch_panda.bullet.urdf import find_mesh, make_scratch_folder
+from torch_panda.bullet.urdf import find_mesh, make_scratch_folder, parse_urdf
 
 # Texture coordinates that differ by less belong to one colour.
 _TEXTURE_CELL = 0.1
@@ -35,8 +35,8 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
     """
     folder = make_scratch_folder()
     source = Path(urdf).absolute()
-    tree = ElementTree.parse(source)
-    for link in tree.iter("link"):
+    robot = parse_urdf(source)
+    for link in robot.iter("link"):
         for collision in link.findall("collision"):
             link.remove(collision)
         for mesh in link.iter("mesh"):
@@ -47,7 +47,7 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
             if original is not None:
                 mesh.set("filename", str(original))
     path = folder / source.name
-    tree.write(path)
+    ElementTree.ElementTree(robot).write(path)
     return path
 
 

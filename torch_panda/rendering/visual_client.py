@@ -1,6 +1,5 @@
 """A client of Bullet that holds the visual shapes of a scene, and draws them."""
 
-import dataclasses
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch_panda.bullet import Blueprint, Scene, SimulationState, building, capi
 from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase, SetJoints
 from torch_panda.bullet.connection import BulletError, Connection, connect, doubles
 from torch_panda.bullet.library import library_path
-from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Sphere
+from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Shape, Sphere
 from torch_panda.rendering.camera import Camera, HandCamera
 from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.mesh_decimation import decimated_urdf
@@ -188,44 +187,58 @@ class VisualClient:
     # ---- building ----------------------------------------------------------------
 
     def _build(self, blueprint: Blueprint) -> None:
-        connection = self._connection
+        connection, num_bodies = self._connection, 0
         for command in blueprint:
             match command:
-                case LoadURDF():
-                    self._load_urdf(command)
-                case CreateBody():
-                    self._create_body(command)
+                case LoadURDF(body) | CreateBody(body):
+                    # Ids of bodies that physics clients failed to build stay unused.
+                    for _ in range(num_bodies, body):
+                        building.create_body(connection, building.ORIGIN)
+                    self._build_body(command)
+                    num_bodies = body + 1
                 case SetBase(body, position, orientation):
                     building.set_base(connection, body, position, orientation)
                 case SetJoints(body, joints, positions) if self._layer != "markers":
                     self._set_joints(body, joints, positions)
 
+    def _build_body(self, command: LoadURDF | CreateBody) -> None:
+        """Build a body with its visual shapes, or without if another layer has it."""
+        is_marker = isinstance(command, CreateBody) and command.is_marker
+        if self._layer != "all" and is_marker != (self._layer == "markers"):
+            building.create_body(self._connection, command.position)
+        elif isinstance(command, LoadURDF):
+            self._load_urdf(command)
+        else:
+            self._create_body(command)
+
     def _load_urdf(self, urdf: LoadURDF) -> None:
-        if self._layer == "markers":  # an invisible body takes its id
-            building.create_body(self._connection, urdf.position)
-            return
+        file = urdf.file
         if self._mesh_cell > 0:
-            file = str(decimated_urdf(urdf.file, self._mesh_cell))
-            urdf = dataclasses.replace(urdf, file=file)
-        building.load_urdf(self._connection, urdf, flags=0)
-
-    def _create_body(self, body: CreateBody) -> None:
-        is_drawn = body.shape is not None and (
-            self._layer == "all" or body.is_marker == (self._layer == "markers")
-        )
-        # A collision shape would be drawn where there is no visual shape.
-        body_id = building.create_body(
+            file = str(decimated_urdf(file, self._mesh_cell))
+        building.load_urdf(
             self._connection,
-            body.position,
-            visual_shape=self._create_shape(body) if is_drawn else building.NO_SHAPE,
+            file,
+            urdf.position,
+            urdf.orientation,
+            fixed_base=urdf.fixed_base,
+            flags=0,
         )
-        if is_drawn and body.visual.texture is not None:
-            self._set_texture(body_id, body.visual.texture)
 
-    def _create_shape(self, body: CreateBody) -> int:
+    def _create_body(self, command: CreateBody) -> None:
+        # Bullet would draw a collision shape where there is no visual shape.
+        shape = building.NO_SHAPE
+        if command.shape is not None:
+            shape = self._create_shape(command.shape, command)
+        body = building.create_body(
+            self._connection, command.position, visual_shape=shape
+        )
+        if command.visual.texture is not None and command.shape is not None:
+            self._set_texture(body, command.visual.texture)
+
+    def _create_shape(self, shape: Shape, body: CreateBody) -> int:
         handle, visual = self._connection.handle, body.visual
         command = capi.visual_init(handle)
-        match body.shape:
+        match shape:
             case Box(half_extents) if visual.texture is not None:
                 add_textured_box(handle, command, half_extents)
             case Box(half_extents):

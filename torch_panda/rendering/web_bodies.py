@@ -39,11 +39,9 @@ class WebBodies:
         self._tree.set_up_direction("+z")
         self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
-        bodies = iter(client.bodies)
         for command in client.blueprint:
             match command:
-                case LoadURDF():
-                    body = next(bodies)
+                case LoadURDF(body):
                     name = f"/body{body}"
                     node = self._tree.add_frame(name, show_axes=False)
                     _place(node, np.array((*command.position, *command.orientation)))
@@ -52,8 +50,7 @@ class WebBodies:
                     handles = self._add_urdf(name, command.file, movable)
                     if body == scene.robot:
                         self._joints = [handles[joint] for joint in movable]
-                case CreateBody():
-                    body = next(bodies)
+                case CreateBody(body):
                     node = self._add_shape(f"/body{body}", command)
                     if node is not None:
                         node.position = command.position
