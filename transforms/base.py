@@ -1,51 +1,76 @@
-"""What the two transforms have in common: arguments, and the buffer they belong to."""
+"""What all hindsight transforms have in common: arguments, memory, checks, saving."""
 
+import difflib
+import gc
 import inspect
 import threading
+import weakref
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl import envs
-from torchrl.data import ReplayBuffer, SliceSampler
-from torchrl.data.replay_buffers.sample_units import Sequence
+from torchrl.data import ReplayBuffer
 from typing_extensions import Self
 
-from torch_panda.transforms.data_checks import N_STEP, DataCheck
+from torch_panda.transforms.buffer import get_chain
+from torch_panda.transforms.data_checks import (
+    MULTI_STEP_ERROR,
+    DataCheck,
+    check_goals_agree,
+)
 from torch_panda.transforms.goal_memory import GoalMemory
-from torch_panda.transforms.rewrite import GoalFunction, Rewriter
-from torch_panda.transforms.strategies import DESIRED, Integers, Weighted, parse
+from torch_panda.transforms.rewrite import DONE, GoalFunction, Rewriter
+from torch_panda.transforms.strategies import (
+    DESIRED,
+    Integers,
+    Mixture,
+    StrategyOption,
+)
 
-SERIAL_KEY = "hindsight_serial"
+SERIAL_KEY = "hindsight_serial"  # serial numbers of stored transitions
+_NORMALISERS = (envs.ObservationNorm, envs.VecNorm, envs.VecNormV2)
 
 
 class BufferTransform(envs.Transform):
-    """A transform of a replay buffer that writes other goals into transitions.
+    """A transform of a replay buffer that gives transitions other goals.
 
     Args:
-        reward_fn: maps (achieved_goal, desired_goal), each (n, *goal), to the reward,
-            (n, 1), a row's by that row only. The first batches are compared with it.
-        strategy: a name, a function `(step, first, end, generator) -> goal step` (see
-            `strategies`), or a mapping of these to weights, divided by their sum.
-        success_fn: the same for the success, bool: also `success_key` is rewritten.
-        terminated_fn: the same for tasks that end on success: also ("next",
-            "terminated") and ("next", "done") are. What ended otherwise stays so.
-        goal_key: the desired goal, as `achieved_goal_key` also under "next".
-        achieved_goal_key, reward_key, success_key: the others.
-        trajectory_key: ids of trajectories; data without are [*environments, time].
-        single_env: takes 1-d data without ids for one environment's steps.
-        seed: seeds a generator of its own. By default torch's is used.
+        reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
+            (n, 1). Row i of the reward depends on row i of the goals only. The
+            rewards of the first batches are compared with it.
+        strategy: Name of a strategy, a function `(step, first, end, generator) -> goal
+            step` (see `strategies`), or a mapping of these to weights.
+        success_fn: Maps goals to the success, bool, (n, 1). With it, `success_key` is
+            rewritten.
+        terminated_fn: Maps goals to whether the episode terminates, for tasks that end
+            on success. With it, ("next", "terminated") and ("next", "done") are
+            rewritten. Failures and truncations stay as they were.
+        goal_key: Key of the desired goal, at the root and under "next".
+        achieved_goal_key: Key of the achieved goal, at the root and under "next".
+        reward_key: Key of the reward.
+        success_key: Key of the success.
+        trajectory_key: Key of the trajectory ids. Data without ids must be
+            [*environments, time].
+        single_env: Whether 1-d data without ids are successive steps of one
+            environment.
+        seed: Seed of the transform's own generator. By default torch's is used.
+
+    Raises:
+        TypeError: an argument is unknown.
+        ValueError: an argument has a value that is not accepted.
     """
 
-    requires_shared_write_state = True  # by all processes that share the buffer
+    # Processes that share the buffer would have to share this transform's memory.
+    requires_shared_write_state = True
     goal_parts: tuple[int, ...] | None = None
 
     def __init__(
         self,
         reward_fn: GoalFunction,
         *,
-        strategy: Weighted = "future",
+        strategy: StrategyOption = "future",
         success_fn: GoalFunction | None = None,
         terminated_fn: GoalFunction | None = None,
         goal_key: NestedKey = "desired_goal",
@@ -55,17 +80,25 @@ class BufferTransform(envs.Transform):
         trajectory_key: NestedKey = ("collector", "traj_ids"),
         single_env: bool = False,
         seed: int | None = None,
+        **unknown: Any,  # noqa: ANN401
     ) -> None:
         super().__init__()
+        for name, value in unknown.items():
+            raise TypeError(self._explain_unknown(name, value))
         if not callable(reward_fn):
-            raise ValueError(f"reward_fn must be a function, got {reward_fn!r}.")
+            raise ValueError(f"reward_fn must be a function, got {reward_fn!r}")
         self.strategy = strategy
-        self._weights = parse(strategy)
-        self.trajectory_key, self.single_env = trajectory_key, single_env
+        self._mixture = Mixture.parse(strategy)
+        self.trajectory_key = unravel_key(trajectory_key)
+        self.single_env = single_env
         keys = goal_key, achieved_goal_key, reward_key, success_key
         functions = reward_fn, success_fn, terminated_fn
         self._rewriter = Rewriter(*functions, *map(unravel_key, keys))
-        self._check_data = DataCheck(self._rewriter)
+        ignored = "action", "collector", "index", SERIAL_KEY, self.trajectory_key
+        warned: set[str] = set()
+        self._check_written = DataCheck(self._rewriter, ignored, warned)
+        # Transforms before this one in the buffer may add entries to what is sampled.
+        self._check_sampled = DataCheck(self._rewriter, ignored, warned)
         self._memory = GoalMemory()
         self._generator: torch.Generator | None = None
         if seed is not None:
@@ -74,14 +107,52 @@ class BufferTransform(envs.Transform):
         self._lock = threading.Lock()  # a prefetching buffer samples in threads
 
     @classmethod
-    def from_env(cls, env: envs.EnvBase, **options: Any) -> Self:  # noqa: ANN401
-        """Makes the transform that belongs to an environment, e.g. a `RobotTaskEnv`.
+    def _explain_unknown(cls, name: str, value: Any) -> str:  # noqa: ANN401
+        """Returns an error message for an unknown argument, with ours."""
+        accepted: list[str] = []
+        for base in cls.__mro__[: cls.__mro__.index(BufferTransform) + 1]:
+            names = inspect.signature(base).parameters
+            accepted += [x for x in names if x not in ("options", "unknown")]
+        translation = None
+        if name in ("k", "n_sampled_goal") and isinstance(value, int) and value > 0:
+            translation = f"her_ratio={value / (value + 1):.3g}"
+        elif name == "her_ratio" and isinstance(value, float) and 0 < value < 1:
+            translation = f"k={max(1, round(value / (1 - value)))}"
+        elif name == "goal_selection_strategy":
+            translation = f"strategy={str(getattr(value, 'value', value)).lower()!r}"
+        elif similar := difflib.get_close_matches(name, accepted, n=1):
+            translation = similar[0]
+        hint = f"use {translation}; " if translation else ""
+        return (
+            f"{cls.__name__} has no argument {name!r}; {hint}accepted are "
+            f"{', '.join(dict.fromkeys(accepted))}"
+        )
 
-        Its `compute_reward` and `is_success` become `reward_fn` and `success_fn`; the
-        latter also `terminated_fn` if it is `terminate_on_success`. What is neither an
-        option nor there is a ValueError. A `ParallelEnv` has one more worker made.
+    @classmethod
+    def from_env(cls, env: envs.EnvBase, **options: Any) -> Self:  # noqa: ANN401
+        """Makes the transform that belongs to an environment, such as a `RobotTaskEnv`.
+
+        The environment's `compute_reward` becomes `reward_fn`, and its `is_success`
+        becomes `success_fn`. If the environment is `terminate_on_success`, `is_success`
+        also becomes `terminated_fn`. A worker of a `ParallelEnv` or `SerialEnv` is made
+        for a moment to read these.
+
+        Args:
+            env: The environment. Its transforms may be left out.
+            **options: Arguments of the transform. They replace what the environment
+                has.
+
+        Raises:
+            TypeError: an option is unknown.
+            ValueError: the environment lacks a function that is not among the options,
+                or its transforms normalise a goal.
         """
+        goal_keys = {
+            unravel_key(options.get("goal_key", "desired_goal")),
+            unravel_key(options.get("achieved_goal_key", "achieved_goal")),
+        }
         while isinstance(env, envs.TransformedEnv):
+            _refuse_normalised_goals(env.transform, goal_keys)
             env = env.base_env
         if isinstance(env, (envs.ParallelEnv, envs.SerialEnv)):
             worker = env.create_env_fn[0](**env.create_env_kwargs[0])
@@ -89,69 +160,140 @@ class BufferTransform(envs.Transform):
                 return cls.from_env(worker, **options)
             finally:
                 worker.close(raise_if_closed=False)
-        names = {"reward_fn": "compute_reward", "success_fn": "is_success"}
-        names["terminated_fn"] = "terminate_on_success"
-        for option, name in names.items():
-            value = options.get(option, getattr(env, name, None))
-            if value is None and option not in options:
-                raise ValueError(f"{env} has no {name}: give {option}=.")
-            if isinstance(value, bool):  # whether success ends an episode
+        attributes = {
+            "reward_fn": "compute_reward",
+            "success_fn": "is_success",
+            "terminated_fn": "terminate_on_success",
+        }
+        for option, attribute in attributes.items():
+            if option in options:
+                continue
+            value = getattr(env, attribute, None)
+            if value is None:
+                raise ValueError(f"{env} has no {attribute}: give {option}=...")
+            if option == "terminated_fn":
                 value = env.is_success if value else None
             options[option] = value
-        return cls(**options)
+        transform = cls(**options)
+        shapes = {
+            key: spec.shape[env.ndim :]
+            for key, spec in env.observation_spec.items(True, True)
+        }
+        for check in (transform._check_written, transform._check_sampled):
+            check.shapes = shapes
+        return transform
 
-    def _note(self, batch: TensorDictBase, stored: int) -> TensorDictBase:
-        """Remembers transitions [*batch, time], and tags them with their serials."""
+    def _remember(self, batch: TensorDictBase, stored: int) -> TensorDictBase:
+        """Remembers transitions and tags them with their serial numbers.
+
+        Args:
+            batch: Transitions, [*environments, time].
+            stored: Number of earlier transitions that the buffer still holds.
+        """
         if not self._is_checked:
             self._check_first(batch)
             self._is_checked = True
-        self._check_data(batch)
-        keys, shape, flat = self._rewriter, batch.batch_size, batch
-        read = (*keys.goal_keys, ("next", "done"))
-        if batch.ndim > 1:  # as storages fill up, in order of time
-            flat = batch.select(self.trajectory_key, *read, strict=False)
+        rewriter, shape, flat = self._rewriter, batch.batch_size, batch
+        keys = (
+            rewriter.achieved_goal_key,
+            rewriter.next_achieved_key,
+            rewriter.goal_key,
+            rewriter.next_goal_key,
+            DONE,
+        )
+        if batch.ndim > 1:  # storages fill up in order of time
+            flat = batch.select(self.trajectory_key, *keys, strict=False)
             flat = flat.movedim(-1, 0).reshape(-1)
-        root, achieved, desired, done = (flat.get(key, None) for key in read)
-        if achieved is None or desired is None or done is None:
-            keys.check(batch)
+        root, achieved, desired, next_desired, done = (
+            flat.get(key, None) for key in keys
+        )
+        if achieved is None or desired is None or next_desired is None or done is None:
+            rewriter.check_entries(batch)  # raises
+        self._check_written(batch)
+        check_goals_agree(flat, rewriter)
         goals: Any = [achieved.numpy(force=True)]
-        if DESIRED in self._weights:
+        if DESIRED in self._mixture.weights:
             goals.append(desired.numpy(force=True))
-        root = None if root is None else root.numpy(force=True)
-        ends = done.numpy(force=True).reshape(-1)
-        serial = self._memory.write(self._ids(flat, shape), ends, root, goals, stored)
-        tag = torch.from_numpy(serial)
+        roots = None if root is None else root.numpy(force=True)
+        is_done = done.numpy(force=True).reshape(-1)
+        ids = self._get_ids(flat, shape)
+        serials = self._memory.write(ids, is_done, roots, goals, stored)
+        tags = torch.from_numpy(serials)
         if batch.ndim > 1:
-            tag = tag.view(shape[-1], *shape[:-1]).movedim(0, -1)
-        return batch.set(SERIAL_KEY, tag.to(desired.device))
+            tags = tags.view(shape[-1], *shape[:-1]).movedim(0, -1)
+        return batch.set(SERIAL_KEY, tags.to(desired.device))
+
+    def _claim(self, buffer: ReplayBuffer | None) -> None:
+        """Makes the buffer the only one whose transitions are remembered.
+
+        Raises:
+            RuntimeError: the transform belongs to another buffer.
+        """
+        if buffer is None:
+            return
+        owner = self._memory.buffer
+        if owner is not None and owner() is not buffer:
+            if owner() is not None:
+                gc.collect()  # a buffer and its storage refer to each other
+            if owner() is not None:
+                raise RuntimeError(
+                    f"this {type(self).__name__} already belongs to another replay "
+                    "buffer: make one transform for each buffer, or call empty() on "
+                    "the transform to forget the other buffer's transitions"
+                )
+            self._reset()
+        if owner is None or owner() is not buffer:
+            self._memory.buffer = weakref.ref(buffer)
+
+    def _find_mask(self, batch: TensorDictBase) -> torch.Tensor | None:
+        """Returns the mask that `split_trajectories` wrote, if it has padded rows.
+
+        The mask is beside the trajectory ids, true for real rows, of shape (*batch,).
+        """
+        key = self.trajectory_key
+        prefix = key[:-1] if isinstance(key, tuple) else ()
+        mask = batch.get(unravel_key((*prefix, "mask")), None)
+        if mask is None or mask.dtype != torch.bool or mask.shape != batch.shape:
+            return None
+        return None if mask.all() else mask
 
     def _check_first(self, batch: TensorDictBase) -> None:
-        """Refuses a chain of transforms, or data, that hindsight cannot be right in."""
-        if _has_multi_step(self):
-            raise RuntimeError(N_STEP)
-        self._rewriter.check(batch)
-        goals = [batch.get(key) for key in self._rewriter.goal_keys[1:]]
-        size, is_vector = goals[0].shape[-1], goals[0].ndim == batch.ndim + 1
+        """Refuses a chain of transforms, or data, for which hindsight cannot be right.
+
+        Raises:
+            RuntimeError: the chain has a `MultiStepTransform`.
+            KeyError: the data lack entries.
+            ValueError: the goals have a wrong type, or do not fit `goal_parts`.
+        """
+        if any(isinstance(t, envs.MultiStepTransform) for t in get_chain(self)):
+            raise RuntimeError(MULTI_STEP_ERROR)
+        self._rewriter.check_entries(batch)
+        achieved = batch.get(self._rewriter.next_achieved_key)
+        desired = batch.get(self._rewriter.goal_key)
+        is_vector, size = achieved.ndim == batch.ndim + 1, achieved.shape[-1]
         parts = self.goal_parts
         if parts is not None and not (is_vector and sum(parts) == size):
             raise ValueError(f"goal_parts must add up to a vector of {size}: {parts}")
-        if torch.bfloat16 in (goals[0].dtype, goals[1].dtype):
-            raise ValueError("hindsight cannot hold goals of bfloat16; float32 ones.")
+        if torch.bfloat16 in (achieved.dtype, desired.dtype):
+            raise ValueError("hindsight cannot hold goals of bfloat16: use float32")
 
-    def _ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
-        """Returns ids of trajectories, or numbers of environments, (n,)."""
+    def _get_ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
+        """Returns trajectory ids, or numbers of environments, (n,)."""
         key, ids = self.trajectory_key, flat.get(self.trajectory_key, None)
         if ids is None:
             if len(shape) < 2 and not self.single_env:
                 raise ValueError(
-                    f"whose are the rows? There are no ids at {key!r}: keep the "
-                    "collector's, name others (trajectory_key=), extend with [num_envs,"
-                    " time], or pass single_env=True for steps of one environment."
+                    f"the rows cannot be told apart, because there are no trajectory "
+                    f"ids at {key!r}: keep the collector's ids, name others "
+                    "(trajectory_key=...), extend with [num_envs, time], or pass "
+                    "single_env=True for steps of one environment"
                 )
             return np.arange(len(flat)) % shape[:-1].numel()
         if ids.numel() != len(flat):
-            got = f"got {tuple(ids.shape)} for {tuple(shape)}"
-            raise ValueError(f"{key!r} must hold one id a transition, {got}.")
+            raise ValueError(
+                f"{key!r} must hold one id per transition, got {tuple(ids.shape)} for "
+                f"{tuple(shape)}"
+            )
         return ids.numpy(force=True).reshape(-1)
 
     def __repr__(self) -> str:
@@ -160,45 +302,50 @@ class BufferTransform(envs.Transform):
         return f"{type(self).__name__}({', '.join(options)})"
 
     def end_trajectories(self) -> None:
-        """Ends all trajectories; what is written next begins new ones."""
+        """Ends all trajectories: the next row of each id begins another one."""
         with self._lock:
-            self._memory.open.clear()
+            self._memory.end_trajectories()
 
     def empty(self) -> None:
-        """Forgets all transitions; a buffer's own `empty` does not tell transforms."""
+        """Forgets all transitions and the buffer, which does not call this itself."""
         with self._lock:
-            self._memory, self._is_checked = GoalMemory(), False
+            self._reset()
+
+    def _reset(self) -> None:
+        self._memory, self._is_checked = GoalMemory(), False
 
     def empty_cache(self) -> None:
-        """Is called when the chain changes: n-step rewards are looked for again."""
+        """Makes the next `extend` check the chain again; called when it changes."""
         super().empty_cache()
         self._is_checked = False
 
     def share_memory_(self) -> None:
-        """Is called for a buffer that several processes write to: a RuntimeError."""
+        """Refuses to be shared. torchrl calls it for a buffer of several processes."""
         raise RuntimeError(
-            "hindsight has no share_memory_: do not give the buffer to a multi-process "
-            "collector (replay_buffer=), but extend it with what the collector yields."
+            "hindsight has no share_memory_, because its memory is of one process: "
+            "do not pass the buffer to a multi-process collector (replay_buffer=...), "
+            "but extend it with what the collector yields"
         )
 
     def set_container(self, container: envs.Transform | envs.EnvBase) -> None:
-        """Joins a buffer's chain of transforms; an environment's is a ValueError."""
+        """Joins a buffer's chain of transforms, and refuses an environment's."""
         if isinstance(container, envs.EnvBase) or container.parent is not None:
             self._call(None)
         super().set_container(container)
         self.empty_cache()
 
     def _call(self, next_tensordict: TensorDictBase | None) -> TensorDictBase:
-        raise ValueError("hindsight is for replay buffers, not for environments.")
+        raise ValueError("hindsight is for replay buffers, not for environments")
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the memory and the generator, for `state_dict` and `dumps`."""
         with self._lock:
-            rng = self._generator and self._generator.get_state()
-            return {"memory": self._memory.state(), "generator": rng}
+            generator = self._generator
+            random_state = None if generator is None else generator.get_state()
+            return {"memory": self._memory.state(), "generator": random_state}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Takes what `get_extra_state` returned."""
+        """Restores what `get_extra_state` returned."""
         with self._lock:
             self._memory.load(state["memory"])
             if state["generator"] is not None:
@@ -212,36 +359,18 @@ class BufferTransform(envs.Transform):
         super().__setstate__({**state, "_lock": threading.Lock()})
 
 
-def find_buffer() -> tuple[ReplayBuffer | None, str]:
-    """Returns the buffer that calls, if any, and its method; refuses `__setitem__`.
-
-    torchrl gives transforms no handle on their buffer, whose size, layout and sampler
-    decide what is right: so the functions that call are looked at (3 us).
-    """
-    frame = inspect.currentframe()
-    while frame is not None:
-        if frame.f_globals.get("__name__", "").startswith("torchrl.data."):
-            buffer = frame.f_locals.get("self")
-            if isinstance(buffer, ReplayBuffer):
-                method = frame.f_code.co_name
-                if method == "__setitem__":
-                    raise RuntimeError(
-                        "hindsight cannot follow rows that are replaced: use extend()."
-                    )
-                return buffer, method
-        frame = frame.f_back
-    return None, ""
-
-
-def samples_slices(buffer: ReplayBuffer | None) -> bool:
-    """Tells whether a buffer samples rows that follow each other in time."""
-    sampler, unit = getattr(buffer, "sampler", None), getattr(buffer, "_sample_unit", 0)
-    return isinstance(sampler, SliceSampler) or isinstance(unit, Sequence)
-
-
-def _has_multi_step(transform: Any) -> bool:  # noqa: ANN401 (a transform or None)
-    """Looks for a MultiStepTransform in the same chain, which may be nested."""
-    while transform is not None:
-        root, container = transform, transform.__dict__["_container"]
-        transform = container and container()
-    return any(isinstance(t, envs.MultiStepTransform) for t in root.modules())
+def _refuse_normalised_goals(
+    transform: envs.Transform, goal_keys: set[NestedKey]
+) -> None:
+    """Refuses an environment's transforms that normalise a goal in place."""
+    for module in transform.modules():
+        if isinstance(module, _NORMALISERS):
+            normalised = goal_keys & set(map(unravel_key, module.out_keys))
+            if normalised:
+                raise ValueError(
+                    f"{type(module).__name__} in the environment normalises "
+                    f"{', '.join(map(repr, sorted(normalised, key=str)))}, but the "
+                    "reward needs goals in their own units, not normalised: leave the "
+                    "goals out of its in_keys, and normalise them in the buffer, after "
+                    "this transform, or in the policy"
+                )

@@ -1,213 +1,295 @@
-"""The goals of the transitions that a buffer holds."""
+"""Goals of the transitions in a replay buffer, in the order of their trajectories."""
 
 import copy
+import weakref
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
+from torchrl.data import ReplayBuffer
 
-from torch_panda.transforms import strategies
-from torch_panda.transforms.strategies import Integers, Weights
+from torch_panda.transforms.strategies import (
+    DESIRED,
+    RANDOM,
+    Integers,
+    Mixture,
+    choose_steps,
+    draw_integers,
+)
 
 Goals = NDArray[Any]  # (n, *goal)
-_NEW = (-1, 0, b"")
+
+# Where a transition stands in its trajectory.
+_POSITION = np.dtype([("trajectory", np.int32), ("step", np.int32)])
+_TRAJECTORY = np.dtype(
+    [
+        ("first", np.int32),  # oldest step that the buffer still holds
+        ("end", np.int32),  # one more than the last step
+        ("offset", np.int32),  # step s has its goals at row `offset + s` of the goals
+        ("limit", np.int32),  # steps below this one fit into the region
+        ("region", np.int32),  # first row of the region of the goals
+    ]
+)
+_MIN_REGION = 16  # rows
 
 
 class GoalMemory:
-    """Finds the goal achieved at any stored step of a transition's trajectory.
+    """Remembers the goals of all stored transitions, and draws hindsight goals.
 
-    Transitions are numbered in the order of writing: their serials. A round-robin
-    buffer overwrites its oldest rows, so it holds the last serials, and with a
-    transition all that lies ahead of it. A ring holds their trajectories and steps. The
-    goals of one lie, in order of time, in a region of `_goals`; a full one is moved.
+    Serial numbers count the transitions in the order in which they are written. A
+    round-robin buffer overwrites its oldest rows first. It therefore holds the
+    transitions with the largest serial numbers, and with every transition also all
+    later steps of its trajectory.
 
-    A transition goes on with the trajectory of its id, unless that was done, or got to
-    another goal than this one begins with, if any ever begins where one before got to.
+    Three arrays lead from a serial number to goals:
+
+    - a ring has the trajectory and step of every remembered transition;
+    - a table has a row for every remembered trajectory, see `_TRAJECTORY`;
+    - `_goals` has a contiguous region for each trajectory, one row per step. A full
+      region is copied into one of twice the size.
+
+    A row extends the open trajectory with its id, unless that trajectory's last
+    achieved goal differs from the row's root goal: then a new collector reuses the id.
+    In some data, root goals never equal the goals achieved before them. They are
+    ignored until two of them are equal.
     """
 
     def __init__(self) -> None:
-        self.count = 0  # transitions so far: serial of the next one
-        self.freed = 0  # serial of the oldest transition that is remembered
-        # What may go on: id -> trajectory, its next step, and the goal it got to.
-        self.open: dict[int, tuple[int, int, bytes]] = {}
-        self._links = False  # whether one ever began with the goal before it
-        self._ring = np.zeros((0, 2), dtype=np.int32)  # their trajectories and steps
-        # Of trajectories: their first step, the end, where in `_goals` step 0 would be,
-        # up to which step there is room, and where in `_goals` their region begins.
-        self._table = np.zeros((64, 5), dtype=np.int32)
-        self._unused = [*range(64)]  # numbers of no trajectory that is remembered
-        # Achieved and, if kept, desired: (places, kinds, *goal).
+        self.buffer: weakref.ref[ReplayBuffer] | None = None  # whose rows these are
+        self.count = 0  # serial number of the next transition
+        self.oldest = 0  # serial number of the oldest remembered transition
+        # Open trajectories: id -> (number, next step, bytes of the last achieved goal).
+        self._open: dict[int, tuple[int, int, bytes]] = {}
+        self._roots_match = False  # whether a root goal ever equalled the goal before
+        self._ring = np.zeros(0, _POSITION)  # indexed by serial number, modulo its size
+        self._trajectories = np.zeros(64, _TRAJECTORY)  # indexed by trajectory number
+        self._free_numbers = [*range(64)]  # trajectory numbers that are not in use
+        # Achieved goals and, if they are needed, desired goals: (rows, 1 or 2, *goal).
         self._goals: Goals = np.zeros((0, 1), dtype=np.float32)
-        self._used = 0  # places that were ever part of a region
-        self._free_regions: dict[int, list[int]] = {}  # size -> where they begin
+        self._allocated = 0  # rows of `_goals` that belong to a region or a free region
+        self._free_regions: dict[int, list[int]] = {}  # size -> first rows
 
     def write(
         self,
         ids: Integers,
         done: NDArray[np.bool_],
-        root: Goals | None,
+        roots: Goals | None,
         goals: list[Goals],
         stored: int,
     ) -> Integers:
-        """Takes transitions that are about to be stored; returns their serials, (n,).
+        """Remembers transitions that are about to be stored.
 
         Args:
-            ids: of their trajectories, or environments, (n,).
-            done: whether these end, (n,).
-            root: goals that had been achieved before them, if known, (n, *goal).
-            goals: that they achieved and, to draw "desired" ones, were asked for.
-            stored: how many transitions before them are still stored.
+            ids: Ids of the trajectories, or numbers of the environments, (n,).
+            done: Whether the transition ends its trajectory, (n,).
+            roots: Achieved goals before the transitions, if the data have them.
+            goals: Achieved goals after the transitions and, if "desired" is among the
+                strategies, their desired goals.
+            stored: Number of earlier transitions that the buffer still holds.
+
+        Returns:
+            Serial numbers of the transitions, (n,).
         """
         if not self.count:
             shape = (0, len(goals), *goals[0].shape[1:])
             self._goals = np.zeros(shape, np.result_type(*goals))
         self._make_room(len(ids), stored)
-        serial = np.arange(self.count, self.count + len(ids))
-        trajectory, step = self._place(ids, done, root, goals[0])
-        row = serial % len(self._ring)
-        self._ring[row, 0], self._ring[row, 1] = trajectory, step
-        _, end, base, room, _ = self._table.T
-        end[trajectory] = step + 1  # of one's several steps the last one stays
-        for t in set(trajectory[step >= room.take(trajectory)].tolist()):
-            self._move(t)
-        place = base.take(trajectory) + step
-        for kind, values in enumerate(goals):
-            self._goals[place, kind] = values
+        serials = np.arange(self.count, self.count + len(ids))
+        numbers, steps = self._assign(ids, done, roots, goals[0])
+        slots = serials % len(self._ring)
+        self._ring["trajectory"][slots] = numbers
+        self._ring["step"][slots] = steps
+
+        self._trajectories["end"][numbers] = steps + 1  # the last of equal numbers wins
+        is_full = steps >= self._trajectories["limit"].take(numbers)
+        for number in set(numbers[is_full].tolist()):
+            self._enlarge(number)
+        rows = self._trajectories["offset"].take(numbers) + steps
+        for column, values in enumerate(goals):
+            self._goals[rows, column] = values
         self.count += len(ids)
-        return serial
+        return serials
 
-    def _place(
-        self, ids: Integers, done: Goals, root: Goals | None, achieved: Goals
-    ) -> Integers:
-        """Returns the trajectories and steps of transitions, (2, n)."""
-        before = [b""] * len(ids) if root is None else _as_bytes(root)
-        after = before if root is None else _as_bytes(achieved)
-        trajectories, steps = [], []
-        rows = zip(ids.tolist(), done.tolist(), before, after, strict=True)
-        for i, ends, b, a in rows:
-            t, s, goal = self.open.pop(i, _NEW)
-            self._links = self._links or goal == b != b""
-            if t < 0 or (self._links and goal != b):
-                t, s = self._begin(), 0
-            if not ends:
-                self.open[i] = t, s + 1, a
-            trajectories.append(t)
-            steps.append(s)
-        return np.array([trajectories, steps], dtype=np.int32)
+    def _assign(
+        self,
+        ids: Integers,
+        done: NDArray[np.bool_],
+        roots: Goals | None,
+        achieved: Goals,
+    ) -> tuple[Integers, Integers]:
+        """Returns trajectory numbers and steps of new transitions, (n,) each."""
+        root_bytes = [b""] * len(ids) if roots is None else _to_bytes(roots)
+        achieved_bytes = root_bytes if roots is None else _to_bytes(achieved)
+        numbers, steps = [], []
+        transitions = zip(
+            ids.tolist(), done.tolist(), root_bytes, achieved_bytes, strict=True
+        )
+        for trajectory_id, is_done, root, goal in transitions:
+            number, step, last_goal = self._open.pop(trajectory_id, (-1, 0, b""))
+            if root == last_goal != b"":
+                self._roots_match = True
+            if number < 0 or (self._roots_match and root != last_goal):
+                number, step = self._new_number(), 0
+            if not is_done:
+                self._open[trajectory_id] = number, step + 1, goal
+            numbers.append(number)
+            steps.append(step)
+        return np.array(numbers, dtype=np.int32), np.array(steps, dtype=np.int32)
 
-    def _begin(self) -> int:
-        """Returns the number of a new trajectory."""
-        if not self._unused:
-            number = len(self._table)
-            self._table = _grow(self._table, 2 * number)
-            self._unused = [*range(number, len(self._table))]
-        return self._unused.pop()
+    def _new_number(self) -> int:
+        """Returns a trajectory number that is not in use."""
+        if not self._free_numbers:
+            size = len(self._trajectories)
+            self._trajectories = _grow(self._trajectories, 2 * size)
+            self._free_numbers = [*range(size, len(self._trajectories))]
+        return self._free_numbers.pop()
 
-    def _move(self, trajectory: int) -> None:
-        """Moves a trajectory to where its steps fit, and some more."""
-        first, end, base, room, _ = self._table[trajectory].tolist()
-        goals = self._goals[base + first : base + room].copy()
-        self._release(trajectory)
-        size = 1 << max(15, 9 * (end - first) // 8).bit_length()
+    def _enlarge(self, number: int) -> None:
+        """Copies a trajectory's goals into a region in which its steps fit."""
+        first, end, offset, limit, _ = self._trajectories[number].tolist()
+        goals = self._goals[offset + first : offset + limit].copy()
+        self._free_region(number)
+        size = 1 << max(_MIN_REGION - 1, 9 * (end - first) // 8).bit_length()
         free = self._free_regions.setdefault(size, [])
         if not free:
-            free.append(self._used)
-            self._used += size
-            self._goals = _grow(self._goals, self._used)
-        start = free.pop()
-        self._goals[start : start + len(goals)] = goals
-        self._table[trajectory, 2:] = start - first, first + size, start
+            free.append(self._allocated)
+            self._allocated += size
+            self._goals = _grow(self._goals, self._allocated)
+        region = free.pop()
+        self._goals[region : region + len(goals)] = goals
+        self._trajectories[number] = first, end, region - first, first + size, region
 
-    def _release(self, trajectory: int) -> None:
-        """Lets the region of a trajectory, if it has one, be used again."""
-        base, room, start = self._table[trajectory, 2:].tolist()
-        if room:
-            self._free_regions[base + room - start].append(start)
+    def _free_region(self, number: int) -> None:
+        """Frees the region of a trajectory, if it has one."""
+        _, _, offset, limit, region = self._trajectories[number].tolist()
+        if limit:
+            self._free_regions[offset + limit - region].append(region)
 
-    def _make_room(self, number: int, stored: int) -> None:
-        """Makes the ring hold more transitions, and a few, so that freeing is rare."""
-        rows, end = len(self._ring), self.count + number
-        if end - self.freed <= rows:
+    def _make_room(self, n: int, stored: int) -> None:
+        """Makes room in the ring for n transitions, and for some more."""
+        size, end = len(self._ring), self.count + n
+        if end - self.oldest <= size:
             return
-        self.free(self.count - stored)
-        serial = np.arange(self.freed, self.count)
-        if (needed := end - self.freed + rows // 64) > rows:
-            placed = self.find(serial)
+        self.forget(self.count - stored)
+        needed = end - self.oldest + size // 64  # so that the ring is rarely full
+        if needed > size:
+            serials = np.arange(self.oldest, self.count)
+            positions = self._ring.take(serials % size)
             self._ring = _grow(self._ring, needed)
-            self._ring[serial % len(self._ring)] = placed.T
+            self._ring[serials % len(self._ring)] = positions
 
-    def free(self, floor: int) -> None:
-        """Forgets the transitions below a serial: they have been overwritten."""
-        if floor <= self.freed:
+    def forget(self, oldest: int) -> None:
+        """Forgets the transitions before serial number `oldest`: the buffer has."""
+        if oldest <= self.oldest:
             return
-        trajectory, step = self.find(np.arange(self.freed, floor))
-        first, end = self._table.T[:2]
-        first[trajectory] = step + 1
-        gone = set(trajectory[first[trajectory] == end[trajectory]].tolist())
-        for t in gone:
-            self._release(t)
-            self._table[t] = 0
-        self._unused += gone
-        self.open = {i: known for i, known in self.open.items() if known[0] not in gone}
-        self.freed = floor
+        numbers, steps = self.find(np.arange(self.oldest, oldest))
+        first, end = self._trajectories["first"], self._trajectories["end"]
+        first[numbers] = steps + 1
+        forgotten = set(numbers[first[numbers] == end[numbers]].tolist())
+        for number in forgotten:
+            self._free_region(number)
+            self._trajectories[number] = 0
+        self._free_numbers += forgotten
+        self._open = {
+            trajectory_id: trajectory
+            for trajectory_id, trajectory in self._open.items()
+            if trajectory[0] not in forgotten
+        }
+        self.oldest = oldest
 
-    def find(self, serial: Integers) -> Integers:
-        """Returns trajectories and steps of transitions, (2, n)."""
-        return self._ring.take(serial % len(self._ring), axis=0).T
+    def find(self, serials: Integers) -> tuple[Integers, Integers]:
+        """Returns trajectory numbers and steps of transitions, (n,) each."""
+        positions = self._ring.take(serials % len(self._ring))
+        return positions["trajectory"], positions["step"]
 
-    def is_open(self, serial: Integers) -> Any:  # noqa: ANN401 (booleans)
-        """Tells which transitions' trajectories may go on, (n,)."""
-        return np.isin(self.find(serial)[0], [t for t, _, _ in self.open.values()])
+    def is_open(self, serials: Integers) -> NDArray[np.bool_]:
+        """Returns whether the transitions' trajectories may still go on, (n,)."""
+        open_numbers = [number for number, _, _ in self._open.values()]
+        return np.isin(self.find(serials)[0], open_numbers)
 
-    def draw(self, serial: Integers, weights: Weights, rng: Generator | None) -> Goals:
-        """Draws a goal for each serial, (n,), by strategies: (n, *goal)."""
-        if len(weights) > 1:
-            limits = np.cumsum([*weights.values()])[:-1]
-            u = strategies.draw_uniform(len(serial), rng)
-            which = limits.searchsorted(u, side="right")
-            goals = np.empty((len(serial), *self._goals.shape[2:]), self._goals.dtype)
-            for number, strategy in enumerate(weights):
-                rows = (which == number).nonzero()[0]
-                goals[rows] = self.draw(serial[rows], {strategy: 1.0}, rng)
-            return goals
-        (strategy,) = weights
-        of_any = strategy in (strategies.RANDOM, strategies.DESIRED)
-        if of_any:
-            end = np.full(len(serial), self.count)
-            serial = strategies.draw_integers(self.freed, end, rng)
-        trajectory, step = self.find(serial)
-        first, end, base, _, _ = self._table.take(trajectory, axis=0).T
-        if not of_any:
-            step = strategies.choose_steps(strategy, step, first, end, rng)
-        kind = int(strategy == strategies.DESIRED)
-        return self._goals[:, kind].take(base + step, axis=0)
+    def end_trajectories(self) -> None:
+        """Ends all trajectories: the next row of each id begins another one."""
+        self._open.clear()
+
+    def draw(
+        self, serials: Integers, mixture: Mixture, generator: Generator | None
+    ) -> Goals:
+        """Draws a goal for each transition, (n,), by a mixture: (n, *goal)."""
+        goals = np.empty((len(serials), *self._goals.shape[2:]), self._goals.dtype)
+        for strategy, rows in mixture.split(len(serials), generator):
+            own = serials[rows]
+            if strategy in (RANDOM, DESIRED):
+                end = np.full(len(own), self.count)
+                own = draw_integers(self.oldest, end, generator)
+            numbers, steps = self.find(own)
+            trajectories = self._trajectories.take(numbers)
+            if strategy not in (RANDOM, DESIRED):
+                first, end = trajectories["first"], trajectories["end"]
+                steps = choose_steps(strategy, steps, first, end, generator)
+            column = int(strategy == DESIRED)
+            goals[rows] = self._goals[:, column].take(
+                trajectories["offset"] + steps, axis=0
+            )
+        return goals
 
     def state(self) -> dict[str, Any]:
-        """Returns a copy of everything, as tensors, numbers, strings and containers."""
-        own, array = vars(self).items(), np.ndarray
-        state = {k: torch.from_numpy(v) if isinstance(v, array) else v for k, v in own}
-        state["open"] = {i: (t, s, goal.hex()) for i, (t, s, goal) in self.open.items()}
-        return copy.deepcopy(state)
+        """Returns a copy of all contents, as tensors, numbers, strings, containers."""
+        ring = self._ring.view(np.int32).reshape(-1, 2)
+        table = self._trajectories.view(np.int32).reshape(-1, 5)
+        return {
+            "count": self.count,
+            "freed": self.oldest,
+            "open": {
+                trajectory_id: (number, step, goal.hex())
+                for trajectory_id, (number, step, goal) in self._open.items()
+            },
+            "_links": self._roots_match,
+            "_ring": torch.from_numpy(ring.copy()),
+            "_table": torch.from_numpy(table.copy()),
+            "_unused": self._free_numbers.copy(),
+            "_goals": torch.from_numpy(self._goals.copy()),
+            "_used": self._allocated,
+            "_free_regions": copy.deepcopy(self._free_regions),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Takes the state that another memory returned."""
-        for name, value in copy.deepcopy(state).items():
-            setattr(self, name, value.numpy() if isinstance(value, Tensor) else value)
-        known = state["open"] if self._links else {}  # else used again, ids might not
-        self.open = {i: (t, s, bytes.fromhex(g)) for i, (t, s, g) in known.items()}
+        """Takes a copy of what another memory's `state` returned."""
+
+        def to_array(tensor: Tensor) -> NDArray[Any]:
+            return tensor.numpy(force=True).copy()
+
+        self.count, self.oldest = state["count"], state["freed"]
+        self._roots_match = state["_links"]
+        # Root goals tell whether the next rows are of the same collector. Without
+        # them, a new collector may reuse the ids, so that no trajectory may go on.
+        self._open = {
+            trajectory_id: (number, step, bytes.fromhex(goal))
+            for trajectory_id, (number, step, goal) in state["open"].items()
+            if self._roots_match
+        }
+        self._ring = to_array(state["_ring"]).view(_POSITION).ravel()
+        self._trajectories = to_array(state["_table"]).view(_TRAJECTORY).ravel()
+        self._free_numbers = [*state["_unused"]]
+        self._goals, self._allocated = to_array(state["_goals"]), state["_used"]
+        self._free_regions = copy.deepcopy(state["_free_regions"])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "buffer": None}  # a weak reference cannot be pickled
 
 
-def _as_bytes(goals: Goals) -> list[bytes]:
-    """Returns each of the goals, (n, *goal), as bytes, which are fast to compare."""
+def _to_bytes(goals: Goals) -> list[bytes]:
+    """Returns each goal of (n, *goal) as bytes, which are fast to compare."""
     flat = np.ascontiguousarray(goals).reshape(len(goals), -1)
     return flat.view(f"V{flat[0].nbytes}").ravel().tolist()
 
 
 def _grow(array: NDArray[Any], size: int) -> NDArray[Any]:
-    """Returns an array with zeros appended, `size` rows long or a bit longer."""
-    if (length := len(array)) >= size:
+    """Returns the array with zeros appended, so that it has at least `size` rows."""
+    length = len(array)
+    if length >= size:
         return array
-    more = max(size, length + length // 32, 256) - length
-    return np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)])
+    new_length = max(size, length + length // 32, 256)
+    zeros = np.zeros((new_length - length, *array.shape[1:]), array.dtype)
+    return np.concatenate([array, zeros])

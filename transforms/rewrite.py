@@ -1,4 +1,4 @@
-"""Writing another goal into transitions, and what follows from it."""
+"""Writes other goals into transitions, with the rewards and ends that follow."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,14 +7,28 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-_DONE, _TERMINATED = ("next", "done"), ("next", "terminated")
+DONE, TERMINATED, TRUNCATED = (
+    ("next", name) for name in ("done", "terminated", "truncated")
+)
 
+# Maps (achieved_goal, desired_goal), (n, *goal) each, to values (n, 1).
 GoalFunction = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass
 class Rewriter:
-    """Gives transitions another goal, reward and, if told how, success and end."""
+    """Gives transitions another goal, and the reward, success and ends that follow.
+
+    Attributes:
+        reward_fn: Reward of a transition.
+        success_fn: Success of a transition, or None: success stays as stored.
+        terminated_fn: Whether a transition terminates its episode because its goal is
+            reached, or None: ends stay as stored.
+        goal_key: Key of the desired goal, at the root and under "next".
+        achieved_goal_key: Key of the achieved goal, at the root and under "next".
+        reward_key: Key of the reward.
+        success_key: Key of the success.
+    """
 
     reward_fn: GoalFunction
     success_fn: GoalFunction | None
@@ -25,66 +39,114 @@ class Rewriter:
     success_key: NestedKey
 
     def __post_init__(self) -> None:
-        """Works out the keys under "next"."""
+        """Derives the keys under "next"."""
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
-        # Achieved before and by a transition, and desired; the first may be missing.
-        self.goal_keys = self.achieved_goal_key, self.next_achieved_key, self.goal_key
-        self._needed = [*self.goal_keys[1:], self.next_goal_key, self.reward_key, _DONE]
-        self._needed += [self.success_key] if self.success_fn else []
-        self._needed += [_TERMINATED] if self.terminated_fn else []
 
-    def check(self, batch: TensorDictBase) -> None:
-        """Raises a KeyError that names the entries that are missing in the batch."""
-        missing = [key for key in self._needed if batch.get(key, None) is None]
+    def check_entries(self, batch: TensorDictBase) -> None:
+        """Checks that the batch has all entries that are read or rewritten.
+
+        Raises:
+            KeyError: entries are missing.
+        """
+        needed = [self.next_achieved_key, self.goal_key, self.next_goal_key]
+        needed += [self.reward_key, DONE]
+        needed += [self.success_key] if self.success_fn else []
+        needed += [TERMINATED] if self.terminated_fn else []
+        missing = [key for key in needed if batch.get(key, None) is None]
         if missing:
-            found = sorted(map(str, batch.keys(True, True)))
-            raise KeyError(f"hindsight needs {missing} in the data; found {found}.")
+            entries = sorted(map(str, batch.keys(True, True)))
+            raise KeyError(
+                f"hindsight needs {missing} in the data, which has {entries}"
+            )
 
     def rewrite(
-        self, batch: TensorDictBase, rows: Tensor, goals: Tensor, *, is_own: bool
+        self, batch: TensorDictBase, rows: Tensor, goals: Tensor, *, inplace: bool
     ) -> TensorDictBase:
-        """Gives rows, (n,), of the flattened batch other goals, (n, *goal).
+        """Gives some rows of a batch other goals.
 
-        Written to is the batch, if it `is_own`: flat, and made for us; else a copy.
+        Args:
+            batch: Transitions, of any batch shape.
+            rows: Indices into the flattened batch, (n,).
+            goals: Their new goals, (n, *goal).
+            inplace: Whether to write into `batch`, which must be one-dimensional,
+                instead of a copy.
         """
-        flat = batch if is_own else batch.reshape(-1).to_tensordict()
-        achieved = flat.get(self.next_achieved_key).index_select(0, rows)
-        old_goals = flat.get(self.goal_key)
-        goals = goals.to(old_goals.dtype)
-        reward = evaluate(self.reward_fn, achieved, goals, flat.get(self.reward_key))
-        new = {self.goal_key: goals, self.next_goal_key: goals, self.reward_key: reward}
-        if self.success_fn is not None:
-            success = flat.get(self.success_key)
-            new[self.success_key] = evaluate(self.success_fn, achieved, goals, success)
-        if self.terminated_fn is not None:
-            done, terminated = flat.get(_DONE), flat.get(_TERMINATED)
-            # torchrl's trainers call every row truncated: `done` says which were.
-            truncated = flat.get(("next", "truncated"), ~terminated) & done
-            stays = terminated.index_select(0, rows)
-            if stays.any():  # unless the old goal is why it ended: a failure, say
-                old = old_goals.index_select(0, rows)
-                stays &= ~evaluate(self.terminated_fn, achieved, old, terminated)
-            stays |= evaluate(self.terminated_fn, achieved, goals, terminated)
-            new[_TERMINATED] = stays
-            new[_DONE] = stays | truncated.index_select(0, rows)
-        for key, values in new.items():
-            flat.get(key).index_copy_(0, rows, values)
+        flat = batch if inplace else batch.reshape(-1).to_tensordict()
+        goals = goals.to(flat.get(self.goal_key).dtype)
+        values = self.evaluate(flat, rows, goals)
+        values |= {self.goal_key: goals, self.next_goal_key: goals}
+        for key, new in values.items():
+            flat.get(key).index_copy_(0, rows, new)
         return flat.reshape(batch.shape)
 
+    def evaluate(
+        self, batch: TensorDictBase, rows: Tensor, goals: Tensor
+    ) -> dict[NestedKey, Tensor]:
+        """Returns the entries of some rows that follow from other goals.
 
-def evaluate(
-    function: GoalFunction, achieved: Tensor, desired: Tensor, old: Tensor
+        Args:
+            batch: Transitions, (m,).
+            rows: Indices into the batch, (n,).
+            goals: Goals of these rows, (n, *goal).
+
+        Returns:
+            Reward and, if the functions for them are known, success and ends: (n, 1).
+        """
+        achieved = batch.get(self.next_achieved_key).index_select(0, rows)
+        stored_reward = batch.get(self.reward_key)
+        reward = call_goal_function(self.reward_fn, achieved, goals, stored_reward)
+        values = {self.reward_key: reward}
+        if self.success_fn is not None:
+            success = batch.get(self.success_key)
+            values[self.success_key] = call_goal_function(
+                self.success_fn, achieved, goals, success
+            )
+        if self.terminated_fn is not None:
+            done, terminated = batch.get(DONE), batch.get(TERMINATED)
+            # torchrl's trainers mark every row as truncated; `done` has the real ends.
+            truncated = batch.get(TRUNCATED, ~terminated) & done
+
+            def reaches(desired: Tensor) -> Tensor:
+                assert self.terminated_fn is not None
+                return call_goal_function(
+                    self.terminated_fn, achieved, desired, terminated
+                )
+
+            # An episode that terminated, but not by reaching its goal, failed. Its
+            # end does not depend on the goal.
+            has_failed = terminated.index_select(0, rows)
+            if has_failed.any():
+                stored_goals = batch.get(self.goal_key).index_select(0, rows)
+                has_failed &= ~reaches(stored_goals)
+            values[TERMINATED] = has_failed | reaches(goals)
+            values[DONE] = values[TERMINATED] | truncated.index_select(0, rows)
+        return values
+
+
+def call_goal_function(
+    function: GoalFunction, achieved: Tensor, desired: Tensor, stored: Tensor
 ) -> Tensor:
-    """Returns what a function gives for goals, (n, *goal) each, in the old type."""
-    with torch.no_grad():  # it may be learned
+    """Calls a goal function and returns its values in the type of the stored entry.
+
+    Args:
+        function: `reward_fn`, `success_fn` or `terminated_fn`.
+        achieved: Achieved goals, (n, *goal).
+        desired: Desired goals, (n, *goal).
+        stored: The entry that the values belong to, (m, 1).
+
+    Raises:
+        ValueError: the function did not return a tensor (n, 1).
+    """
+    with torch.no_grad():  # the function may be a learned network
         values = function(achieved, desired)
-    expected = (len(achieved), *old.shape[1:])
+    expected_shape = (len(achieved), *stored.shape[1:])
     is_tensor = isinstance(values, Tensor)
-    got = tuple(values.shape) if is_tensor else type(values).__name__
-    if got != expected:
+    result = tuple(values.shape) if is_tensor else type(values).__name__
+    if result != expected_shape:
         raise ValueError(
-            "reward_fn, success_fn and terminated_fn map (achieved_goal, desired_goal),"
-            f" (n, *goal) each, to a tensor: {function} to {expected}, got {got}."
+            "reward_fn, success_fn and terminated_fn must map (achieved_goal, "
+            f"desired_goal), (n, *goal) each, to a tensor: {function} to "
+            f"{expected_shape}, got {result}"
         )
-    return values.to(old.dtype)
+    return values.to(stored.dtype)

@@ -1,11 +1,13 @@
-"""Goal strategies: which goal a transition is relabelled with.
+"""Goal strategies: the step whose goal a relabelled transition gets.
 
-One that follows the transition's trajectory chooses a step of it: `step`, (n,), is its
-own; stored are those from `first` up to and without `end`, counted from the oldest
-known. All but "desired" are those of Andrychowicz et al. 2017, section 4.5.
+The stored steps of a trajectory are numbered from `first` to `end - 1`. A strategy that
+stays within the trajectory chooses one of these steps for a transition of step `step`.
+Strategies "future", "final", "episode" and "random" are those of Andrychowicz et al.
+2017 (arXiv 1707.01495), section 4.5.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,64 +16,129 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 Integers = NDArray[np.integer[Any]]
-# A user's own: (step, first, end, generator) -> goal step, int32 tensors on the CPU.
-Strategy = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
-Weights = dict[str | Strategy, float]
-Weighted = str | Strategy | Mapping[Any, float]  # as users give them
+Rows = slice | Integers
+# A user's function: (step, first, end, generator) -> goal step, int32 tensors (n,) on
+# the CPU. Its steps count from the oldest stored step of the trajectory.
+StrategyFunction = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
+Strategy = str | StrategyFunction
+StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
-RANDOM, DESIRED = "random", "desired"  # of any stored transition
-LOOKING_AHEAD = ("future", "final")  # what follows a stored transition is stored too
+RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
+# A stored transition's later steps are stored too, so these never need older steps.
+LOOKING_AHEAD = ("future", "final")
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
-def parse(strategy: Weighted) -> Weights:
-    """Returns strategies and weights that add up to 1; a ValueError if it cannot."""
-    weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
-    for name in weights or [strategy]:
-        if not callable(name) and name not in NAMES:
-            known = f"one of {[*NAMES]}, a callable, or a mapping of these to weights"
-            raise ValueError(f"strategy must be {known}, got {name!r}.")
-    if not all(weight > 0 and np.isfinite(weight) for weight in weights.values()):
-        raise ValueError(f"strategy must have positive weights, got {strategy!r}.")
-    total = sum(weights.values())
-    return {name: weight / total for name, weight in weights.items()}
+@dataclass(frozen=True)
+class Mixture:
+    """Strategies with the probability of each.
+
+    Attributes:
+        weights: Probability of each strategy. They add up to 1.
+    """
+
+    weights: Mapping[Strategy, float]
+
+    @classmethod
+    def parse(cls, strategy: StrategyOption) -> "Mixture":
+        """Makes the mixture of a strategy, or of a mapping of strategies to weights.
+
+        Raises:
+            ValueError: a strategy is unknown, or a weight is not positive and finite.
+        """
+        weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
+        for name in weights or [strategy]:
+            if not callable(name) and name not in NAMES:
+                raise ValueError(
+                    f"strategy must be one of {[*NAMES]}, a callable, or a mapping of "
+                    f"these to weights, got {name!r}"
+                )
+        if not all(weight > 0 and np.isfinite(weight) for weight in weights.values()):
+            raise ValueError(
+                f"strategy must have positive, finite weights, got {strategy!r}"
+            )
+        total = sum(weights.values())
+        return cls({name: weight / total for name, weight in weights.items()})
+
+    @property
+    def only_looks_ahead(self) -> bool:
+        """Whether every strategy draws this step or a later one of the trajectory."""
+        return all(strategy in LOOKING_AHEAD for strategy in self.weights)
+
+    def split(
+        self, n: int, generator: Generator | None
+    ) -> Iterator[tuple[Strategy, Rows]]:
+        """Draws a strategy for each of n rows; yields strategies and their rows."""
+        if len(self.weights) == 1:
+            yield from ((strategy, slice(None)) for strategy in self.weights)
+            return
+        upper_limits = np.cumsum([*self.weights.values()])[:-1]
+        u = draw_uniform(n, generator)
+        choices = upper_limits.searchsorted(u, side="right")
+        for number, strategy in enumerate(self.weights):
+            yield strategy, (choices == number).nonzero()[0]
 
 
-def draw_uniform(number: int, generator: Generator | None) -> NDArray[np.float64]:
-    """Draws random numbers from 0 to 1, (number,), with a generator of the CPU's."""
-    u = torch.rand(number, generator=generator, dtype=torch.float64, device="cpu")
+def draw_uniform(n: int, generator: Generator | None) -> NDArray[np.float64]:
+    """Draws n numbers from [0, 1) with a generator of the CPU, torch's if None."""
+    u = torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")
     return u.numpy()
 
 
 def draw_integers(
     low: Integers | int, end: Integers, generator: Generator | None
 ) -> Integers:
-    """Draws integers from low up to and without end, (n,)."""
+    """Draws integers from `low` to `end - 1`, (n,)."""
     u = draw_uniform(len(end), generator)
     return low + (u * (end - low)).astype(np.int64)
 
 
 def choose_steps(
-    strategy: str | Strategy,
+    strategy: Strategy,
     step: Integers,
     first: Integers,
     end: Integers,
     generator: Generator | None,
 ) -> Integers:
-    """Chooses steps, (n,), for transitions of steps `step` from `first` up to `end`."""
+    """Chooses a step of its own trajectory for each transition.
+
+    Args:
+        strategy: "future", "final", "episode", or a user's function.
+        step: Steps of the transitions, (n,).
+        first: Oldest stored step of each transition's trajectory, (n,).
+        end: One more than the last stored step of each trajectory, (n,).
+        generator: Generator of the random draws, torch's if None.
+
+    Raises:
+        ValueError: a user's function did not return stored steps.
+    """
     if strategy == "final":
         return end - 1
-    if isinstance(strategy, str):
-        return draw_integers(step if strategy == "future" else first, end, generator)
-    numbers = (step - first, 0 * step, end - first)
-    s, f, e = (torch.from_numpy(x.astype(np.int32)) for x in numbers)
-    chosen = strategy(s, f, e, generator)
-    is_right = isinstance(chosen, Tensor) and chosen.shape == s.shape
-    if is_right and not chosen.is_floating_point():
-        steps: Integers = chosen.numpy(force=True)
-        if ((steps >= 0) & (steps < end - first)).all():
-            return first + steps
+    if strategy == "future":
+        return draw_integers(step, end, generator)
+    if strategy == "episode":
+        return draw_integers(first, end, generator)
+    assert callable(strategy)
+    return first + _call(strategy, step - first, end - first, generator)
+
+
+def _call(
+    function: StrategyFunction,
+    step: Integers,
+    end: Integers,
+    generator: Generator | None,
+) -> Integers:
+    """Calls a user's strategy, for trajectories whose oldest stored step is step 0."""
+    steps, firsts, ends = (
+        torch.from_numpy(numbers.astype(np.int32)) for numbers in (step, 0 * step, end)
+    )
+    chosen = function(steps, firsts, ends, generator)
+    is_integer = isinstance(chosen, Tensor) and not chosen.is_floating_point()
+    if is_integer and chosen.shape == steps.shape:
+        goal_steps: Integers = chosen.numpy(force=True)
+        if ((goal_steps >= 0) & (goal_steps < end)).all():
+            return goal_steps
     raise ValueError(
-        f"the strategy must return a tensor of integer steps {tuple(s.shape)}, from "
-        f"first up to end, got {chosen!r}."
+        f"the strategy must return a tensor of integer steps {tuple(steps.shape)}, "
+        f"from first up to end, got {chosen!r}"
     )

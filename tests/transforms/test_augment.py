@@ -62,7 +62,7 @@ def test_what_is_held_back_takes_the_room_of_open_episodes():
     rb, envs = make_buffer(k=1), Envs(4, [30])
     for _ in range(200):
         rb.extend(envs.chunk(1))
-        pieces = rb.transform[0]._held
+        pieces = rb.transform[0]._unfinished
         assert sum(map(len, pieces)) == 4 * int(envs.step[0])
         size = sum(x["next", "reward"].untyped_storage().nbytes() for x in pieces)
         assert size <= 2 * 4 * 30 * 4

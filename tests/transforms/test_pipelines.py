@@ -109,6 +109,27 @@ def test_from_env_of_another_environment_raises(hindsight):
     hindsight.from_env(toy.make_env(), **options, terminated_fn=None)
 
 
+@pytest.mark.parametrize(
+    ("hindsight", "options", "message"),
+    [
+        (HindsightRelabel, {"k": 4}, "use her_ratio=0.8; accepted are reward_fn"),
+        (HindsightRelabel, {"n_sampled_goal": 1}, "use her_ratio=0.5"),
+        (HindsightRelabel, {"goal_selection_strategy": "final"}, "strategy='final'"),
+        (HindsightRelabel, {"stategy": "final"}, "use strategy; .*goal_parts"),
+        (HindsightAugment, {"her_ratio": 0.8}, "use k=4; .*, trajectory_key"),
+        (HindsightAugment, {"xyz": 0}, "no argument 'xyz'; accepted are reward_fn, k"),
+    ],
+)
+def test_unknown_arguments_are_translated(hindsight, options, message):
+    env = make("PandaReach-v1", None)
+    for make_transform in (
+        lambda: hindsight(reward_fn, **options),
+        lambda: hindsight.from_env(env, **options),
+    ):
+        with pytest.raises(TypeError, match=message):
+            make_transform()
+
+
 def test_augment_rewrites_success_too():
     env = make("PandaReach-v3")
     rb = buffer(HindsightAugment.from_env(env, k=2))
@@ -161,6 +182,7 @@ def test_copies_that_are_less_precise_are_refused():
     for key in ("desired_goal", "achieved_goal"):
         for entry in (data, data["next"]):
             entry[key] = entry[key].double() + torch.rand(40, 3, dtype=torch.float64)
+    data["next", "desired_goal"] = data["desired_goal"].clone()
     data["policy_input"] = torch.cat([torch.rand(40, 4), data["desired_goal"]], 1)
     goals = data["next", "achieved_goal"], data["desired_goal"]
     data["next", "reward"] = reward_fn(*goals).float()
@@ -241,7 +263,7 @@ def test_goals_normalised_in_the_environment_warn():
         make("PandaReach-v1", 8),
         ObservationNorm(0.0, 5.0, in_keys=["achieved_goal", "desired_goal"]),
     )
-    rb = buffer(HindsightRelabel.from_env(env))
+    rb = buffer(HindsightRelabel(env.base_env.compute_reward))
     with pytest.warns(UserWarning, match="reward_fn gives other rewards"):
         for data in collect(env, 50, 8):
             rb.extend(data.reshape(-1))
@@ -289,7 +311,7 @@ def test_an_ensemble_of_buffers_is_relabelled(strategy):
             own = member.storage[:]["desired_goal"]
             is_old = (batch["desired_goal"][:, None] == own).all(-1).any(1)
             assert is_old.float().mean() < 0.1
-    assert [transform._memory.freed for transform in transforms] == [0, 0]
+    assert [transform._memory.oldest for transform in transforms] == [0, 0]
 
 
 @pytest.mark.parametrize("unit", ["row", "slice"])

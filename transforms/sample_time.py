@@ -1,0 +1,211 @@
+"""Base of the transforms that draw goals when a buffer is sampled."""
+
+import warnings
+from abc import abstractmethod
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl import envs
+from torchrl.data import ReplayBuffer, ReplayBufferEnsemble, RoundRobinWriter
+
+from torch_panda.transforms.base import SERIAL_KEY, BufferTransform
+from torch_panda.transforms.buffer import find_buffer, get_chain, samples_slices
+from torch_panda.transforms.rewrite import GoalFunction
+from torch_panda.transforms.strategies import Integers
+
+
+class SampleTimeTransform(BufferTransform):
+    """Remembers stored transitions, and draws goals for sampled transitions.
+
+    Args:
+        reward_fn: See `BufferTransform`.
+        unit: "row" draws a goal for each row; "slice" draws one for all rows of a
+            slice, for the slice's last row.
+        capacity: Number of transitions to remember if no buffer calls, because a buffer
+            would tell its size.
+        **options: Other arguments of `BufferTransform`.
+    """
+
+    def __init__(
+        self,
+        reward_fn: GoalFunction,
+        *,
+        unit: Literal["row", "slice"] = "row",
+        capacity: int | None = None,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(reward_fn, **options)
+        if unit not in ("row", "slice"):
+            raise ValueError(f'unit must be "row" or "slice", got {unit!r}')
+        if capacity is not None and (capacity < 1 or not float(capacity).is_integer()):
+            raise ValueError(f"capacity must be a positive integer, got {capacity}")
+        self.unit, self.capacity = unit, capacity
+        self._is_first_sample = True
+        self._last_write = 0, 0  # transitions stored before the last write, and in it
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Remembers the transitions that are about to be stored."""
+        buffer, method = find_buffer()
+        mask = self._find_mask(tensordict)
+        is_one_item = not tensordict.ndim
+        if buffer is not None:
+            _check_layout(buffer, method, tensordict, is_padded=mask is not None)
+            is_one_item = tensordict.ndim < buffer.storage.ndim
+        batch = tensordict if mask is None else tensordict[mask]
+        if is_one_item:
+            batch = batch.unsqueeze(-1)
+        with self._lock:
+            self._claim(buffer)
+            stored = self._count_stored(buffer)
+            self._last_write = stored, batch.numel()
+            batch = self._remember(batch, stored)
+        return batch.squeeze(-1) if is_one_item else batch
+
+    def _count_stored(self, buffer: ReplayBuffer | None) -> int:
+        """Returns how many of the remembered transitions the buffer holds."""
+        # An ensemble samples from several buffers, and does not tell from which.
+        if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):
+            return len(buffer.storage)
+        count = self._memory.count
+        return min(count, self.capacity or count)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Gives sampled transitions other goals."""
+        buffer, method = find_buffer()
+        tags = tensordict.get(SERIAL_KEY, None)
+        with self._lock:
+            oldest = self._find_oldest(buffer)
+            if tags is None or oldest < 0:
+                raise self._explain_unknown_rows(has_tags=tags is not None)
+            if self._is_first_sample:
+                self._is_first_sample = False
+                self._rewriter.check_entries(tensordict)
+                self._warn_of_slices(buffer)
+            self._check_sampled(tensordict)
+            if not self._mixture.only_looks_ahead:
+                self._memory.forget(oldest)
+            serials = tags.numpy(force=True).reshape(-1)
+            drawn = self._draw(serials, tensordict)
+        # Other methods may return the storage itself, or a lazy stack.
+        is_copy = method == "_sample" and type(tensordict) is TensorDict
+        inplace = is_copy and tensordict.ndim == 1
+        return self._write(tensordict, drawn, inplace=inplace).exclude(SERIAL_KEY)
+
+    @abstractmethod
+    def _draw(self, serials: Integers, batch: TensorDictBase) -> Any:  # noqa: ANN401
+        """Draws goals for the transitions of a batch, with the memory locked."""
+
+    @abstractmethod
+    def _write(
+        self,
+        batch: TensorDictBase,
+        drawn: Any,  # noqa: ANN401
+        *,
+        inplace: bool,
+    ) -> TensorDictBase:
+        """Writes what `_draw` returned into the batch, or into a copy of it."""
+
+    def _find_oldest(self, buffer: ReplayBuffer | None) -> int:
+        """Returns the serial number of the oldest transition that the buffer holds."""
+        stored, (before, written) = self._count_stored(buffer), self._last_write
+        size = 0 if buffer is None else getattr(buffer.storage, "max_size", 0)
+        if stored == before < size:  # the last write has not reached the storage yet
+            stored += written
+        return self._memory.count - stored
+
+    def _find_units(self, serials: Integers) -> tuple[Integers, Integers | None]:
+        """Finds the units that get one goal each.
+
+        Returns:
+            Serial number of the last row of each unit, (m,), and the unit of each row,
+            (n,), or None if each row is a unit.
+        """
+        if self.unit == "row":
+            return serials, None
+        numbers, steps = self._memory.find(serials.clip(self._memory.oldest))
+        # Padding repeats a step.
+        continues = (np.diff(numbers) == 0) & np.isin(np.diff(steps), (0, 1))
+        is_last = np.append(~continues, True)
+        return serials[is_last], is_last.cumsum() - is_last
+
+    def _explain_unknown_rows(self, *, has_tags: bool) -> Exception:
+        """Returns the error for sampled rows that were not remembered."""
+        name = type(self).__name__
+        chain = get_chain(self)
+        selecting = [
+            type(transform).__name__
+            for transform in chain[: chain.index(self)]
+            if isinstance(transform, (envs.SelectTransform, envs.ExcludeTransform))
+        ]
+        if selecting and not has_tags:
+            return KeyError(
+                f"{SERIAL_KEY!r} is missing in the sampled batch, because "
+                f"{' and '.join(selecting)} comes before {name} in the buffer: put it "
+                f"after {name}"
+            )
+        message = (
+            f"{name} must be in the buffer before the first extend(); pass rows that "
+            "are stored already through prepare()"
+        )
+        return RuntimeError(message) if has_tags else KeyError(message)
+
+    def _warn_of_slices(self, buffer: ReplayBuffer | None) -> None:
+        """Warns if the rows of a sampled slice get several goals."""
+        if self.unit == "row" and samples_slices(buffer):
+            warnings.warn(
+                'the rows of a slice get several goals: pass unit="slice" for one goal '
+                "per slice",
+                stacklevel=2,
+            )
+
+    def prepare(self, data: TensorDictBase) -> TensorDictBase:
+        """Remembers transitions that are stored already: a data set, or a storage.
+
+        Args:
+            data: Transitions with trajectory ids, or [trajectories, time].
+
+        Returns:
+            The transitions, flat and with serial numbers, for the `TensorStorage` of a
+            buffer with this transform. The tensors are not copied.
+
+        Raises:
+            RuntimeError: the transform has remembered other transitions.
+        """
+        if self._memory.count:
+            raise RuntimeError("prepare() must come before other transitions")
+        flat = data.reshape(-1)
+        identified = flat.copy()
+        if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
+            ids = torch.arange(len(flat), device="cpu") // data.shape[-1]
+            identified.set(self.trajectory_key, ids)
+        mask = self._find_mask(data)
+        if mask is not None:
+            flat, identified = flat[mask.reshape(-1)], identified[mask.reshape(-1)]
+        with self._lock:
+            tags = self._remember(identified, 0).get(SERIAL_KEY)
+        self.end_trajectories()
+        return flat.copy().set(SERIAL_KEY, tags)
+
+
+def _check_layout(
+    buffer: ReplayBuffer, method: str, data: TensorDictBase, *, is_padded: bool
+) -> None:
+    """Checks that the buffer writes transitions in order of time.
+
+    Raises:
+        RuntimeError: it does not.
+    """
+    ndim, writer = buffer.storage.ndim, type(buffer.writer)
+    fits = data.ndim in (ndim - 1, ndim) and buffer.dim_extend == ndim - 1
+    if is_padded:  # rows are dropped, so that the others must come out flat
+        fits = ndim == 1
+    adds_many = method == "add" and data.shape[ndim - 1 :].numel() > 1
+    if adds_many or not fits or not issubclass(writer, RoundRobinWriter):
+        raise RuntimeError(
+            f"rows must be written round-robin (here: {writer.__name__}) in order of "
+            f"time; got {list(data.shape)} for ndim={ndim}: extend with "
+            "data.reshape(-1), or use several dimensions, ndim=2 for [num_envs, time] "
+            "(of collectors with replay_buffer=)"
+        )
