@@ -75,8 +75,9 @@ def check_names(
         hint = f"did you mean {similar[0]!r}? " if similar else ""
         if advice and name in advice:
             hint = f"{advice[name]}; "
+        # Python's own phrase. torchrl's GymEnv looks for it to drop `frameskip`.
         raise TypeError(
-            f"{owner}: unknown argument {name!r}; {hint}"
+            f"{owner} got an unexpected keyword argument {name!r}; {hint}"
             f"accepted are {', '.join(accepted) or 'none'}"
         )
 

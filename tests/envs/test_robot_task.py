@@ -464,3 +464,12 @@ def test_outputs_on_cuda():
         td = env.rollout(3)
         assert td.device.type == td["next", "observation"].device.type == "cuda"
         assert env.get_state()["object_pose"].device.type == "cuda"
+
+
+def test_a_repr_shows_the_arguments():
+    with torch_panda.make("PandaReach-v1", num_envs=2, seed=3) as env:
+        text = repr(env)
+    assert text.startswith("RobotTaskEnv(robot=Panda(")
+    assert "task=Reach(reward_type='sparse'" in text
+    assert text.endswith("num_envs=2, seed=3, max_episode_steps=50)")
+    assert "device" not in text

@@ -4,20 +4,25 @@ import functools
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiAsyncCollector
+from torchrl.data import Unbounded
 from torchrl.envs import (
     CatTensors,
     Compose,
     InitTracker,
     ObservationNorm,
+    ParallelEnv,
     RewardSum,
     SerialEnv,
     StepCounter,
+    TensorDictPrimer,
     TransformedEnv,
 )
-from torchrl.envs.utils import RandomPolicy
+from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import torch_panda
+from torch_panda.envs import StateTransform
 
 make_env = functools.partial(
     torch_panda.make, "PandaReach-v1", num_envs=2, num_threads=1
@@ -55,6 +60,96 @@ def test_transformed_environments_do_not_lose_a_state_silently():
             transformed.reset(state, set_state=True)
         start = transformed.base_env.reset(state, set_state=True)
         assert (start.select(*state.keys()) == state).exclude("desired_goal").all()
+
+
+def make_counted():
+    return TransformedEnv(make_env(seed=0), StepCounter())
+
+
+def make_primed():
+    primer = TensorDictPrimer(hidden=Unbounded((4,)), expand_specs=True)
+    return TransformedEnv(make_env(seed=0), primer)
+
+
+def make_with_state(seed=0):
+    transforms = Compose(StateTransform(), StepCounter())
+    return TransformedEnv(make_env(seed=seed), transforms)
+
+
+@pytest.mark.parametrize("make_worker", [make_counted, make_primed])
+def test_a_reset_with_entries_of_transforms_is_a_new_episode(make_worker):
+    """torchrl takes them for a state, because the transforms name them in specs."""
+    env = SerialEnv(2, make_worker)
+    first = env.rollout(3)[..., -1]
+    start = env.reset(first.clone())
+    assert not torch.equal(start["desired_goal"], first["desired_goal"])
+    if make_worker is make_counted:
+        only_count = TensorDict({"step_count": first["step_count"]}, [2, 2])
+        assert not env.reset(only_count)["step_count"].any()
+    with pytest.raises(NotImplementedError, match="does not support determin"):
+        env.reset(first, set_state=True)
+    env.close()
+
+
+def test_a_state_transform_passes_states_on():
+    env = make_with_state()
+    check_env_specs(env)
+    rollout = env.rollout(8)
+    now = rollout[..., 5]
+    # StepCounter's count is beside the state's, and begins anew.
+    assert torch.equal(now["state", "step_count"], now["step_count"])
+    start = env.reset(now.select("state"), set_state=True)
+    assert (start["state"] == now["state"]).all()
+    assert not start["step_count"].any()
+    assert torch.equal(start["desired_goal"], now["desired_goal"])
+    with pytest.warns(FutureWarning, match="without specifying `set_state`"):
+        again = env.reset(now.select("state"))
+    assert (again["state"] == now["state"]).all()
+    with pytest.raises(ValueError, match="StateTransform and give the state under"):
+        env.reset(env.get_state(), set_state=True)
+    env.close()
+
+
+@pytest.mark.parametrize("batched_env", [SerialEnv, ParallelEnv])
+def test_a_state_transform_passes_states_to_workers(batched_env):
+    env = batched_env(2, make_with_state)
+    last = env.rollout(4)[..., -1]
+    env.reset()
+    start = env.reset(last.select("state"), set_state=True)
+    for key in ("object_pose", "joint_position", "desired_goal", "step_count"):
+        assert torch.equal(start["state", key], last["state", key])
+    env.close()
+
+
+def test_a_bare_environment_takes_a_nested_state():
+    with make_env(seed=0) as env:
+        env.rollout(3)
+        state = env.get_state()
+        expected = env.reset(state, set_state=True)
+        nested = TensorDict({"state": state}, [2])
+        for set_state in (True, None):
+            start = env.reset(nested, set_state=set_state)
+            assert (
+                start.select(*expected.keys(), strict=False)
+                == expected.select(*start.keys(), strict=False)
+            ).all()
+        observed = start.set("state", state)
+        with pytest.raises(ValueError, match="say set_state=True"):
+            env.reset(observed)
+
+
+def test_a_state_transform_wraps_one_environment():
+    env = TransformedEnv(SerialEnv(2, make_env), StateTransform())
+    with pytest.raises(TypeError, match="must wrap a RobotTaskEnv, got SerialEnv"):
+        env.reset()
+    env.close()
+
+
+def test_workers_of_one_seed_repeat_each_other():
+    """So each worker needs a seed of its own, as the docstring of ``seed`` says."""
+    goals = [make_env(seed=seed).reset()["desired_goal"] for seed in (0, 0, 1)]
+    assert torch.equal(goals[0], goals[1])
+    assert not torch.isin(goals[2], goals[0]).any()
 
 
 def test_batched_environments():

@@ -6,6 +6,8 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
+from torchrl.envs import GymEnv, GymWrapper
+from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from tests.gymnasium_envs.equal import assert_equal
@@ -240,3 +242,23 @@ def test_bad_actions(env):
     env.close()
     with pytest.raises(torch_panda.BulletError, match="closed"):
         env.step(np.zeros(3))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "make_wrapped",
+    [
+        lambda: GymEnv("torch_panda/PandaReach-v3"),
+        lambda: GymWrapper(gymnasium.make("torch_panda/PandaReach-v3")),
+        lambda: GymWrapper(
+            gymnasium.make_vec(
+                "torch_panda/PandaReach-v3", num_envs=2, autoreset_mode="Disabled"
+            )
+        ),
+    ],
+)
+def test_torchrls_wrappers_read_the_infos(make_wrapped):
+    env = make_wrapped().auto_register_info_dict()
+    check_env_specs(env)
+    assert env.rollout(3)["next", "is_success"].dtype == torch.bool
+    env.close()

@@ -130,8 +130,8 @@ def test_tasks_are_compared_and_hashed_by_identity():
 @pytest.mark.parametrize("task_class", [Push, Penalty])
 def test_an_unknown_argument_is_named_with_the_accepted_ones(task_class):
     message = (
-        f"{task_class.__name__}: unknown argument 'threshold'; did you mean "
-        r"'distance_threshold'\? accepted are reward_type, distance_threshold, "
+        f"{task_class.__name__} got an unexpected keyword argument 'threshold'; "
+        r"did you mean 'distance_threshold'\? accepted are reward_type, "
     )
     with pytest.raises(TypeError, match=message):
         task_class(threshold=0.02)

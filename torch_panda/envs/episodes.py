@@ -37,7 +37,7 @@ from torch_panda.envs.start import EpisodeStarts
 from torch_panda.envs.state import StartState, read_state
 from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
-from torch_panda.sensors import Sensor, read_sensors
+from torch_panda.sensors import Entry, Sensor, read_sensors
 from torch_panda.tasks import Task
 
 OnDivergence = Literal["raise", "reset"]
@@ -254,6 +254,13 @@ class Episodes:
             self._check_was_reset()
             state = {key: value.clone() for key, value in self._starts.state().items()}
             return {**state, **self._history.export()} if exact else state
+
+    def state_entries(self) -> dict[str, Entry]:
+        """Shapes and dtypes of the entries of a state, by key."""
+        return {
+            key: Entry(tuple(value.shape[1:]), value.dtype)
+            for key, value in self._starts.state().items()
+        }
 
     def watch(self) -> Observed:
         """Goals, success and number of steps, (n, ...), for a viewer.

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, EnvMetaData
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
@@ -21,7 +22,7 @@ from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, is_state
+from torch_panda.envs.state import EXACT_KEYS, STATE_KEY, is_state
 from torch_panda.rendering import Camera, RendererName, Window, segmentation_ids
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -31,6 +32,9 @@ from torch_panda.tasks.base import RewardFunction
 
 if TYPE_CHECKING:  # needs an extra
     from torch_panda.rendering.web_viewer import WebViewer
+
+# The function with which SerialEnv and ParallelEnv ask for the properties of a worker.
+_METADATA_CODE = EnvMetaData.metadata_from_env.__code__
 
 
 class RobotTaskEnv(EnvBase):
@@ -100,7 +104,6 @@ class RobotTaskEnv(EnvBase):
         episodes: Runs the environments, without torchrl.
     """
 
-    _supports_set_state = True
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:  # noqa: ANN401 (a subclass's)
@@ -205,7 +208,9 @@ class RobotTaskEnv(EnvBase):
         args, kwargs = self._arguments
         defaults = {
             name: parameter.default
-            for name, parameter in inspect.signature(type(self)).parameters.items()
+            for name, parameter in inspect.signature(
+                type(self).__init__
+            ).parameters.items()
         }
         arguments = [repr(value) for value in args]
         arguments += [
@@ -498,7 +503,30 @@ class RobotTaskEnv(EnvBase):
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = None if mask is None else indices(mask)
         state = {} if tensordict is None else tensordict
+        state = state.get(STATE_KEY, state)
         return self._emit(self.episodes.reset(envs, state if set_state else None))
+
+    @property
+    def _supports_set_state(self) -> bool:
+        """Whether a reset of this environment may start from a state.
+
+        `SerialEnv` and `ParallelEnv` ask this once for each worker. The answer is no
+        for a worker in which a `TransformedEnv` without `StateTransform` wraps this
+        environment, because no state would arrive. Otherwise torchrl would take the
+        ``step_count`` of a `StepCounter` in an ordinary reset for a state. torchrl does
+        not say who asks, so the calling functions are looked at.
+        """
+        wrapper, frame = None, sys._getframe(1)
+        while frame.f_code.co_name == "_supports_set_state" and frame.f_back:
+            wrapper = wrapper or frame.f_locals.get("self")
+            frame = frame.f_back
+        if wrapper is None or frame.f_code is not _METADATA_CODE:
+            return True
+        return STATE_KEY in set(wrapper.state_spec.keys())
+
+    def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
+        """Whether a tensordict holds a state; `TransformedEnv` asks this."""
+        return tensordict is not None and STATE_KEY in set(tensordict.keys())
 
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)

@@ -25,6 +25,8 @@ PHYSICAL = (
     "object_joint_velocity",
 )
 STATE = (*PHYSICAL, "desired_goal", "step_count", *PHYSICS)
+# Key under which `StateTransform` carries a whole state.
+STATE_KEY = "state"
 # Entries of an exact state beside those of a state.
 EXACT_KEYS = (*(START + key for key in STATE), ACTIONS, NUM_ACTIONS)
 
@@ -99,6 +101,7 @@ def is_state(
     The tensordict of an ordinary reset may hold a ``desired_goal`` too, and torchrl's
     `StepCounter` writes a ``step_count`` into it. It then holds an ``achieved_goal``,
     and entries of a state that the environment observes (the sensor "joint_state").
+    A state may also lie under the key ``state``, where `StateTransform` puts it.
 
     Args:
         entries: The argument of the reset.
@@ -112,13 +115,13 @@ def is_state(
     is_observed = "achieved_goal" in keys
     if is_observed:
         keys -= set(observed_keys)
-    if not keys.intersection(PHYSICAL):
+    if not keys.intersection((*PHYSICAL, STATE_KEY)):
         return "desired_goal" in keys and not is_observed
     if is_observed:
         raise ValueError(
             f"the tensordict holds observations and a state (one of "
-            f"{', '.join(PHYSICAL)}): say set_state=True to start from it, "
-            "set_state=False to start a new episode"
+            f"{', '.join(PHYSICAL)}, {STATE_KEY}): say set_state=True to start from "
+            f"it, set_state=False to start a new episode"
         )
     return True
 
@@ -152,7 +155,8 @@ def read_state(
         raise ValueError(
             f"set_state=True needs a state with some of {', '.join(present)}; none "
             "arrived. torchrl's TransformedEnv and ParallelEnv do not pass states on: "
-            "reset env.base_env, use SerialEnv, or add torch_panda.envs.StateTransform"
+            "reset env.base_env, or add torch_panda.envs.StateTransform and give the "
+            f"state under the key {STATE_KEY!r}"
         )
 
     def read(prefix: str = "") -> dict[str, Tensor]:

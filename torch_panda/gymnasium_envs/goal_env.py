@@ -94,7 +94,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         if seed is not None:
             self.torch_env.set_env_seed(0, seed)
         start = self.torch_env.episodes.reset(state=state)
-        return self._observation(start), {"is_success": start["success"].item()}
+        return self._observation(start), _info(start)
 
     def step(
         self, action: ArrayLike
@@ -106,7 +106,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
             float(after["reward"]),
             bool(after["terminated"]),
             bool(after["truncated"]),
-            {"is_success": after["success"].item()},
+            _info(after),
         )
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -121,6 +121,11 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _observation(self, observed: Observed) -> Observation:
         return {key: observed[key][0].numpy() for key in self._keys}
+
+
+def _info(observed: Observed) -> dict[str, Any]:
+    # Not a plain bool: torchrl's readers of infos expect a dtype.
+    return {"is_success": np.bool_(observed["success"].item())}
 
 
 def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:
