@@ -55,7 +55,6 @@ __all__ = [
     "WorkerError",
     "XArm6",
     "XArm6Gripper",
-    "__version__",
     "make",
     "max_episode_steps",
     "register",

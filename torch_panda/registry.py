@@ -33,6 +33,55 @@ Options = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
+class Registration:
+    """How to make the robot and the task of an id.
+
+    Attributes:
+        env_id: The id, such as "PandaPush-v1".
+        robot: Class or function that makes the robot.
+        task: Class or function that makes the task.
+        max_episode_steps: Number of steps until ``truncated``.
+        terminate_on_success: Whether success ends an episode.
+    """
+
+    env_id: str
+    robot: Callable[..., Robot]
+    task: Callable[..., Task]
+    max_episode_steps: int
+    terminate_on_success: bool = False
+
+    def make_robot(self, options: Options | None = None) -> Robot:
+        """Make the robot of the id.
+
+        Args:
+            options: Arguments that replace those of the id.
+
+        Raises:
+            TypeError: The robot does not have one of these arguments.
+        """
+        return _call(self.robot, f"robot_options of {self.env_id}", options)
+
+    def make_task(self, options: Options | None = None) -> Task:
+        """Make the task of the id; see `make_robot`."""
+        return _call(self.task, f"task_options of {self.env_id}", options)
+
+    @property
+    def task_name(self) -> str:
+        """Name of the task's class, such as "Push"."""
+        return type(self.make_task()).__name__
+
+    @property
+    def robot_name(self) -> str:
+        """Name of the robot's class, such as "Panda"."""
+        return type(self.make_robot()).__name__
+
+    @property
+    def version(self) -> str:
+        """Version of the id, such as "v1"; empty if the id has none."""
+        return self.env_id.rpartition("-")[2] if "-" in self.env_id else ""
+
+
+@dataclass(frozen=True)
 class Family:
     """The ids of one robot at one task: ``{robot}{task}{,Joints}{,Dense}-v{1,3}``.
 
@@ -55,6 +104,29 @@ class Family:
     v3_task: Options | None = None
     v3_robot: Options = field(default_factory=dict)
     joints: bool = True
+
+    def registrations(self) -> Iterator[Registration]:
+        """One registration for each id."""
+        controls = ("", "Joints") if self.joints else ("",)
+        versions = ("v1",) if self.v3_task is None else ("v1", "v3")
+        for control, reward, version in product(controls, ("", "Dense"), versions):
+            robot_options = dict(self.robot_options)
+            task_options: dict[str, Any] = {}
+            if version == "v3":
+                robot_options |= self.v3_robot
+                task_options |= self.v3_task or {}
+            if control == "Joints":
+                robot_options["control_type"] = "joints"
+            if reward == "Dense":
+                task_options["reward_type"] = "dense"
+            name = f"{self.robot.__name__}{self.task.__name__}"
+            yield Registration(
+                f"{name}{control}{reward}-{version}",
+                partial(self.robot, **robot_options),
+                partial(self.task, **task_options),
+                self.task.max_episode_steps,
+                terminate_on_success=version == "v3",
+            )
 
 
 BLOCKED = {"block_gripper": True}
@@ -119,81 +191,11 @@ FAMILIES = (
 )
 
 
-@dataclass(frozen=True)
-class Registration:
-    """How to make the robot and the task of an id.
-
-    Attributes:
-        env_id: The id, such as "PandaPush-v1".
-        robot: Class or function that makes the robot.
-        task: Class or function that makes the task.
-        max_episode_steps: Number of steps until ``truncated``.
-        terminate_on_success: Whether success ends an episode.
-    """
-
-    env_id: str
-    robot: Callable[..., Robot]
-    task: Callable[..., Task]
-    max_episode_steps: int
-    terminate_on_success: bool = False
-
-    def make_robot(self, options: Options | None = None) -> Robot:
-        """Make the robot of the id.
-
-        Args:
-            options: Arguments that replace those of the id.
-
-        Raises:
-            TypeError: The robot does not have one of these arguments.
-        """
-        return _call(self.robot, f"robot_options of {self.env_id}", options)
-
-    def make_task(self, options: Options | None = None) -> Task:
-        """Make the task of the id; see `make_robot`."""
-        return _call(self.task, f"task_options of {self.env_id}", options)
-
-    @property
-    def task_name(self) -> str:
-        """Name of the task's class, such as "Push"."""
-        return type(self.make_task()).__name__
-
-    @property
-    def robot_name(self) -> str:
-        """Name of the robot's class, such as "Panda"."""
-        return type(self.make_robot()).__name__
-
-    @property
-    def version(self) -> str:
-        """Version of the id, such as "v1"; empty if the id has none."""
-        return self.env_id.rpartition("-")[2] if "-" in self.env_id else ""
-
-
-def _shipped() -> Iterator[Registration]:
-    """The registrations of all families."""
-    for family in FAMILIES:
-        controls = ("", "Joints") if family.joints else ("",)
-        versions = ("v1",) if family.v3_task is None else ("v1", "v3")
-        for control, reward, version in product(controls, ("", "Dense"), versions):
-            robot_options = dict(family.robot_options)
-            task_options: dict[str, Any] = {}
-            if version == "v3":
-                robot_options |= family.v3_robot
-                task_options |= family.v3_task or {}
-            if control == "Joints":
-                robot_options["control_type"] = "joints"
-            if reward == "Dense":
-                task_options["reward_type"] = "dense"
-            name = f"{family.robot.__name__}{family.task.__name__}"
-            yield Registration(
-                f"{name}{control}{reward}-{version}",
-                partial(family.robot, **robot_options),
-                partial(family.task, **task_options),
-                family.task.max_episode_steps,
-                terminate_on_success=version == "v3",
-            )
-
-
-_REGISTRATIONS = {registration.env_id: registration for registration in _shipped()}
+_REGISTRATIONS = {
+    registration.env_id: registration
+    for family in FAMILIES
+    for registration in family.registrations()
+}
 
 ENV_IDS: tuple[str, ...] = tuple(_REGISTRATIONS)
 """The ids that torch_panda ships, which are those of `FAMILIES`."""

@@ -1,0 +1,119 @@
+"""Registrations of ids, and the arguments of `make`."""
+
+import pytest
+
+import torch_panda
+from tests.test_custom import PushBall
+from torch_panda import Panda, Push
+from torch_panda.registry import Family, find_registration
+
+
+@pytest.fixture
+def env_id():
+    torch_panda.register(
+        "Shove", robot=lambda: Panda(control_type="joints"), task=PushBall
+    )
+    return "Shove"
+
+
+def test_one_line_registers_all_ids_of_a_task():
+    family = Family(Panda, PushBall, {"block_gripper": True})
+    made = {
+        registration.env_id: (registration.make_robot(), registration.make_task())
+        for registration in family.registrations()
+    }
+    assert list(made) == [
+        "PandaPushBall-v1",
+        "PandaPushBallDense-v1",
+        "PandaPushBallJoints-v1",
+        "PandaPushBallJointsDense-v1",
+    ]
+    for robot, task in made.values():
+        assert robot.block_gripper
+        assert type(task) is PushBall
+    robot, task = made["PandaPushBallJointsDense-v1"]
+    assert (robot.control_type, task.reward_type) == ("joints", "dense")
+
+
+def test_a_family_with_changes_for_v3_has_ids_of_both_versions():
+    family = Family(
+        Panda,
+        PushBall,
+        v3_task={"distance_threshold": 0.1},
+        v3_robot={"finger_friction": 2.0},
+        joints=False,
+    )
+    first, second, *dense = family.registrations()
+    assert (first.version, second.version, len(dense)) == ("v1", "v3", 2)
+    assert (first.terminate_on_success, second.terminate_on_success) == (False, True)
+    assert second.max_episode_steps == PushBall.max_episode_steps
+    assert second.make_task().distance_threshold == 0.1
+    assert second.make_robot().finger_friction == 2.0
+    assert first.make_task().distance_threshold == 0.05
+
+
+def test_a_registration_names_robot_task_and_version(env_id):
+    registration = find_registration("XArm6GripperPickAndPlaceDense-v1")
+    assert registration.robot_name == "XArm6Gripper"
+    assert registration.task_name == "PickAndPlace"
+    assert registration.version == "v1"
+    registration = find_registration(env_id)
+    assert (registration.robot_name, registration.task_name) == ("Panda", "PushBall")
+    assert registration.version == ""
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "advice"),
+    [
+        ("n_envs", 4, "use num_envs;"),
+        (
+            "reward_type",
+            "dense",
+            r"use task_options=\{'reward_type': 'dense'\}, or the id PandaPushDense-v1",
+        ),
+        ("control_type", "joints", r"use robot_options=\{'control_type': 'joints'\}"),
+        ("distance_threshold", 0.02, r"use task_options=\{'distance_threshold': 0.02"),
+        ("render_mode", "human", r"use env.render\(\) .*, or env.open_viewer\(\)"),
+        ("robot", Panda(), r"use an id, or RobotTaskEnv\(robot=..., task"),
+        ("num_env", 3, "did you mean 'num_envs'"),
+        ("max_steps", 3, "did you mean 'max_episode_steps'"),
+        ("colour", "red", "accepted are env_id, num_envs, .*max_episode_steps"),
+    ],
+)
+def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
+    message = rf"make: unknown argument '{option}'; {advice}"
+    with pytest.raises(TypeError, match=message):
+        torch_panda.make("PandaPush-v1", **{option: value})
+
+
+def test_options_of_task_and_robot_are_checked():
+    with pytest.raises(
+        TypeError,
+        match="task_options of PandaPush-v1: unknown argument 'threshold'; did you "
+        "mean 'distance_threshold'",
+    ):
+        torch_panda.make("PandaPush-v1", task_options={"threshold": 0.1})
+    with pytest.raises(TypeError, match="robot_options of PandaPush-v1 must be a map"):
+        torch_panda.make("PandaPush-v1", robot_options="joints")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"env_id": "PandaPush-v1"}, ValueError, "ships; choose another one"),
+        ({"env_id": "Two words"}, ValueError, "cannot be an id"),
+        ({"robot": Panda()}, TypeError, "robot must be a class or a function"),
+        ({"task": Push()}, TypeError, "task must be a class or a function"),
+        ({"max_episode_steps": 0}, ValueError, "max_episode_steps must be"),
+    ],
+)
+def test_wrong_registrations(arguments, error, message):
+    accepted = {"env_id": "Shove-v0", "robot": Panda, "task": Push}
+    with pytest.raises(error, match=message):
+        torch_panda.register(**(accepted | arguments))
+
+
+def test_an_unknown_id_is_named_with_the_accepted_ones(env_id):
+    with pytest.raises(ValueError, match=r"accepted are Panda\{Reach,.*: Shove$"):
+        torch_panda.make("PandaShove-v1")
+    assert torch_panda.max_episode_steps(env_id) == 30
