@@ -7,6 +7,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import torch_panda
 from torch_panda.commands import record as record_demos
+from torch_panda.datasets import recording
 from torch_panda.experts import make_expert
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.transforms import HindsightRelabel
@@ -55,7 +56,7 @@ def test_numbers_of_the_task_can_be_others(tmp_path, capsys):
     with pytest.raises(SystemExit, match=r"accepted are .*distance_threshold"):
         record_demos.main(args)
     args.task_options, args.format = {"distance_threshold": 0.5}, "minari"
-    with pytest.raises(SystemExit, match="no task_options"):
+    with pytest.raises(SystemExit, match="task_options do not work with the format"):
         record_demos.main(args)
 
 
@@ -63,13 +64,15 @@ def stop(*arguments):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("during", ["play", "join"])
-def test_ctrl_c_leaves_the_file_as_it_was(tmp_path, monkeypatch, during):
+@pytest.mark.parametrize(
+    ("module", "function"), [(record_demos, "play"), (recording, "join")]
+)
+def test_ctrl_c_leaves_the_file_as_it_was(tmp_path, monkeypatch, module, function):
     out = tmp_path / "demos.pt"
     args = record_demos.Args("PandaReach-v3", episodes=2, num_envs=2, out=out)
     record_demos.main(args)
     before = out.read_bytes()
-    monkeypatch.setattr(record_demos, during, stop)
+    monkeypatch.setattr(module, function, stop)
     with pytest.raises(SystemExit, match=r"^stopped$"):
         record_demos.main(args)
     assert out.read_bytes() == before

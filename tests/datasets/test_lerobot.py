@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torch_panda
-from tests.datasets.learning import imitate, record
+from tests.datasets.imitation import imitate, record
 from torch_panda.datasets.demonstrations import read_demos
 
 lerobot_dataset = pytest.importorskip(

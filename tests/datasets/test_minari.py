@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import torch_panda
-from tests.datasets.learning import imitate, record
+from tests.datasets.imitation import imitate, record
 from torch_panda.datasets.demonstrations import read_demos
 
 minari = pytest.importorskip(
@@ -74,9 +74,9 @@ def test_a_policy_learns_from_it(recorded):
 def test_bad_names_are_one_line(recorded):
     for name, message in (
         (recorded[1], "already"),
-        ("push", "ends in its version, .* such as .*, got 'push'"),
-        ("x/y-v0", "a namespace has two characters or more, .*, got 'x/y-v0'"),
-        ("panda/x.y-v0", "such as panda/push-expert-v0, got 'panda/x.y-v0'"),
+        ("push", "'push' is no id of .*: it must end in a version"),
+        ("x/y-v0", "'x/y-v0' is no id of .* a namespace must have at least two"),
+        ("panda/x.y-v0", "'panda/x.y-v0' is no id of .* as in panda/push-expert-v0"),
     ):
         with pytest.raises(SystemExit, match=message):
             record("minari", name, "PandaReach-v1", 1)

@@ -26,30 +26,31 @@ from torch_panda.learning.user_modules import Imports, import_modules, read_modu
 
 @dataclass
 class Args:
-    """Which expert to run, for how long, and where to write."""
+    """Record demonstrations of a scripted expert."""
 
     env_id: str = "PandaPush-v1"
-    """one of torch_panda.ENV_IDS with end-effector control"""
+    """task of the expert, with end-effector control"""
     episodes: Positive = 200
-    """episodes to run"""
+    """number of episodes"""
     seed: Seed = 0
-    """of the environments"""
+    """seed of the environments"""
     num_envs: Positive = 32
-    """environments that are stepped in parallel"""
+    """number of environments that are stepped in parallel"""
     num_threads: Positive | None = None
-    """threads that step them; None means one per core"""
+    """number of threads that step the environments; None means one per core"""
     noise_eps: Weight = 0.0
-    """the standard deviation of Gaussian noise on the actions that are executed; saved
-    are the actions without it, so that who imitates them learns to correct himself
-    (DART, arXiv 1703.09327)"""
+    """standard deviation of Gaussian noise on the executed actions; the file holds the
+    actions without noise, so that imitating them teaches how to correct errors (DART,
+    arXiv 1703.09327)"""
     task_options: dict[str, Finite] = field(default_factory=dict)
-    """numbers of the task that are others than the id's, such as `play 0.0005`"""
+    """arguments of the task to change, such as `play 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
-    """a file of a nested dict of tensors of shape (steps, ...), or a data set"""
+    """a file with a nested dict of tensors (transitions, ...), or a data set"""
     out: Path | None = None
-    """the file; for minari the data set's id, for lerobot its folder"""
+    """file to write; for minari the id of the data set, for lerobot its folder; None
+    measures success only"""
     image_size: Positive = 128
-    """height and width of lerobot's pictures [pixels]"""
+    """height and width of the pictures of a LeRobot data set [pixels]"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 
@@ -73,11 +74,11 @@ def print_success(env_id: str, success: list[Tensor]) -> None:
 
 
 def open_writer(args: Args, env: torch_panda.RobotTaskEnv) -> Writer | None:
-    """What writes the episodes; None: they are only counted.
+    """Open the writer of the episodes; None if they are only counted.
 
     Raises:
-        ValueError: the format's library is not installed, or refuses the name.
-        OSError: the data could not be written.
+        ValueError: The library of the format is not installed, or refuses the name.
+        OSError: The data cannot be written.
     """
     if args.out is None:
         return None
@@ -87,15 +88,21 @@ def open_writer(args: Args, env: torch_panda.RobotTaskEnv) -> Writer | None:
 
 
 def main(args: Args) -> None:
-    """Run the episodes, print the success rates, save the transitions."""
+    """Play the episodes, print the success rates and save the transitions."""
     try:
         check_limits(args)
         import_modules(read_modules(args.imports))
         expert: TensorDictModuleBase = make_expert(args.env_id)
         if args.noise_eps and args.format == "minari":
-            raise ValueError("minari's episodes hold what was executed: no noise_eps")
+            raise ValueError(
+                "noise_eps does not work with the format minari, whose episodes hold "
+                "the executed actions"
+            )
         if args.task_options and args.format != "tensors":
-            raise ValueError(f"{args.format}'s data sets name an id: no task_options")
+            raise ValueError(
+                f"task_options do not work with the format {args.format}, whose data "
+                "sets are recreated from an id; use the format tensors"
+            )
         pictures: dict[str, Any] = {}
         if args.format == "lerobot":
             pictures = {"from_pixels": True, "render_size": args.image_size}
@@ -117,7 +124,7 @@ def main(args: Args) -> None:
         with env, tqdm(total=args.episodes, unit="episode", desc=args.env_id) as bar:
             while len(success) < args.episodes:
                 first = len(success)
-                if args.format != "tensors":  # each episode has a seed of its own
+                if args.format != "tensors":  # every episode stores its seed
                     for index in range(env.batch_size[0]):
                         env.set_env_seed(index, args.seed + first + index)
                 new = play(env, expert)[: args.episodes - first]

@@ -1,4 +1,4 @@
-"""Transitions of an expert, to learn from before and beside one's own."""
+"""Reads demonstrations: transitions of an expert for an agent to learn from."""
 
 from pathlib import Path
 
@@ -10,24 +10,32 @@ from torch_panda.datasets.formats import format_of, load_format
 from torch_panda.learning import files
 from torch_panda.learning.buffers import STORED_KEYS
 
-OTHER_REWARDS = 0.01  # of all, at most
+# Fraction of rewards that may differ from those of the task: a goal at the edge of
+# success may be rounded to the other side.
+DIFFERENT_REWARDS = 0.01
 
 
 def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
-    """Transitions (n,) of whole episodes.
+    """Read demonstrations and check that they fit an environment.
 
     Args:
-        path: a file of `record_demos.py`, or the folder of a data set; see `formats`.
-        env: the environment that they are for.
+        path: File that ``python -m torch_panda record`` wrote, or the folder of a data
+            set in one of the `Format`s.
+        env: Environment of the task that was demonstrated.
+
+    Returns:
+        Transitions (n,) of whole episodes, on the device of the environment. Actions
+        are clipped to [-1, 1], as the environment clips them.
 
     Raises:
-        ValueError: it holds none, or none of such an environment: sizes or rewards
-            differ.
+        ValueError: The path holds no demonstrations, or their sizes or rewards differ
+            from those of the environment.
     """
     if not path.exists():
         raise ValueError(
-            f"there is no {path}: demonstrations are a file of record_demos.py, or the "
-            "folder of a data set (Minari's is ~/.minari/datasets/ and its id)"
+            f"there is no file or folder {path}: demonstrations are a file that "
+            "`python -m torch_panda record` wrote, or the folder of a data set "
+            "(Minari's is ~/.minari/datasets/ followed by its id)"
         )
     if (name := format_of(path)) is not None:
         demos = load_format(name).read(path).select(*STORED_KEYS)
@@ -35,7 +43,10 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         content = files.read(path, "demonstrations", STORED_KEYS)
         try:
             demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
-        except (RuntimeError, TypeError) as error:  # other lengths, or no tensors
+        except (
+            RuntimeError,
+            TypeError,
+        ) as error:  # lengths or types differ
             raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
@@ -44,29 +55,29 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         size = (env.action_spec if expected is None else expected).shape[-1]
         if demos[key].shape[-1] != size:
             raise ValueError(
-                f"{path}: {key} has size {demos[key].shape[-1]}, the task's has {size}"
+                f"{path} is for another task: its {key} has size "
+                f"{demos[key].shape[-1]}, that of the environment {size}"
             )
-    check_rewards(path, demos, env)
-    # What is beyond the environment clips, too.
+    _check_rewards(path, demos, env)
     demos["action"] = demos["action"].clamp(-1.0, 1.0)
     return demos.to(env.device)
 
 
-def check_rewards(path: Path, demos: TensorDictBase, env: RobotTaskEnv) -> None:
-    """Make sure that demonstrations were rewarded as the task rewards.
+def _check_rewards(path: Path, demos: TensorDictBase, env: RobotTaskEnv) -> None:
+    """Check that the stored rewards are those that the task computes.
 
     Raises:
-        ValueError: they were not.
+        ValueError: More than `DIFFERENT_REWARDS` of them differ.
     """
     after = demos["next"]
     expected = env.compute_reward(after["achieved_goal"], demos["desired_goal"])
-    found = after["reward"].to(expected)
-    # A rounded goal at the edge of success may count otherwise.
-    other = ~torch.isclose(found, expected, rtol=1e-3, atol=1e-3)
-    if other.double().mean() > OTHER_REWARDS:
-        k = int(other.flatten().nonzero()[0])
+    stored = after["reward"].to(expected)
+    differs = ~torch.isclose(stored, expected, rtol=1e-3, atol=1e-3)
+    if differs.double().mean() > DIFFERENT_REWARDS:
+        k = int(differs.flatten().nonzero()[0])
         raise ValueError(
-            f"{path}: {other.double().mean():.0%} of the rewards are not the task's, "
-            f"the first is {float(found[k]):g} instead of {float(expected[k]):g}: were "
-            "they recorded with another id or other options?"
+            f"{path}: {differs.double().mean():.0%} of the rewards differ from those "
+            f"of the task; the first is {float(stored[k]):g} instead of "
+            f"{float(expected[k]):g}. Record the demonstrations with the same id and "
+            "options"
         )

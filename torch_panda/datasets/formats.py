@@ -1,7 +1,7 @@
-"""Demonstrations as data sets that other tools read, and back as our transitions.
+"""Formats of data sets: which there are, and what a module of a format offers.
 
-In these formats each episode has its seed: ``reset(seed=...)`` of
-`torch_panda.gymnasium_envs.GoalEnv` starts it again.
+In all of them each episode has its seed: ``reset(seed=...)`` of
+`torch_panda.gymnasium_envs.GoalEnv` starts the episode again.
 """
 
 from importlib import import_module
@@ -12,47 +12,57 @@ from typing import Literal, Protocol
 from tensordict import TensorDict, TensorDictBase
 
 from torch_panda import RobotTaskEnv
+from torch_panda.extras import install_command
 
 Format = Literal["minari", "lerobot"]
 
-MARKS: dict[Format, str] = {"minari": "data/metadata.json", "lerobot": "meta/info.json"}
+# A file by which the folder of a data set is recognised.
+_MARKER_FILES: dict[Format, str] = {
+    "minari": "data/metadata.json",
+    "lerobot": "meta/info.json",
+}
 
 
 class Writer(Protocol):
-    """Writes a data set."""
+    """Writes a data set, episode after episode."""
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
-        """Add an episode's transitions (steps,), and the seed that started it."""
+        """Add an episode.
+
+        Args:
+            episode: Its transitions, (steps,).
+            seed: Seed that started it.
+        """
 
     def close(self) -> str:
-        """Finish the data set, and say where it is and how it is read."""
+        """Finish the data set, and return where it is and how to read it."""
 
 
 class FormatModule(Protocol):
-    """What a module of this package offers."""
+    """Interface of the modules ``minari_format`` and ``lerobot_format``."""
 
     def open_writer(self, out: Path, env_id: str, env: RobotTaskEnv) -> Writer:
-        """Begin a data set, of transitions of this environment."""
+        """Start a data set of transitions of this environment."""
 
     def read(self, path: Path) -> TensorDict:
-        """The transitions of a data set's folder, with our keys, (n,)."""
+        """Read the transitions (n,) of a data set's folder, under our keys."""
 
 
 def load_format(name: Format) -> FormatModule:
-    """The module that writes and reads a format.
+    """Import the module that writes and reads a format.
 
     Raises:
-        ValueError: its library is not installed.
+        ValueError: The library of the format is not installed.
     """
     if find_spec(name) is None:
-        raise ValueError(
-            f"{name} is not installed: examples/README.md, under Data sets for other "
-            "tools, says how to"
-        )
+        raise ValueError(f"{name} is not installed: {install_command(name)}")
     module: FormatModule = import_module(f"torch_panda.datasets.{name}_format")
     return module
 
 
 def format_of(path: Path) -> Format | None:
-    """The format of a data set's folder; None: it is no such folder."""
-    return next((name for name, mark in MARKS.items() if (path / mark).is_file()), None)
+    """The format of a data set's folder, or None if the folder is no data set."""
+    for name, file in _MARKER_FILES.items():
+        if (path / file).is_file():
+            return name
+    return None

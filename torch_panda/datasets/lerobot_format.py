@@ -1,7 +1,7 @@
-"""LeRobot's format, version 3: tables of frames, and the pictures as videos.
+"""LeRobot's format, version 3: tables of frames, and pictures as videos.
 
-A frame holds what is seen before an action, and what follows from it in numbers; what
-is seen after an episode's last action is not kept.
+A frame holds the observation before an action, the action, and its reward and flags.
+The format has no place for the observation after an episode's last action.
 """
 
 import os
@@ -15,42 +15,34 @@ from tensordict import TensorDict, TensorDictBase
 from torch_panda import RobotTaskEnv
 
 STATE = "observation.state"
-# The achieved goal, then the desired one: policies of LeRobot read this beside STATE.
+# The achieved goal, then the desired goal. Policies of LeRobot read it beside STATE.
 GOALS = "observation.environment_state"
 PICTURE = "observation.images.scene"
-FPS = 25  # steps a second
-
-INSTRUCTIONS = {
-    "Reach": "Move the gripper to the marker.",
-    "Push": "Push the cube onto the marker.",
-    "Slide": "Strike the puck so that it slides to the marker.",
-    "PickAndPlace": "Bring the cube to the marker.",
-    "Stack": "Stack the two cubes at the markers.",
-    "Flip": "Turn the cube as the marker is turned.",
-}
+FPS = 25  # steps per second
 
 
 class LeRobotWriter:
-    """Writes episodes one after the other.
+    """Writes episodes as they come.
 
     Args:
-        folder: to write, new.
-        env_id: one of torch_panda.ENV_IDS.
-        env: observes ``pixels``.
+        folder: Folder to create.
+        env_id: Id of the environment that is recorded.
+        env: The environment; it must observe ``pixels``.
 
     Raises:
-        ValueError: there is such a folder already.
-        OSError: it could not be made.
+        ValueError: The folder exists already.
+        OSError: The folder cannot be created.
     """
 
     def __init__(self, folder: Path, env_id: str, env: RobotTaskEnv) -> None:
         if folder.exists():
-            raise ValueError(f"there is a {folder} already")
+            raise ValueError(f"the folder {folder} exists already: choose another one")
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        name = type(env.task).__name__
-        self.instruction = INSTRUCTIONS.get(name, name)
-        # Ctrl-C leaves an unfinished folder of another name.
+        task = type(env.task)
+        # The instruction of all frames: the first line of the task's docstring.
+        self.instruction = (task.__doc__ or task.__name__).partition("\n")[0]
+        # An unfinished data set has another name, so Ctrl-C leaves no broken one.
         self.unfinished = folder.with_name(folder.name + ".new")
         self.dataset = LeRobotDataset.create(
             repo_id=f"torch_panda/{env_id}",
@@ -61,7 +53,7 @@ class LeRobotWriter:
         )
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
-        """Write an episode; ``seed`` is a column."""
+        """Write an episode; the column ``seed`` repeats its seed."""
         following = episode["next"]
         goals = torch.cat((episode["achieved_goal"], episode["desired_goal"]), -1)
         columns = {
@@ -88,7 +80,7 @@ class LeRobotWriter:
 
 
 def features(env: RobotTaskEnv) -> dict[str, dict[str, object]]:
-    """The columns of an environment's data set, and their shapes."""
+    """Columns of the data set of an environment, with their types and shapes."""
     sizes = {
         STATE: env.observation_spec["observation"].shape[-1],
         GOALS: 2 * env.task.goal_dim,
@@ -111,15 +103,15 @@ def features(env: RobotTaskEnv) -> dict[str, dict[str, object]]:
 
 
 def open_writer(out: Path, env_id: str, env: RobotTaskEnv) -> LeRobotWriter:
-    """Begin a data set; ``out`` is its folder."""
+    """Start a data set; ``out`` is its folder."""
     return LeRobotWriter(out, env_id, env)
 
 
 def read(path: Path) -> TensorDict:
-    """The transitions of a data set's folder, without pictures; see `FormatModule`.
+    """Read the transitions of a data set's folder, without pictures.
 
-    An episode's last transition, whose end was not kept, is left out: the one before
-    is the last.
+    The observation after an episode's last action was not stored, so the last
+    transition is left out and the one before it becomes the end of the episode.
     """
     dataset = LeRobotDataset(f"torch_panda/{path.name}", root=path)
     table = dataset.hf_dataset.with_format("numpy")[:]
@@ -130,7 +122,9 @@ def read(path: Path) -> TensorDict:
 
     achieved, desired = column(GOALS, torch.float32).chunk(2, dim=-1)
     number = column("episode_index", torch.int64).squeeze(-1)
-    kept = number[:-1] == number[1:]  # transitions whose end is the next frame
+    kept = (
+        number[:-1] == number[1:]
+    )  # transitions whose next observation is the next frame
     observed = {
         "observation": column(STATE, torch.float32),
         "achieved_goal": achieved,

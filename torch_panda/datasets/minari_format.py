@@ -1,4 +1,4 @@
-"""Minari's format (https://minari.farama.org): data sets by id, in one folder."""
+"""Minari's format (https://minari.farama.org): one folder holds all data sets by id."""
 
 import warnings
 from importlib.metadata import version
@@ -18,14 +18,14 @@ OBSERVED = ("observation", "achieved_goal", "desired_goal")
 
 
 class MinariWriter:
-    """Gathers episodes, and writes them at the end.
+    """Collects episodes, and writes the data set when it is closed.
 
     Args:
-        dataset_id: such as "panda/push-expert-v0".
-        env_id: one of torch_panda.ENV_IDS.
+        dataset_id: Id of the data set, such as "panda/push-expert-v0".
+        env_id: Id of the environment that was recorded.
 
     Raises:
-        ValueError: the id is none, or is taken.
+        ValueError: The id is invalid, or a data set with this id exists.
     """
 
     def __init__(self, dataset_id: str, env_id: str) -> None:
@@ -33,21 +33,24 @@ class MinariWriter:
             parse_dataset_id(dataset_id)
         except (ValueError, TypeError):  # TypeError: without a version
             raise ValueError(
-                "the id of a data set ends in its version, and a namespace has two "
-                f"characters or more, such as panda/push-expert-v0, got {dataset_id!r}"
+                f"{dataset_id!r} is no id of a Minari data set: it must end in a "
+                "version, and a namespace must have at least two characters, as in "
+                "panda/push-expert-v0"
             ) from None
         if self.folder(dataset_id).exists():
-            raise ValueError(f"there is a data set {dataset_id} already")
+            raise ValueError(
+                f"the data set {dataset_id} exists already: choose another id"
+            )
         self.dataset_id, self.env_id = dataset_id, env_id
         self.episodes: list[EpisodeBuffer] = []
 
     @staticmethod
     def folder(dataset_id: str) -> Path:
-        """Where Minari keeps a data set."""
+        """The folder in which Minari keeps a data set."""
         return Path(get_dataset_path(dataset_id))
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
-        """Observations and success are those of all states, one more than actions."""
+        """Add an episode: observations and success have one more entry than actions."""
         self.episodes.append(
             EpisodeBuffer(
                 id=len(self.episodes),
@@ -64,17 +67,18 @@ class MinariWriter:
     def close(self) -> str:
         """Write the data set."""
         with warnings.catch_warnings():
-            # That there is no author, no address, no second environment; and that a -v1
-            # is older than a -v3.
+            # Minari warns of missing metadata (author, address, second environment),
+            # and Gymnasium that -v1 is older than -v3.
             warnings.filterwarnings("ignore", "`.*` is set to None")
             warnings.filterwarnings("ignore", ".*is out of date")
             minari.create_dataset_from_buffers(
                 self.dataset_id,
                 self.episodes,
                 env=f"torch_panda/{self.env_id}",
-                algorithm_name="the scripted expert of examples/experts",
-                description=f"{self.env_id}; `import torch_panda` before "
-                "recover_environment(); reset(seed=episode's) starts an episode again",
+                algorithm_name="the scripted expert of torch_panda.experts",
+                description=f"{self.env_id}: import torch_panda before "
+                "recover_environment(); reset(seed=...) with the seed of an episode "
+                "starts it again",
                 requirements=[f"torch_panda=={version('torch_panda')}"],
                 data_format="hdf5",
             )
@@ -85,12 +89,12 @@ class MinariWriter:
 
 
 def open_writer(out: Path, env_id: str, env: RobotTaskEnv) -> MinariWriter:
-    """Begin a data set; ``out`` is its id."""
+    """Start a data set; ``out`` is its id."""
     return MinariWriter(out.as_posix(), env_id)
 
 
 def read(path: Path) -> TensorDict:
-    """The transitions of a data set's folder; see `FormatModule.read`."""
+    """Read the transitions of a data set's folder; see `FormatModule.read`."""
     episodes = []
     for episode in minari.MinariDataset(path / "data").iterate_episodes():
         terminated = column(episode.terminations)
@@ -112,15 +116,15 @@ def read(path: Path) -> TensorDict:
 
 
 def states(episode: TensorDictBase, key: str) -> np.ndarray:
-    """An entry of all states of an episode, (steps + 1, ...)."""
+    """The values of an entry in all states of an episode, (steps + 1, ...)."""
     return torch.cat((episode[key][:1], episode["next", key])).numpy()
 
 
 def after(episode: TensorDictBase, key: str) -> np.ndarray:
-    """An entry after each step, (steps,)."""
+    """The values of an entry after each step, (steps,)."""
     return episode["next", key].squeeze(-1).numpy()
 
 
 def column(values: np.ndarray) -> torch.Tensor:
-    """(n,) as (n, 1)."""
+    """Reshape (n,) to (n, 1)."""
     return torch.as_tensor(values).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""Records episodes of the scripted experts as demonstrations."""
+"""Records episodes of scripted experts as demonstrations."""
 
 from pathlib import Path
 
@@ -13,13 +13,13 @@ from torch_panda.learning.files import prepare, save
 
 
 class TensorWriter:
-    """Writes all transitions into one file, which `torch.load` reads.
+    """Writes all transitions into one file that `torch.load` reads.
 
     Args:
-        path: of the file.
+        path: Path of the file.
 
     Raises:
-        OSError: it could not be written.
+        OSError: The file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -28,11 +28,11 @@ class TensorWriter:
         self.episodes: list[TensorDictBase] = []
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
-        """Keep an episode."""
+        """Keep an episode until the file is written; the format has no seeds."""
         self.episodes.append(episode)
 
     def close(self) -> str:
-        """Ctrl-C leaves the file as it was, or makes the whole of it."""
+        """Write the file. Ctrl-C leaves either no file or a complete one."""
         demos = join(self.episodes)
         save(self.path, demos.to_dict())
         return str(self.path)
@@ -41,7 +41,17 @@ class TensorWriter:
 def disturb(
     expert: TensorDictModule, env: torch_panda.RobotTaskEnv, noise_eps: float
 ) -> TensorDictModuleBase:
-    """The expert with noise on its ``action``, which is kept as ``intended``."""
+    """Add Gaussian noise to the actions of an expert.
+
+    Args:
+        expert: Policy that writes ``action``.
+        env: Environment, for the shape and limits of actions.
+        noise_eps: Standard deviation of the noise.
+
+    Returns:
+        A policy that writes the disturbed ``action``, and the expert's own action under
+        ``intended``.
+    """
     keep = TensorDictModule(torch.clone, ["action"], ["intended"])
     noise = AdditiveGaussianModule(
         env.action_spec, sigma_init=noise_eps, sigma_end=noise_eps
@@ -54,7 +64,16 @@ def play(
     expert: TensorDictModuleBase,
     exploration: ExplorationType = ExplorationType.RANDOM,
 ) -> list[TensorDictBase]:
-    """One fresh episode of every environment, each with its transitions (steps,)."""
+    """Play one new episode in every environment.
+
+    Args:
+        env: Batched environment.
+        expert: Policy that writes ``action``.
+        exploration: Whether the policy may add its noise.
+
+    Returns:
+        The episodes, each with its transitions (steps,).
+    """
     with torch.no_grad(), set_exploration_type(exploration):
         rollout = env.rollout(
             env.max_episode_steps,
@@ -68,9 +87,8 @@ def play(
 
 
 def join(episodes: list[TensorDictBase]) -> TensorDictBase:
-    """The transitions of all episodes, one after the other, numbered by episode."""
+    """Concatenate episodes; ``("collector", "traj_ids")`` numbers them."""
     transitions = TensorDict.cat(episodes)
-    # The key by which collectors, and HindsightRelabel, tell trajectories apart.
     lengths = torch.tensor([len(episode) for episode in episodes])
     numbers = torch.arange(len(episodes)).repeat_interleave(lengths)
     transitions["collector", "traj_ids"] = numbers

@@ -1,13 +1,13 @@
-"""Recording a small data set, and what imitating it comes to."""
+"""Helpers: record a small data set, and imitate one."""
 
 from pathlib import Path
 
 import torch
 
 from torch_panda.commands import record as record_demos
-from torch_panda.datasets.demonstrations import make_demo_buffer
 from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.evaluation import evaluate
+from torch_panda.learning.pretraining import make_demo_buffer
 
 
 def record(format, out, env_id, episodes, seed=0, **options):
@@ -19,7 +19,7 @@ def record(format, out, env_id, episodes, seed=0, **options):
 
 
 def imitate(env, demos):
-    """Success at the end of an episode of each environment, after 300 updates."""
+    """The success rate of an agent after 300 gradient steps of imitation."""
     torch.manual_seed(0)
     agent = make_agent(env, Hyperparameters())
     agent.normalizer.update(demos["observation"], demos["desired_goal"])
