@@ -1,5 +1,8 @@
 """The viewer in the browser: what its server holds is what the environments are."""
 
+import socket
+from http.client import HTTPConnection
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +10,9 @@ import torch
 import torch_panda
 
 pytest.importorskip("viser", reason="needs the extra viewer")
+
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from torch_panda.rendering import web_bodies, web_viewer
 
@@ -141,3 +147,121 @@ def test_bad_calls_are_named(env, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(torch_panda.BulletError, match="closed"):
         env.open_viewer()
+
+
+@pytest.fixture(scope="module")
+def viewer():
+    with torch_panda.make("PandaReach-v1", seed=0) as env:
+        env.reset()
+        with env.open_viewer(port=8765, allowed_hosts=("lab.example",)) as viewer:
+            viewer.update()
+            yield viewer
+
+
+def get(viewer, host):
+    """Status and text that the page's address answers to a request with this Host."""
+    connection = HTTPConnection("127.0.0.1", viewer._server.get_port(), timeout=10)
+    connection.putrequest("GET", "/", skip_host=True)
+    for name in host if isinstance(host, tuple) else (host,):
+        connection.putheader("Host", name)
+    connection.endheaders()
+    response = connection.getresponse()
+    return response.status, response.read().decode()
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["localhost", "127.0.0.1:8765", "[::1]:9", "LocalHost:80", "lab.example:8443"],
+)
+def test_the_page_is_served_under_loopback_and_listed_names(viewer, host):
+    status, text = get(viewer, host)
+    assert status == 200
+    assert "<html" in text
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example",
+        "evil.example:8765",
+        "localhost.evil.example",
+        "evil.example@localhost",
+        "localhost:x",
+        "",
+        ("localhost", "evil.example"),
+    ],
+)
+def test_the_page_is_not_served_under_other_names(viewer, host):
+    status, _ = get(viewer, host)
+    assert status in (400, 403)
+
+
+def test_a_refusal_says_how_to_allow_a_name(viewer):
+    status, text = get(viewer, "robot.example:80")
+    assert status == 403
+    assert "'robot.example'" in text and "allowed_hosts" in text
+
+
+def open_socket(viewer, origin, host="localhost:8765"):
+    """Connect as viser's page does, from a page of another origin."""
+    return connect(
+        f"ws://{host}",
+        sock=socket.create_connection(("127.0.0.1", viewer._server.get_port())),
+        origin=origin,
+        subprotocols=[f"viser-v{web_bodies.viser.__version__}"],
+        open_timeout=10,
+        max_size=None,
+    )
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "http://evil.example:8765",
+        "http://localhost:8766",  # another server on the same machine
+        "http://localhost",
+        "null",
+    ],
+)
+def test_other_web_pages_cannot_connect(viewer, origin):
+    with pytest.raises(InvalidStatus, match="403"):
+        open_socket(viewer, origin)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("localhost:8765", "http://localhost:8765"),
+        ("localhost:9000", "http://localhost:9000"),  # a tunnel's port
+        ("lab.example", "https://lab.example"),  # a tunnel with TLS
+        ("127.0.0.1:8765", None),  # no browser
+    ],
+)
+def test_the_own_page_can_connect(viewer, host, origin):
+    with open_socket(viewer, origin, host) as connection:
+        assert connection.recv(timeout=10)
+
+
+def test_a_version_of_viser_that_cannot_be_checked_is_refused(env, monkeypatch):
+    monkeypatch.setattr(web_viewer.viser, "ViserServer", lambda **options: None)
+    with pytest.raises(RuntimeError, match="does not allow to check its requests"):
+        env.open_viewer(port=8765)
+
+
+@pytest.mark.parametrize("chosen", [-100, -1, 2, 10**30])
+def test_indices_from_a_browser_never_raise(env, chosen):
+    """A client sends what it likes, whatever the limits of the page's sliders."""
+    env.reset()
+    with env.open_viewer(port=8765) as viewer:
+        viewer.update()
+        for step in (-100, 99, 10**30):
+            for handle, value in ((viewer._chosen, chosen), (viewer._step, step)):
+                handle._impl.value = value
+            viewer._choose(Click)
+            viewer._go_to(Click)
+            assert viewer.paused
+            viewer._pause.value = False
+            env.step(env.full_action_spec.rand())
+            viewer.update()
+        assert "step 3" in viewer._status.content

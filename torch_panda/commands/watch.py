@@ -52,6 +52,7 @@ def serve(
     *,
     host: str,
     port: int,
+    allowed_hosts: Sequence[str],
 ) -> None:
     """Play episodes in a browser, in real time, with the next policy for each.
 
@@ -60,8 +61,11 @@ def serve(
         policies: one for each episode; with the last one it ends.
         host: the address at which the page is.
         port: or the next one that is free.
+        allowed_hosts: names of this machine under which browsers may open the page.
     """
-    with env.open_viewer(CAMERA, host=host, port=port) as viewer:
+    with env.open_viewer(
+        CAMERA, host=host, port=port, allowed_hosts=allowed_hosts
+    ) as viewer:
         print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
         for number, policy in enumerate(policies, 1):
             viewer.write(f"episode {number}")
@@ -111,6 +115,8 @@ class Args:
     """with --web, the address to serve at; 0.0.0.0 lets other machines in"""
     port: Port = 8080
     """with --web, the port, or the next one that is free"""
+    allowed_hosts: tuple[str, ...] = ()
+    """with --web, names of this machine under which other machines open the page"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 
@@ -143,7 +149,13 @@ def main(args: Args) -> None:
                 policies: Iterator[TensorDictModuleBase] = itertools.repeat(policy)
                 if checkpoint:
                     policies = follow(Path(args.policy), env)
-                serve(env, policies, host=args.host, port=args.port)
+                serve(
+                    env,
+                    policies,
+                    host=args.host,
+                    port=args.port,
+                    allowed_hosts=args.allowed_hosts,
+                )
             elif args.human:
                 show(env, policy, args.num_envs)
             else:

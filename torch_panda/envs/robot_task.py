@@ -434,6 +434,7 @@ class RobotTaskEnv(EnvBase):
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
+        allowed_hosts: Sequence[str] = (),
     ) -> "WebViewer":
         """Serve the scene to browsers, in three dimensions; needs the extra ``viewer``.
 
@@ -446,6 +447,9 @@ class RobotTaskEnv(EnvBase):
                 defaults.
             host: Address at which it serves; "0.0.0.0" lets other machines in.
             port: First port to try; the viewer takes the next free one, see ``url``.
+            allowed_hosts: Names of this machine under which browsers may open the page,
+                beside ``host`` and the loopback names. Other requests, and requests of
+                other web pages, are refused.
 
         Raises:
             ImportError: viser is not installed.
@@ -467,6 +471,7 @@ class RobotTaskEnv(EnvBase):
                 camera=camera or Camera(),
                 host=host,
                 port=port,
+                allowed_hosts=allowed_hosts,
             )
 
     # ---- closing -------------------------------------------------------------------

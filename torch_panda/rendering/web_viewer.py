@@ -4,7 +4,7 @@ This module needs the extra ``viewer``.
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,11 @@ from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rendering.camera import Camera
+from torch_panda.rendering.web_access import (
+    WILDCARDS,
+    allowed_names,
+    restricted_servers,
+)
 from torch_panda.rendering.web_bodies import WebBodies
 
 POSITION = 3  # numbers of an object's part of a goal
@@ -45,8 +50,10 @@ class WebViewer:
         max_episode_steps: where the slider ends.
         title: of the page.
         camera: where the view starts.
-        host: the address at which it serves.
-        port: or the next one that is free.
+        host: Address at which it serves.
+        port: First port to try; the viewer takes the next free one.
+        allowed_hosts: Names of this machine under which browsers may open the page,
+            beside ``host`` and the loopback names.
     """
 
     def __init__(
@@ -59,6 +66,7 @@ class WebViewer:
         camera: Camera,
         host: str,
         port: int,
+        allowed_hosts: Sequence[str] = (),
     ) -> None:
         self._simulation, self._observe, self._title = simulation, observe, title
         self._episodes: list[list[Frame]] = [[] for _ in range(simulation.num_envs)]
@@ -67,9 +75,10 @@ class WebViewer:
         self._lock = threading.RLock()
         self._resumed = threading.Event()
         self._resumed.set()
-        self._server = server = viser.ViserServer(
-            host=host, port=port, label=title, verbose=False
-        )
+        with restricted_servers(allowed_names(host, allowed_hosts)):
+            self._server = server = viser.ViserServer(
+                host=host, port=port, label=title, verbose=False
+            )
         server.initial_camera.look_at = camera.target
         server.initial_camera.position = eye(camera)
         self._bodies = WebBodies(server, simulation.clients[0], simulation.scene)
@@ -90,8 +99,10 @@ class WebViewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        """Address of the page."""
+        host = self._server.get_host()
+        name = "localhost" if host in WILDCARDS else host
+        return f"http://{name}:{self._server.get_port()}"
 
     @property
     def paused(self) -> bool:
@@ -152,7 +163,7 @@ class WebViewer:
 
     def _choose(self, event: Any) -> None:  # noqa: ANN401 (viser's)
         with self._lock:
-            self._env = min(int(self._chosen.value), len(self._episodes) - 1)
+            self._env = _clamped(self._chosen.value, len(self._episodes))
             if not self.paused:
                 self._step.value = max(len(self._episodes[self._env]) - 1, 0)
             self._draw()
@@ -174,12 +185,17 @@ class WebViewer:
             episode = self._episodes[self._env]
             if not episode:
                 return
-            frame = episode[min(int(self._step.value), len(episode) - 1)]
+            frame = episode[_clamped(self._step.value, len(episode))]
             number = f", environment {self._env}" if len(self._episodes) > 1 else ""
             self._status.content = f"**{self._title}**{number}\n\n{frame.status}"
             forces = frame.forces if self._contacts.value else frame.forces[:0]
             with self._server.atomic():
                 self._bodies.show(*frame[:3], arrows(forces))
+
+
+def _clamped(index: int, count: int) -> int:
+    """An index that a browser sent, moved into 0 to count - 1."""
+    return max(0, min(index, count - 1))
 
 
 def read_forces(
