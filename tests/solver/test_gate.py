@@ -21,7 +21,7 @@ def closed(monkeypatch):
     """A process in which nothing is replaced yet, and nothing may be enabled."""
     solver = gate.load_library()
     solver.uninstall()
-    slot = gate.find_slot(library.library_path())
+    replacements = gate.find_replacements(library.library_path())
     monkeypatch.delenv(SOLVER_VARIABLE, raising=False)
     monkeypatch.setattr(gate, "_status", None)
     monkeypatch.setattr(
@@ -29,8 +29,9 @@ def closed(monkeypatch):
     )
     yield
     monkeypatch.undo()
-    assert gate.find_slot(library.library_path()) == slot  # Bullet's function is back
-    solver.install(*slot)
+    # Bullet's functions are back in their slots.
+    assert gate.find_replacements(library.library_path()) == replacements
+    solver.install(replacements)
 
 
 def reason():
@@ -82,9 +83,12 @@ def test_no_compiled_library(closed, monkeypatch):
     assert "was installed without it" in reason()
 
 
-@pytest.mark.parametrize("name", ["_VTABLE", "_ITERATIONS"])
-def test_missing_symbol(closed, monkeypatch, name):
-    monkeypatch.setattr(gate, name, "_ZTV7missing")
+@pytest.mark.parametrize("part", [0, 1])
+@pytest.mark.parametrize("index", range(len(gate._REPLACED)))
+def test_missing_symbol(closed, monkeypatch, index, part):
+    replaced = [list(names) for names in gate._REPLACED]
+    replaced[index][part] = "_ZTV7missing"
+    monkeypatch.setattr(gate, "_REPLACED", replaced)
     assert reason() == "pybullet has no symbol _ZTV7missing"
 
 
@@ -103,8 +107,10 @@ def test_module_that_is_no_elf_file(closed, monkeypatch):
 
 
 def test_function_that_is_not_in_the_table(closed, monkeypatch):
-    monkeypatch.setattr(gate, "_VTABLE", "_ZTV21btMultiBodyJointMotor")
-    assert "holds the replaced function 0 times" in reason()
+    (table, _), *others = gate._REPLACED
+    replaced = [(table, others[1][1]), *others]
+    monkeypatch.setattr(gate, "_REPLACED", replaced)
+    assert "holds the function to replace 0 times" in reason()
 
 
 @pytest.mark.parametrize(
@@ -116,6 +122,11 @@ def test_function_that_is_not_in_the_table(closed, monkeypatch):
         ("friction", 0.5, "m_friction"),
         ("num_iterations", 50, "m_numIterations"),
         ("num_dofs", 9, "number of rows of motors and limits"),
+        ("num_links", 4, "btMultiBody.m_links"),
+        ("kp", 0.1, "btMultiBodyJointMotor.m_kp"),
+        ("kd", 0.5, "btMultiBodyJointMotor.m_kd"),
+        ("motor_table", 0, "btMultiBodyConstraint"),
+        ("limit_table", 0, "btMultiBodyConstraint"),
     ],
 )
 def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
@@ -130,6 +141,11 @@ def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
     monkeypatch.setattr(native.SolverLibrary, "set_mode", set_mode)
     assert reason().startswith("Bullet's layout differs: ")
     assert wrong in reason()
+
+
+def test_library_of_other_sources(closed, monkeypatch):
+    monkeypatch.setattr(native, "VERSION", 0)
+    assert "but the sources of torch_panda have version 0" in reason()
 
 
 def test_results_that_differ(closed, monkeypatch):
@@ -150,6 +166,18 @@ def test_results_that_differ(closed, monkeypatch):
 def test_groups_that_are_left_to_bullet(closed, monkeypatch):
     monkeypatch.setattr(self_test, "SOLVE", native.LEAVE)
     assert reason() == "it did not solve all groups of the self-test"
+
+
+def test_rows_that_are_left_to_bullet(closed, monkeypatch):
+    counts = native.SolverLibrary.counts
+
+    def none_created(self):
+        result = counts(self)
+        result.created, result.not_created = 0, result.created
+        return result
+
+    monkeypatch.setattr(native.SolverLibrary, "counts", none_created)
+    assert reason() == "it did not create the rows of the self-test"
 
 
 def test_decides_once(monkeypatch):

@@ -12,6 +12,7 @@ from tests.solver.solvers import assert_same, needs_packed
 
 pytestmark = needs_packed
 
+SELF_COLLISION = pybullet.URDF_USE_SELF_COLLISION
 BOX = {"halfExtents": (0.05, 0.05, 0.05)}
 
 
@@ -347,5 +348,59 @@ def test_solver_analytics():
             world.analytics = world.client.stepSimulation()
 
         world.state, world.step = state, step
+
+    assert_same(scene(fill), 60)
+
+
+ROBOTS = (
+    "kuka_iiwa/model.urdf",
+    "r2d2.urdf",
+    "cartpole.urdf",
+    "humanoid/humanoid.urdf",
+    "xarm/xarm6_robot.urdf",
+    "pr2_gripper.urdf",
+    "racecar/racecar.urdf",
+    "husky/husky.urdf",
+    "aliengo/aliengo.urdf",
+    "spherical_joint_limit.urdf",
+    "sphere2.urdf",
+    "teddy_vhacd.urdf",
+)
+
+
+@pytest.mark.parametrize("fixed_base", [False, True])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_robots_of_pybullet(robot, fixed_base):
+    """Floating bases, joints of several degrees of freedom, meshes, self-collisions."""
+
+    def fill(world):
+        client = world.client
+        client.setAdditionalSearchPath(pybullet_data.getDataPath())
+        world.ground()
+        world.box(0.5, (0.3, 0.1, 0.05))
+        body = client.loadURDF(
+            robot, (0, 0, 0.4), useFixedBase=fixed_base, flags=SELF_COLLISION
+        )
+        world.bodies.append(body)
+        generator = np.random.default_rng(0)
+        joints = [
+            joint
+            for joint in range(client.getNumJoints(body))
+            if client.getJointInfo(body, joint)[2]
+            in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)
+        ]
+
+        def drive(k):
+            if k % 10 == 0:
+                for joint in joints:
+                    client.setJointMotorControl2(
+                        body,
+                        joint,
+                        pybullet.POSITION_CONTROL,
+                        targetPosition=generator.uniform(-2, 2),
+                        force=generator.choice([0.0, 1.0, 50.0]),
+                    )
+
+        world.drive = drive
 
     assert_same(scene(fill), 60)

@@ -58,22 +58,32 @@ struct link {
     char pad5[72];
 };
 
+/* btCollisionObject */
+struct collision_object {
+    char pad0[408];
+    int flags;
+    char pad1[4];
+    int companion_id;
+};
+
 /* btMultiBody */
 struct multi_body {
-    char pad0[320];
+    char pad0[8];
+    struct collision_object *base_collider;
+    char pad1[304];
     struct array links; /* of struct link */
-    char pad1[32];
+    char pad2[32];
     struct array delta_v; /* m_deltaV */
-    struct array real_buffer;
-    struct array vector_buffer;
-    struct array matrix_buffer;
-    char pad2[385];
+    struct array real_buffer;   /* velocities, then inverses of D at squared offsets */
+    struct array vector_buffer; /* h, a struct spatial for each degree of freedom */
+    struct array matrix_buffer; /* rotations from the parent, the base's first */
+    char pad3[385];
     char fixed_base;
-    char pad3[46];
+    char pad4[46];
     int companion_id;
-    char pad4[45];
+    char pad5[45];
     char pos_updated; /* __posUpdated */
-    char pad5[2];
+    char pad6[2];
     int num_dofs;
 };
 
@@ -148,11 +158,39 @@ struct solver_info {
     int num_inner_iterations; /* m_numNonContactInnerIterations */
 };
 
-/* btCollisionObject */
-struct collision_object {
-    char pad0[416];
-    int companion_id;
+/* btMultiBodyConstraint */
+struct constraint {
+    void **vtable;
+    struct multi_body *body_a, *body_b;
+    int link_a, link_b;
+    int type;
+    int num_rows;
+    int jac_size_a, jac_size_both;
+    int position_offset;
+    char is_unilateral;
+    int num_dofs_finalized;
+    double max_impulse;
+    struct array data; /* a number, the Jacobians and a position for each row */
 };
+
+/* btMultiBodyJointMotor */
+struct motor {
+    struct constraint base;
+    double desired_velocity, desired_position;
+    double kd, kp, erp, rhs_clamp;
+};
+
+/* btMultiBodyJointLimitConstraint */
+struct limit {
+    struct constraint base;
+    double lower, upper;
+};
+
+/* enum btMultibodyLink::eFeatherstoneJointType */
+enum { REVOLUTE = 0, PRISMATIC = 1, FIXED = 4 };
+
+/* btCollisionObject::CF_KINEMATIC_OBJECT */
+enum { KINEMATIC = 2 };
 
 /* enum btSolverMode */
 enum { TWO_FRICTION_DIRECTIONS = 16, NO_FRICTION_CONE = 2048 };
@@ -176,6 +214,9 @@ AT(link, joint_feedback, 1104);
 AT(link, world_basis, 1112);
 AT(link, world_origin, 1208);
 SIZE(link, 1312);
+AT(collision_object, flags, 408);
+AT(collision_object, companion_id, 416);
+AT(multi_body, base_collider, 8);
 AT(multi_body, links, 320);
 AT(multi_body, delta_v, 384);
 AT(multi_body, real_buffer, 416);
@@ -217,6 +258,18 @@ AT(solver, analytics.residual, 408);
 AT(solver, multi_body_joint_rows, 416);
 AT(solver, multi_body_spinning_rows, 544);
 AT(solver, data, 576);
+AT(constraint, body_a, 8);
+AT(constraint, link_a, 24);
+AT(constraint, num_rows, 36);
+AT(constraint, jac_size_a, 40);
+AT(constraint, position_offset, 48);
+AT(constraint, num_dofs_finalized, 56);
+AT(constraint, max_impulse, 64);
+AT(constraint, data, 72);
+AT(motor, desired_velocity, 104);
+AT(motor, rhs_clamp, 144);
+AT(limit, lower, 104);
+AT(limit, upper, 112);
 AT(solver_info, time_step, 24);
 AT(solver_info, num_iterations, 40);
 AT(solver_info, erp, 64);
@@ -225,7 +278,6 @@ AT(solver_info, split_impulse_threshold, 136);
 AT(solver_info, mode, 176);
 AT(solver_info, residual_threshold, 208);
 AT(solver_info, num_inner_iterations, 232);
-AT(collision_object, companion_id, 416);
 
 #undef AT
 #undef SIZE

@@ -1,4 +1,4 @@
-"""Decides whether Bullet's solver is replaced, and replaces it.
+"""Decides whether parts of Bullet's solver are replaced, and replaces them.
 
 The replacement depends on the layout of Bullet's objects in memory. It is used only if
 all of these conditions hold; otherwise Bullet's own functions run:
@@ -6,9 +6,9 @@ all of these conditions hold; otherwise Bullet's own functions run:
 1. ``TORCH_PANDA_SOLVER`` is not ``bullet``.
 2. The process runs on x86-64 Linux. Other compilers fuse multiply-adds.
 3. The installed pybullet has the supported version.
-4. torch_panda was installed with its C library.
-5. pybullet's extension module has the symbols that are needed, and the table of virtual
-   functions holds the function that is replaced exactly once.
+4. torch_panda was installed with its C library, compiled from the same sources.
+5. pybullet's extension module has the symbols that are needed, and each table of
+   virtual functions holds the function that is replaced exactly once.
 6. Bullet's objects in a known scene are laid out as ``bullet_types.h`` declares.
 7. The same scene comes out the same with and without the replacement, bit for bit.
 
@@ -31,7 +31,11 @@ from typing import Literal
 
 from torch_panda.bullet import library
 from torch_panda.bullet.solver.elf import read_symbols
-from torch_panda.bullet.solver.native import GateError, SolverLibrary
+from torch_panda.bullet.solver.native import (
+    GateError,
+    Replacement,
+    SolverLibrary,
+)
 from torch_panda.bullet.solver.self_test import run_self_test
 
 SolverName = Literal["packed", "bullet"]
@@ -40,11 +44,28 @@ SolverName = Literal["packed", "bullet"]
 SOLVER_VARIABLE = "TORCH_PANDA_SOLVER"
 
 _LIBRARY = "torch_panda.bullet.solver._solver"
-_VTABLE = "_ZTV27btMultiBodyConstraintSolver"
-_ITERATIONS = (
-    "_ZN35btSequentialImpulseConstraintSolver33solveGroupCacheFriendlyIterations"
-    "EPP17btCollisionObjectiPP20btPersistentManifoldiPP17btTypedConstrainti"
-    "RK19btContactSolverInfoP12btIDebugDraw"
+_SOLVER = "_ZTV27btMultiBodyConstraintSolver"
+_MOTOR = "_ZTV21btMultiBodyJointMotor"
+_LIMIT = "_ZTV31btMultiBodyJointLimitConstraint"
+_CREATE_ROWS = (
+    "20createConstraintRowsER20btAlignedObjectArrayI27btMultiBodySolverConstraint"
+    "ER23btMultiBodyJacobianDataRK19btContactSolverInfo"
+)
+# Tables of virtual functions, and what is replaced in them; in the order of hook.c.
+_REPLACED = (
+    (
+        _SOLVER,
+        "_ZN35btSequentialImpulseConstraintSolver33solveGroupCacheFriendlyIterations"
+        "EPP17btCollisionObjectiPP20btPersistentManifoldiPP17btTypedConstrainti"
+        "RK19btContactSolverInfoP12btIDebugDraw",
+    ),
+    (
+        _SOLVER,
+        "_ZN27btMultiBodyConstraintSolver15convertContactsEPP20btPersistentManifoldi"
+        "RK19btContactSolverInfo",
+    ),
+    (_MOTOR, "_ZN21btMultiBodyJointMotor" + _CREATE_ROWS),
+    (_LIMIT, "_ZN31btMultiBodyJointLimitConstraint" + _CREATE_ROWS),
 )
 _EXPORTED = "b3ConnectPhysicsDirect"  # its address is known in the process, too
 
@@ -117,9 +138,12 @@ def open_gate() -> None:
     check_platform()
     check_version()
     solver = load_library()
-    solver.install(*find_slot(library.library_path()))
+    replacements = find_replacements(library.library_path())
+    solver.install(replacements)
     try:
-        run_self_test(solver)
+        run_self_test(
+            solver, motor_table=replacements[2].table, limit_table=replacements[3].table
+        )
     except GateError:
         solver.uninstall()
         raise
@@ -155,28 +179,34 @@ def load_library() -> SolverLibrary:
     return SolverLibrary(spec.origin)
 
 
-def find_slot(path: str) -> tuple[int, int]:
-    """Find what is replaced: the slot of a table, and Bullet's function in it.
+def find_replacements(path: str) -> list[Replacement]:
+    """Find the functions that are replaced, in the order of ``hook.c``.
 
     Args:
         path: Path of pybullet's extension module.
     """
+    names = {name for names in _REPLACED for name in names} | {_EXPORTED}
     try:
-        symbols = read_symbols(path, (_VTABLE, _ITERATIONS, _EXPORTED))
+        symbols = read_symbols(path, names)
     except ValueError as error:
         raise GateError(str(error)) from None
-    for name in (_VTABLE, _ITERATIONS, _EXPORTED):
+    for name in sorted(names):
         if name not in symbols:
             raise GateError(f"pybullet has no symbol {name}")
     exported = ctypes.cast(getattr(library.WORK, _EXPORTED), c_void_p).value
     assert exported is not None
     base = exported - symbols[_EXPORTED].address
-    function = base + symbols[_ITERATIONS].address
-    table = base + symbols[_VTABLE].address
-    entries = (c_void_p * (symbols[_VTABLE].size // 8)).from_address(table)
-    slots = [i for i, entry in enumerate(entries) if entry == function]
-    if len(slots) != 1:
-        raise GateError(
-            f"{_VTABLE} holds the replaced function {len(slots)} times, expected once"
-        )
-    return table + 8 * slots[0], function
+    replacements = []
+    for table_name, function_name in _REPLACED:
+        function = base + symbols[function_name].address
+        table = base + symbols[table_name].address
+        entries = (c_void_p * (symbols[table_name].size // 8)).from_address(table)
+        slots = [i for i, entry in enumerate(entries) if entry == function]
+        if len(slots) != 1:
+            raise GateError(
+                f"{table_name} holds the function to replace {len(slots)} times, "
+                f"expected once"
+            )
+        # Objects point behind the offset and the type information of the table.
+        replacements.append(Replacement(table + 16, table + 8 * slots[0], function))
+    return replacements

@@ -1,9 +1,9 @@
 /*
- * Puts the solver into Bullet's table of virtual functions.
+ * Puts the solver into Bullet's tables of virtual functions.
  *
- * Only a pointer in data is replaced: no code is changed, and nothing on disk. The
- * table lies in a page that the loader made read-only, so this page is writable for
- * the moment of the replacement.
+ * Only pointers in data are replaced: no code is changed, and nothing on disk. The
+ * tables lie in pages that the loader made read-only, so a page is writable for the
+ * moment of the replacement.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #define _GNU_SOURCE
@@ -13,9 +13,21 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-typedef double (*iterations_function)(struct solver *, struct collision_object **, int,
-                                      void **, int, void **, int,
-                                      const struct solver_info *, void *);
+enum { VERSION = 1 }; /* native.py refuses a library of another version */
+
+/* The functions that are replaced, in the order of gate.py. */
+enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, NUM_FUNCTIONS };
+
+/* btSequentialImpulseConstraintSolver::solveGroupCacheFriendlyIterations */
+typedef double iterations_function(struct solver *, struct collision_object **, int,
+                                   void **, int, void **, int,
+                                   const struct solver_info *, void *);
+/* btMultiBodyConstraintSolver::convertContacts */
+typedef void convert_function(struct solver *, void **, int,
+                              const struct solver_info *);
+/* btMultiBodyConstraint::createConstraintRows */
+typedef void rows_function(void *, struct array *, struct jacobian_data *,
+                           const struct solver_info *);
 
 /* Who solves the groups of a thread. */
 enum mode {
@@ -29,25 +41,34 @@ enum mode {
 struct counts {
     int solved;      /* groups that this solver solved */
     int left;        /* groups that it left to Bullet's function */
-    int joint_rows;  /* rows of motors and limits that it saw */
+    int created;     /* motors and limits whose rows it created */
+    int not_created; /* those that it left to Bullet's function */
+    int joint_rows;  /* rows that it probed */
     int contact_rows;
     int spinning_rows;
     const char *wrong; /* a field that is not laid out as declared */
 };
 
-static iterations_function bullet_iterations;
-static void **iterations_slot;
+static void *bullet[NUM_FUNCTIONS];
+static void **slots[NUM_FUNCTIONS];
 static int enabled; /* for all threads in mode FOLLOW */
 static __thread enum mode mode;
 static __thread struct counts counts;
 static __thread struct expectation expectation;
+/* The responses of the group that this thread converts, or NULL: see `convert`. */
+static __thread struct responses **responses;
+
+static int is_active(void) {
+    const enum mode own = mode;
+    return own == FOLLOW ? __atomic_load_n(&enabled, __ATOMIC_RELAXED) : own == SOLVE;
+}
 
 static double iterations(struct solver *solver, struct collision_object **bodies,
                          int num_bodies, void **manifolds, int num_manifolds,
                          void **constraints, int num_constraints,
                          const struct solver_info *info, void *drawer) {
     const enum mode own = mode;
-    if (own == FOLLOW ? __atomic_load_n(&enabled, __ATOMIC_RELAXED) : own == SOLVE) {
+    if (is_active()) {
         const int solved = solve_group(solver, bodies, num_bodies, num_manifolds,
                                        num_constraints, info);
         if (own == SOLVE) *(solved ? &counts.solved : &counts.left) += 1;
@@ -61,12 +82,44 @@ static double iterations(struct solver *solver, struct collision_object **bodies
             counts.spinning_rows += solver->multi_body_spinning_rows.size;
         }
     }
-    const double result =
-        bullet_iterations(solver, bodies, num_bodies, manifolds, num_manifolds,
-                          constraints, num_constraints, info, drawer);
+    const double result = ((iterations_function *)bullet[ITERATIONS])(
+        solver, bodies, num_bodies, manifolds, num_manifolds, constraints,
+        num_constraints, info, drawer);
     if (own == PROBE && counts.wrong == NULL)
         counts.wrong = probe_result(solver, bodies, num_bodies, num_manifolds, info);
     return result;
+}
+
+/* While Bullet converts a group, rows of joints share the responses of their bodies. */
+static void convert(struct solver *solver, void **manifolds, int num_manifolds,
+                    const struct solver_info *info) {
+    struct responses *list = NULL;
+    if (is_active()) responses = &list;
+    ((convert_function *)bullet[CONVERT])(solver, manifolds, num_manifolds, info);
+    responses = NULL;
+    free_responses(list);
+}
+
+static void motor_rows(void *motor, struct array *rows, struct jacobian_data *data,
+                       const struct solver_info *info) {
+    struct responses **shared = responses;
+    if (shared != NULL) {
+        const int created = create_motor_rows(shared, motor, rows, data, info);
+        if (mode == SOLVE) *(created ? &counts.created : &counts.not_created) += 1;
+        if (created) return;
+    }
+    ((rows_function *)bullet[MOTOR_ROWS])(motor, rows, data, info);
+}
+
+static void limit_rows(void *limit, struct array *rows, struct jacobian_data *data,
+                       const struct solver_info *info) {
+    struct responses **shared = responses;
+    if (shared != NULL) {
+        const int created = create_limit_rows(shared, limit, rows, data, info);
+        if (mode == SOLVE) *(created ? &counts.created : &counts.not_created) += 1;
+        if (created) return;
+    }
+    ((rows_function *)bullet[LIMIT_ROWS])(limit, rows, data, info);
 }
 
 /* Stores a function in a slot of a table; returns 0, or 1 if the page is locked. */
@@ -79,16 +132,28 @@ static int store(void **slot, void *function) {
     return 0;
 }
 
-/* Replaces Bullet's function in a slot of a table; returns as `store` does. */
-int solver_install(void **slot, iterations_function bullet) {
-    bullet_iterations = bullet;
-    iterations_slot = slot;
-    return store(slot, (void *)iterations);
+int solver_version(void) { return VERSION; }
+
+/* Puts Bullet's functions back into their slots. */
+void solver_uninstall(void) {
+    for (int i = 0; i < NUM_FUNCTIONS; i++)
+        if (slots[i] != NULL) store(slots[i], bullet[i]);
 }
 
-/* Puts Bullet's function back into its slot. */
-int solver_uninstall(void) {
-    return store(iterations_slot, (void *)bullet_iterations);
+/* Replaces Bullet's functions in their slots; returns 0, or 1 if a page is locked. */
+int solver_install(void **const *new_slots, void *const *functions) {
+    void *const replacements[] = {(void *)iterations, (void *)convert,
+                                  (void *)motor_rows, (void *)limit_rows};
+    for (int i = 0; i < NUM_FUNCTIONS; i++) {
+        slots[i] = new_slots[i];
+        bullet[i] = functions[i];
+    }
+    for (int i = 0; i < NUM_FUNCTIONS; i++)
+        if (store(slots[i], replacements[i])) {
+            solver_uninstall();
+            return 1;
+        }
+    return 0;
 }
 
 /* Switches all threads in mode FOLLOW to this solver, or to Bullet's function. */

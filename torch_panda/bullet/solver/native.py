@@ -1,26 +1,55 @@
 """The C library of the replacement, as the installation compiled it."""
 
 import ctypes
+from collections.abc import Sequence
 from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_void_p
+from typing import NamedTuple
+
+# Version of the C sources, as in hook.c: the library must have been compiled from
+# sources of this version.
+VERSION = 1
 
 # ``enum mode``
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
+
+# ``enum btMultibodyLink::eFeatherstoneJointType``
+REVOLUTE, PRISMATIC, FIXED = 0, 1, 4
 
 
 class GateError(Exception):
     """A condition of the gate does not hold."""
 
 
+class Replacement(NamedTuple):
+    """One of Bullet's functions that is replaced.
+
+    Attributes:
+        table: Address of the table of virtual functions, as objects point to it.
+        slot: Address of the function's slot in the table.
+        function: Address of Bullet's function.
+    """
+
+    table: int
+    slot: int
+    function: int
+
+
 class Expectation(Structure):
     """``struct expectation``."""
 
     _fields_ = (
+        ("motor_table", c_void_p),
+        ("limit_table", c_void_p),
         ("time_step", c_double),
         ("residual_threshold", c_double),
         ("motor_impulse", c_double),
         ("friction", c_double),
         ("num_iterations", c_int),
         ("num_dofs", c_int),
+        ("num_links", c_int),
+        ("joint_types", POINTER(c_int)),
+        ("kp", c_double),
+        ("kd", c_double),
     )
 
 
@@ -30,6 +59,8 @@ class Counts(Structure):
     _fields_ = (
         ("solved", c_int),
         ("left", c_int),
+        ("created", c_int),
+        ("not_created", c_int),
         ("joint_rows", c_int),
         ("contact_rows", c_int),
         ("spinning_rows", c_int),
@@ -42,13 +73,25 @@ class SolverLibrary:
 
     Args:
         path: Path of the compiled file.
+
+    Raises:
+        GateError: The library was compiled from sources of another version.
     """
 
     def __init__(self, path: str) -> None:
         functions = ctypes.PyDLL(path)  # cheap calls
+        version = (
+            functions.solver_version() if hasattr(functions, "solver_version") else 0
+        )
+        if version != VERSION:
+            raise GateError(
+                f"the compiled solver {path} has version {version}, but the sources of "
+                f"torch_panda have version {VERSION}: install torch_panda again"
+            )
         self._install = functions.solver_install
         self._install.argtypes = (c_void_p, c_void_p)
         self._uninstall = functions.solver_uninstall
+        self._uninstall.restype = None
         self._enable = functions.solver_enable
         self._enable.argtypes = (c_int,)
         self._enable.restype = None
@@ -59,17 +102,20 @@ class SolverLibrary:
         self._counts.argtypes = (POINTER(Counts),)
         self._counts.restype = None
 
-    def install(self, slot: int, function: int) -> None:
-        """Replace Bullet's function in a slot of the table of virtual functions.
+    def install(self, replacements: Sequence[Replacement]) -> None:
+        """Replace Bullet's functions in their slots.
 
         Raises:
-            GateError: The system does not make the table writable.
+            GateError: The system does not make a table writable.
         """
-        if self._install(slot, function):
-            raise GateError("the table of virtual functions cannot be made writable")
+        addresses = c_void_p * len(replacements)
+        slots = addresses(*(replacement.slot for replacement in replacements))
+        functions = addresses(*(replacement.function for replacement in replacements))
+        if self._install(slots, functions):
+            raise GateError("a table of virtual functions cannot be made writable")
 
     def uninstall(self) -> None:
-        """Put Bullet's function back into its slot."""
+        """Put Bullet's functions back into their slots."""
         self._uninstall()
 
     def enable(self, on: bool) -> None:

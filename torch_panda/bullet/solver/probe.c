@@ -8,6 +8,7 @@
 #if defined(__x86_64__) && defined(__linux__)
 #include "solver.h"
 
+#include <math.h>
 #include <stdint.h>
 
 #define CHECK(name, condition)                                                         \
@@ -53,6 +54,89 @@ static const char *probe_row(const struct solver *solver,
     return NULL;
 }
 
+/* The body that has joints, link by link. */
+static const char *probe_links(const struct multi_body *body,
+                               const struct expectation *expected) {
+    const int num_dofs = body->num_dofs;
+    CHECK("btMultiBody.m_links",
+          is_array(&body->links) && body->links.size == expected->num_links);
+    CHECK("btMultiBody.m_matrixBuf", is_array(&body->matrix_buffer) &&
+                                         body->matrix_buffer.size ==
+                                             expected->num_links + 1);
+    CHECK("btMultiBody.m_vectorBuf", is_array(&body->vector_buffer) &&
+                                         body->vector_buffer.size == 2 * num_dofs);
+    CHECK("btMultiBody.m_realBuf",
+          is_array(&body->real_buffer) &&
+              body->real_buffer.size ==
+                  6 + num_dofs + num_dofs * num_dofs + 6 + num_dofs);
+    CHECK("btMultiBody.m_fixedBase", body->fixed_base == 1);
+    const struct link *link = body->links.data;
+    int dof = 0;
+    for (int i = 0; i < expected->num_links; i++, link++) {
+        const int type = expected->joint_types[i];
+        CHECK("btMultibodyLink.m_jointType", link->joint_type == type);
+        CHECK("btMultibodyLink.m_dofCount", link->num_dofs == (type != FIXED));
+        CHECK("btMultibodyLink.m_parent", link->parent == (i < 4 ? i - 1 : 2));
+        CHECK("btMultibodyLink.m_dofOffset", link->dof_offset == dof);
+        CHECK("btMultibodyLink.m_jointPos",
+              type == FIXED || fabs(link->joint_position[0]) < 1.0);
+        const struct vector3 *axis =
+            type == REVOLUTE ? &link->axes[0].top : &link->axes[0].bottom;
+        CHECK("btMultibodyLink.m_axes",
+              type == FIXED ||
+                  fabs(axis->x * axis->x + axis->y * axis->y + axis->z * axis->z -
+                       1.0) < 1e-12);
+        const struct vector3 *row = link->world_basis.row;
+        CHECK("btMultibodyLink.m_cachedWorldTransform",
+              fabs(row[0].x * row[0].x + row[0].y * row[0].y + row[0].z * row[0].z -
+                   1.0) < 1e-9);
+        dof += link->num_dofs;
+    }
+    return NULL;
+}
+
+static const char *probe_constraint(const struct constraint_row *row,
+                                    const struct expectation *expected) {
+    const struct constraint *constraint = row->constraint;
+    CHECK("a row's m_orgConstraint", constraint != NULL);
+    const int is_motor = constraint->vtable == expected->motor_table;
+    CHECK("btMultiBodyConstraint", is_motor || constraint->vtable ==
+                                                   expected->limit_table);
+    const int size = row->multi_body_a->num_dofs + 6, num_rows = is_motor ? 1 : 2;
+    CHECK("btMultiBodyConstraint.m_bodyA", constraint->body_a == row->multi_body_a &&
+                                               constraint->body_b == row->multi_body_b);
+    CHECK("btMultiBodyConstraint.m_linkA", constraint->link_a == row->link_a &&
+                                               constraint->link_b == row->link_b);
+    CHECK("btMultiBodyConstraint.m_numRows", constraint->num_rows == num_rows);
+    CHECK("a row's m_orgDofIndex",
+          row->constraint_row >= 0 && row->constraint_row < num_rows);
+    CHECK("btMultiBodyConstraint.m_jacSizeA",
+          constraint->jac_size_a == size && constraint->jac_size_both == 2 * size &&
+              constraint->num_dofs_finalized == 2 * size);
+    CHECK("btMultiBodyConstraint.m_posOffset",
+          constraint->position_offset == (1 + 2 * size) * num_rows);
+    CHECK("btMultiBodyConstraint.m_data",
+          is_array(&constraint->data) &&
+              constraint->data.size == (2 + 2 * size) * num_rows);
+    CHECK("btMultiBodyConstraint.m_maxAppliedImpulse",
+          constraint->max_impulse == row->upper_limit);
+    if (is_motor) {
+        const struct motor *motor = (const struct motor *)constraint;
+        CHECK("limits of motors", row->upper_limit == expected->motor_impulse);
+        CHECK("btMultiBodyJointMotor.m_kp", motor->kp == expected->kp);
+        CHECK("btMultiBodyJointMotor.m_kd", motor->kd == expected->kd);
+        CHECK("btMultiBodyJointMotor.m_desiredVelocity", motor->desired_velocity == 0.0);
+    } else {
+        const struct limit *limit = (const struct limit *)constraint;
+        const struct link *link =
+            (const struct link *)row->multi_body_a->links.data + row->link_a;
+        CHECK("btMultiBodyJointLimitConstraint",
+              link->joint_position[0] <= limit->lower ||
+                  link->joint_position[0] >= limit->upper);
+    }
+    return NULL;
+}
+
 const char *probe_rows(const struct solver *solver, const struct solver_info *info,
                        const struct expectation *expected) {
     CHECK("m_timeStep", info->time_step == expected->time_step);
@@ -91,10 +175,12 @@ const char *probe_rows(const struct solver *solver, const struct solver_info *in
         if (wrong != NULL) return wrong;
         CHECK("a joint's bodies", row->multi_body_a == row->multi_body_b &&
                                       row->multi_body_a->num_dofs > 0);
-        num_motors += row->upper_limit == expected->motor_impulse &&
-                      row->lower_limit == -expected->motor_impulse;
+        if (i == 0) wrong = probe_links(row->multi_body_a, expected);
+        if (wrong == NULL) wrong = probe_constraint(row, expected);
+        if (wrong != NULL) return wrong;
+        num_motors += row->constraint->vtable == expected->motor_table;
     }
-    CHECK("limits of motors", num_joint_rows == 0 || num_motors == expected->num_dofs);
+    CHECK("number of motors", num_joint_rows == 0 || num_motors == expected->num_dofs);
 
     row = solver->multi_body_normal_rows.data;
     for (int i = 0; i < num_contacts; i++, row++) {

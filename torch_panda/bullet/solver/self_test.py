@@ -5,14 +5,18 @@ steps the scene first, and the layout of its objects is probed. Then the replace
 steps it. All state must be the same, bit for bit, after every step.
 """
 
+from ctypes import c_int
 from pathlib import Path
 
 from torch_panda.bullet import capi
 from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState
 from torch_panda.bullet.connection import doubles
 from torch_panda.bullet.solver.native import (
+    FIXED,
     FOLLOW,
+    PRISMATIC,
     PROBE,
+    REVOLUTE,
     SOLVE,
     Expectation,
     GateError,
@@ -26,23 +30,37 @@ _NUM_ITERATIONS = 40
 _RESIDUAL_THRESHOLD = 1e-8
 _FORCE = 40.0
 _FRICTION = 0.6
+_KP = 0.3
+_KD = 1.0
+_JOINT_TYPES = (REVOLUTE, REVOLUTE, FIXED, PRISMATIC, PRISMATIC)  # of the arm's links
 _NUM_JOINTS = 4
 _JOINT_RANGE = 0.8  # beyond the limits of all joints
 
 
-def run_self_test(solver: SolverLibrary) -> None:
+def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) -> None:
     """Probe the layout of Bullet's objects, and compare both solvers.
+
+    Args:
+        solver: The replacement, installed but not enabled.
+        motor_table: Address of the motors' table of virtual functions.
+        limit_table: Address of the joint limits' table of virtual functions.
 
     Raises:
         GateError: The layout differs, or a bit of the results.
     """
     expectation = Expectation(
+        motor_table,
+        limit_table,
         _TIME_STEP,
         _RESIDUAL_THRESHOLD,
         _FORCE * _TIME_STEP,
         _FRICTION * _FRICTION,
         _NUM_ITERATIONS,
         _NUM_JOINTS,
+        len(_JOINT_TYPES),
+        (c_int * len(_JOINT_TYPES))(*_JOINT_TYPES),
+        _KP,
+        _KD,
     )
     try:
         solver.set_mode(PROBE, expectation)
@@ -60,6 +78,9 @@ def run_self_test(solver: SolverLibrary) -> None:
         solver.set_mode(FOLLOW)
     if counts.left or not counts.solved:
         raise GateError("it did not solve all groups of the self-test")
+    # Bullet creates the first rows of a joint, and those for which it makes room.
+    if counts.created <= counts.not_created:
+        raise GateError("it did not create the rows of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
             raise GateError(f"the self-test differs from Bullet in step {step}")
@@ -142,8 +163,8 @@ def _drive(client: int, arm: int, step: int) -> None:
     for joint in range(_NUM_JOINTS):
         capi.motor_set_position(command, Q_OFFSET + joint, target)
         capi.motor_set_velocity(command, U_OFFSET + joint, 0.0)
-        capi.motor_set_kp(command, U_OFFSET + joint, 0.3)
-        capi.motor_set_kd(command, U_OFFSET + joint, 1.0)
+        capi.motor_set_kp(command, U_OFFSET + joint, _KP)
+        capi.motor_set_kd(command, U_OFFSET + joint, _KD)
         capi.motor_set_force(command, U_OFFSET + joint, _FORCE)
     _submit(client, command)
 

@@ -13,14 +13,35 @@
 int solve_group(struct solver *solver, struct collision_object **bodies, int num_bodies,
                 int num_manifolds, int num_constraints, const struct solver_info *info);
 
+/* Unit responses of bodies, as a list that one conversion of a group owns. */
+struct responses;
+void free_responses(struct responses *list);
+
+/*
+ * The rows of a joint's motor, and of its limits.
+ *
+ * Returns 1 if the rows are there. Returns 0, with nothing changed, if Bullet's own
+ * function has to create them.
+ */
+int create_motor_rows(struct responses **responses, struct motor *motor,
+                      struct array *rows, struct jacobian_data *data,
+                      const struct solver_info *info);
+int create_limit_rows(struct responses **responses, struct limit *limit,
+                      struct array *rows, struct jacobian_data *data,
+                      const struct solver_info *info);
+
 /* What the layout probe knows of the scene that it looks at. */
 struct expectation {
+    void **motor_table, **limit_table; /* of virtual functions */
     double time_step;
     double residual_threshold;
     double motor_impulse; /* of every motor: largest force times time step */
     double friction;      /* of every contact */
     int num_iterations;
     int num_dofs; /* joints of the one body that has joints */
+    int num_links;
+    const int *joint_types; /* of its links */
+    double kp, kd; /* of all motors */
 };
 
 /*
