@@ -1,6 +1,7 @@
-"""What `import torch_panda` does, and in which direction its rooms import."""
+"""Cost and effects of `import torch_panda`, and the order of imports in the package."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from importlib.metadata import version
@@ -11,18 +12,22 @@ import pytest
 import torch_panda
 
 PACKAGE = Path(torch_panda.__file__).parent
-# Rooms from the ground up: each imports from those above it in this list.
-ROOMS = (
-    ("arguments", "checks", "rotations"),
+# Folders and modules of the package. Each imports only from those before it.
+LAYERS = (
+    ("arguments", "checks", "extras", "policies", "rotations", "workers"),
     ("bullet",),
     ("rendering", "robots", "tasks"),
     ("sensors",),
-    ("envs",),
-    ("noise",),
+    ("envs", "noise"),
     ("registry",),
-    ("gymnasium_envs",),
+    ("experts", "gymnasium_envs"),
+    ("learning",),
+    ("datasets",),
+    ("info",),
+    ("commands",),
+    ("__main__",),
 )
-HEIGHT = {room: height for height, rooms in enumerate(ROOMS) for room in rooms}
+HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
 
 IMPORT = """
 import sys, time, warnings
@@ -53,21 +58,49 @@ def test_the_version_is_that_of_the_installed_package():
     assert torch_panda.__version__ == version("torch_panda")
 
 
-def imported_rooms(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom):
-            parts = (node.module or "").split(".")
-            if parts[0] == "torch_panda" and len(parts) > 1:
-                yield parts[1]
+MODULES = {
+    ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(
+        ".__init__"
+    ): file
+    for file in PACKAGE.rglob("*.py")
+}
 
 
-@pytest.mark.parametrize("room", HEIGHT)
-def test_imports_point_down(room):
-    folder = PACKAGE / room
-    files = folder.glob("*.py") if folder.is_dir() else [folder.with_suffix(".py")]
-    for file in files:
-        for other in imported_rooms(file):
-            assert other == room or HEIGHT[other] < HEIGHT[room], (file.name, other)
+def imported_modules(file):
+    """Modules of the package that a file imports, in functions and for types too."""
+    modules = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            modules |= names & MODULES.keys() or {node.module}
+    return modules & MODULES.keys()
+
+
+def layer(module):
+    return module.split(".")[1]
+
+
+def test_every_module_has_a_layer():
+    assert {layer(name) for name in MODULES if "." in name} == HEIGHT.keys()
+
+
+@pytest.mark.parametrize("name", HEIGHT)
+def test_imports_point_down(name):
+    for module, file in MODULES.items():
+        if "." not in module or layer(module) != name:
+            continue
+        for other in imported_modules(file) - {"torch_panda"}:
+            is_below = HEIGHT[layer(other)] < HEIGHT[name]
+            assert is_below or layer(other) == name, (module, other)
+
+
+def test_no_two_modules_import_each_other():
+    """Not even through others. `torch_panda` itself stands above the environments."""
+    graph = {module: imported_modules(file) for module, file in MODULES.items()}
+    del graph["torch_panda"]
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 def test_the_core_needs_no_torchrl():
