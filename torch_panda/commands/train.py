@@ -66,7 +66,7 @@ def main(args: Args) -> None:
     if finished and args.video:
         try:
             with torch_panda.make(
-                args.env_id, num_envs=6, seed=args.seed, device=args.device
+                args.env_id, num_envs=4, seed=args.seed, device=args.device
             ) as env:
                 record(env, run.agent.policy, out / "video.mp4")
         except KeyboardInterrupt:

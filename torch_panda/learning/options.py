@@ -40,7 +40,7 @@ class Args(Hyperparameters):
     """the seed of the environments, the networks and the sampling"""
     num_envs: Positive = 4
     """the number of environments that are stepped in parallel"""
-    total_steps: Count = 10_000
+    total_steps: Count = 4_000
     """environment steps, over all environments; 0 stops after `pretrain_updates`"""
     updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
@@ -71,7 +71,7 @@ class Args(Hyperparameters):
     device: str = "cpu"
     """the device of the networks and the replay buffer"""
     video: bool = True
-    """record 6 episodes at the end"""
+    """record 4 episodes at the end"""
 
 
 def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
