@@ -10,7 +10,6 @@ import sys
 import tempfile
 import threading
 import time
-import timeit
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -174,25 +173,3 @@ def test_threads_one_after_the_other():
             thread.join()
         results.append(env.rollout(3))
     assert len(results) == 4
-
-
-def test_the_guard_costs_little_beside_a_step():
-    with torch_panda.make("PandaReach-v1", seed=0) as env:
-        guard = env.episodes._guard
-        start = env.reset()
-        start["action"] = torch.zeros(3)
-
-        def guarded():
-            with guard:
-                pass
-
-        # In turns, the fastest of each: a busy machine slows both.
-        turns = [
-            (
-                timeit.timeit(guarded, number=100) / 100,
-                timeit.timeit(lambda: env.step(start), number=1),
-            )
-            for _ in range(50)
-        ]
-    of_guard, of_step = map(min, zip(*turns, strict=True))
-    assert of_guard < 0.002 * of_step
