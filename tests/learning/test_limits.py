@@ -77,7 +77,7 @@ def test_devices_that_do_not_work(tmp_path, device):
     ("script", "option", "value"),
     [
         *((evaluate, "episodes", 0), (evaluate, "num_envs", 0), (evaluate, "seed", -1)),
-        (evaluate, "task_options", {"play": nan}),
+        (evaluate, "task_options", {"clearance": nan}),
         *((record_demos, "episodes", 0), (record_demos, "num_envs", 0)),
         *((watch, "num_envs", 0), (watch, "seed", 2**64)),
         *((watch, "port", 0), (watch, "port", 65536)),

@@ -55,15 +55,15 @@ def test_the_hand_holds_the_peg():
         assert (moved - torch.tensor((0.0, 0.0, -0.06))).norm(dim=1).max() < 0.003
 
 
-@pytest.mark.parametrize("play", [0.001, 0.0005])
-def test_the_hole_is_wider_by_the_play(play):
-    options = {"play": play}
+@pytest.mark.parametrize("clearance", [0.001, 0.0005])
+def test_the_hole_is_wider_by_the_play(clearance):
+    options = {"clearance": clearance}
     with torch_panda.make(
         "PandaPegInsertion-v1", num_envs=N, seed=0, task_options=options
     ) as env:
-        inside = place(env, (0.4 * play, -0.4 * play), 0.052)
+        inside = place(env, (0.4 * clearance, -0.4 * clearance), 0.052)
         assert (inside["achieved_goal"][:, 2] < 0.045).all()
-        on_top = place(env, (0.7 * play + 0.001, 0.0), 0.052)
+        on_top = place(env, (0.7 * clearance + 0.001, 0.0), 0.052)
         assert (on_top["achieved_goal"][:, 2] > 0.045).all()
 
 
@@ -84,8 +84,8 @@ def test_success_is_in_the_hole():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"play": 0.0}, "play must be between"),
-        ({"play": 0.03}, "play must be between"),
+        ({"clearance": 0.0}, "clearance must be between"),
+        ({"clearance": 0.03}, "clearance must be between"),
         ({"depth": 0.06}, "depth must be from distance_threshold"),
         ({"depth": 0.005}, "depth must be from distance_threshold"),
     ],

@@ -1,4 +1,4 @@
-"""Tasks: their scene, goals, observation, success and reward."""
+"""Tasks: scene, goals, observation, success and reward."""
 
 from torch_panda.tasks.base import (
     Bodies,

@@ -1,4 +1,4 @@
-"""A goal-conditioned task."""
+"""Base class of goal-conditioned tasks."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from torch_panda.checks import check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
 
-# What tasks of users are made of is found here.
+# A task of a user needs these names.
 __all__ = [
     "NO_ROTATION",
     "Bodies",
@@ -28,17 +28,17 @@ __all__ = [
 ]
 
 RewardType = Literal["sparse", "dense"]
-# (achieved_goal, desired_goal), both (..., goal_dim), to (..., 1).
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
+"""A function of achieved and desired goals, both (..., goal_dim), to (..., 1)."""
 
 
 class Bodies(NamedTuple):
-    """What a task has built in a client, by body id.
+    """Body ids of the bodies that a task has built in a client.
 
     Attributes:
-        objects: movable objects, in the order in which observations name them. Their
-            joints, if they have any, are part of the state, too.
-        markers: bodies that nothing touches, which show the goal.
+        objects: Movable objects, in the order of ``simulation.object_pose``. Their
+            joints are part of the state too.
+        markers: Bodies without collisions that show the goal.
     """
 
     objects: tuple[int, ...] = ()
@@ -46,12 +46,14 @@ class Bodies(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What a task draws for an episode; see `Task.sample_start`.
+    """Goal and objects at the start of an episode; see `Task.sample_start`.
 
     Attributes:
-        goal: (goal_dim,).
-        object_pose: (n_objects, 7), positions [m] and quaternions xyzw, world frame.
-        object_joint_position: (n_object_joints,) [rad] or [m]; or one number for all.
+        goal: Desired goal, (goal_dim,).
+        object_pose: Positions [m] and quaternions xyzw of the objects, world frame,
+            (n_objects, 7).
+        object_joint_position: Positions of the objects' joints [rad] or [m],
+            (n_object_joints,), or one number for all joints.
     """
 
     goal: Sequence[float]
@@ -86,24 +88,27 @@ class ObjectState(NamedTuple):
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Task(Configured, ABC):
-    """What is to be done: scene, goals, observation, success, reward.
+    """A task: scene, goals, observation, success and reward.
 
-    One description serves all clients of a simulation. Sampling is done for one
-    episode of one environment with its own random generator; all else is batched over
-    the state tensors of the simulation. Lengths are in metres, in the world frame.
+    One object describes the task for all environments of a simulation. The methods
+    whose names start with ``sample_`` draw for one episode of one environment, from a
+    random generator of that episode. All other methods are batched over the
+    environments. Lengths are in metres, and positions are in the world frame.
 
-    A task sets ``goal_dim``, ``observation_dim`` and, unless it is 50,
-    ``max_episode_steps``. The defaults of its arguments are those of the ids -v1.
+    A subclass sets ``goal_dim`` and ``observation_dim``. It also sets
+    ``max_episode_steps`` if an episode does not have 50 steps. The arguments of the
+    shipped tasks are fields of dataclasses, whose defaults are those of the ids -v1.
 
-    `randomize`, `reward`, `failure` and `extra_observation` are hooks: a task has those
-    that it overrides, and the others are never called.
+    `randomize`, `reward`, `failure` and `extra_observation` are optional hooks. A hook
+    that a task leaves out is never called, so it costs nothing.
 
     Args:
-        reward_type: "sparse": 0 on success and -1 otherwise; "dense": -distance.
-        distance_threshold: success is a distance below it.
+        reward_type: "sparse" rewards success with 0 and all else with -1; "dense"
+            rewards with minus the distance to the goal.
+        distance_threshold: A goal is reached at a smaller distance.
 
     Raises:
-        ValueError: one is none of these.
+        ValueError: An argument is out of range.
     """
 
     goal_dim: ClassVar[int]
@@ -113,7 +118,7 @@ class Task(Configured, ABC):
     """Where the observation holds the achieved goal; None if it does not.
 
     `RobotTaskEnv.goal_indices` and ``goal="observation"`` need it. A subclass that
-    overrides `observation` or `achieved_goal` declares it anew."""
+    overrides `observation` or `achieved_goal` must declare it again."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
@@ -128,14 +133,22 @@ class Task(Configured, ABC):
 
     @abstractmethod
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the scene in a client."""
+        """Build the scene in a client.
+
+        Returns:
+            The ids of the objects and the markers. The ground, the table and other
+            fixed bodies are not among them.
+        """
 
     def sample_start(self, rng: np.random.Generator) -> Start:
-        """Draw what an episode starts with.
+        """Draw the goal and the objects of an episode.
 
-        By default what the next three draw, in this order, each on its own. A task in
-        which one depends on another, such as a goal on where an object starts,
-        overrides this instead.
+        The default calls `sample_goal`, `sample_objects` and `sample_object_joints`, in
+        this order. A task overrides `sample_start` instead of these three if one of
+        them depends on another, for example a goal on the start of an object.
+
+        Args:
+            rng: Random generator of the episode.
         """
         return Start(
             self.sample_goal(rng),
@@ -144,22 +157,23 @@ class Task(Configured, ABC):
         )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a goal: (goal_dim,)."""
-        name = type(self).__name__
-        raise NotImplementedError(f"{name} must have a sample_goal or a sample_start")
+        """Draw a desired goal, (goal_dim,)."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must define sample_goal or sample_start"
+        )
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
-        """Draw start poses: (n_objects, 7), position and quaternion xyzw."""
+        """Draw start poses, (n_objects, 7): positions and quaternions xyzw."""
         return ()
 
     def sample_object_joints(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw start positions of the objects' joints [rad] or [m], by default 0.
+        """Draw start positions of the objects' joints [rad] or [m].
 
-        Unused if they have none.
+        It has no effect if the objects have no joints.
 
         Returns:
-            (n_object_joints,), as `VectorSimulation.object_joint_position`; or one
-            number for all.
+            Positions in the order of ``simulation.object_joint_position``,
+            (n_object_joints,), or one number for all joints. The default is 0.
         """
         return (0.0,)
 
@@ -168,14 +182,14 @@ class Task(Configured, ABC):
     ) -> None:
         """Change the physics of an environment before each of its episodes.
 
-        A hook, which runs in the thread that resets the environment. What it changes
-        must depend on ``rng`` alone, and whatever it changes once it must set every
-        time: what the last episode had is still there.
+        A hook. It runs in the thread that resets the environment. Its changes may
+        depend on ``rng`` only. They last until the next change, so a value that it sets
+        in one episode it must set in every episode.
 
         Args:
-            client: of the environment; see `PhysicsClient.set_dynamics`.
-            bodies: what `build` has built.
-            rng: of this episode, and of nothing else.
+            client: Client of the environment; see `PhysicsClient.set_dynamics`.
+            bodies: Return value of `build`.
+            rng: Random generator for this call alone.
         """
 
     def reward(
@@ -185,72 +199,83 @@ class Task(Configured, ABC):
         achieved_goal: Tensor,
         desired_goal: Tensor,
     ) -> Tensor:
-        """The reward of a step, which may depend on state and action.
+        """Reward of a step as a function of state and action.
 
-        A hook. By default it is `compute_reward`, which remains the function of goals
-        that hindsight relabelling calls.
+        A hook. Without it the reward is `compute_reward`. Hindsight relabelling always
+        calls `compute_reward`, so the two should be close.
 
         Args:
-            simulation: the state after the step.
-            action: (num_envs, action_dim) float32 in [-1, 1].
-            achieved_goal: (num_envs, goal_dim) float32, after the step.
-            desired_goal: (num_envs, goal_dim) float32.
+            simulation: The environments after the step.
+            action: The clipped actions, (num_envs, action_dim) float32 in [-1, 1].
+            achieved_goal: Goals after the step, (num_envs, goal_dim) float32.
+            desired_goal: Desired goals, (num_envs, goal_dim) float32.
 
         Returns:
-            (num_envs, 1).
+            Rewards, (num_envs, 1).
         """
         return self.compute_reward(achieved_goal, desired_goal)
 
     def failure(self, simulation: VectorSimulation) -> Tensor:
-        """Where an episode has failed, and ends as ``terminated``.
+        """Whether episodes have failed; a failed one ends as ``terminated``.
 
-        A hook. By default none fails.
+        A hook.
 
         Returns:
-            (num_envs, 1), bool.
+            (num_envs, 1) bool.
         """
         return torch.zeros(simulation.num_envs, 1, dtype=torch.bool, device="cpu")
 
     def extra_observation(self, simulation: VectorSimulation) -> dict[str, Tensor]:
-        """What is observed beside ``observation``, each under a key of its own.
+        """Further observed entries beside ``observation``.
 
-        A hook. By default nothing is.
+        A hook.
 
         Returns:
-            By key (num_envs, ...); float64 is observed as float32.
+            Tensors (num_envs, ...) by key. A float64 tensor is observed as float32.
         """
         return {}
 
     def marker_pose(self, goal: Tensor) -> Tensor:
-        """Where goals put the markers: (..., goal_dim) -> (..., n_markers, 7).
+        """Poses of the markers that show goals.
 
-        By default a goal is one position for each marker. Unused without markers.
+        The default takes a goal as one position for each marker.
+
+        Args:
+            goal: Desired goals, (..., goal_dim).
+
+        Returns:
+            Positions and quaternions xyzw, (..., n_markers, 7).
 
         Raises:
-            ValueError: by default: a goal is not made of positions.
+            ValueError: The default does not apply, because ``goal_dim`` is not a
+                multiple of 3.
         """
         if goal.shape[-1] % 3:
             raise ValueError(
-                f"{type(self).__name__} needs a marker_pose of its own: its goals of "
-                f"{goal.shape[-1]} numbers are no positions for markers"
+                f"{type(self).__name__} needs a marker_pose of its own, because a goal "
+                f"of {goal.shape[-1]} numbers is not a position for each marker"
             )
         positions = goal.unflatten(-1, (-1, 3))
         rotation = goal.new_tensor(NO_ROTATION).expand(*positions.shape[:-1], 4)
         return torch.cat((positions, rotation), dim=-1)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """The task's part of the observation: (num_envs, observation_dim), float64."""
+        """The task's part of the observation, (num_envs, observation_dim) float64.
+
+        The robot's part precedes it in ``observation``.
+        """
         return simulation.ee_position[:, :0]
 
     @abstractmethod
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """What has been achieved: (num_envs, goal_dim), float64."""
+        """The achieved goals, (num_envs, goal_dim) float64."""
 
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
-        """Where the objects are when goals are reached, for ``goal="observation"``.
+        """States of the objects in which goals are reached, for ``goal="observation"``.
 
-        By default a goal is one position for each object, which is not rotated. Where
-        the goal is a position of the end-effector, the objects stay where they start.
+        The default takes a goal as one position for each object, and does not rotate
+        the objects. If the goal is a position of the end-effector, the objects stay at
+        their start.
 
         Args:
             goal: Desired goals, (n, goal_dim) float64.
@@ -275,39 +300,46 @@ class Task(Configured, ABC):
         return objects._replace(pose=pose)
 
     def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """How far the goal is, (..., 1); minus this is the dense reward."""
+        """Distance between goals, (..., 1). The dense reward is minus this distance."""
         return torch.linalg.vector_norm(
             achieved_goal - desired_goal, dim=-1, keepdim=True
         )
 
     def success_distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """What is compared with ``distance_threshold``, (..., 1)."""
+        """The distance that is compared with ``distance_threshold``, (..., 1)."""
         return self.distance(achieved_goal, desired_goal)
 
     def is_success(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Whether the goal is reached.
+        """Whether goals are reached.
 
-        A pure function on any device, without a simulator.
+        It is a pure function that needs no simulator and works on any device.
 
         Args:
-            achieved_goal: (..., goal_dim).
-            desired_goal: (..., goal_dim).
+            achieved_goal: Achieved goals, (..., goal_dim).
+            desired_goal: Desired goals, (..., goal_dim).
 
         Returns:
-            (..., 1), bool.
+            (..., 1) bool.
 
         Raises:
-            ValueError: a last dimension is not ``goal_dim``.
+            ValueError: The last dimension of a goal is not ``goal_dim``.
         """
         self._check_goals(achieved_goal, desired_goal)
         distance = self.success_distance(achieved_goal, desired_goal)
         return distance < self.distance_threshold
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The reward for an achieved goal; see `is_success`.
+        """Rewards for achieved goals, a pure function like `is_success`.
+
+        Args:
+            achieved_goal: Achieved goals, (..., goal_dim).
+            desired_goal: Desired goals, (..., goal_dim).
 
         Returns:
-            (..., 1), float32.
+            (..., 1) float32.
+
+        Raises:
+            ValueError: The last dimension of a goal is not ``goal_dim``.
         """
         self._check_goals(achieved_goal, desired_goal)
         if self.reward_type == "dense":
@@ -316,15 +348,24 @@ class Task(Configured, ABC):
         return (distance > self.distance_threshold).float().neg()
 
     def _check_goals(self, achieved_goal: Tensor, desired_goal: Tensor) -> None:
-        sizes = (self.goal_dim,)
-        if achieved_goal.shape[-1:] != sizes or desired_goal.shape[-1:] != sizes:
-            shapes = tuple(achieved_goal.shape), tuple(desired_goal.shape)
+        size = (self.goal_dim,)
+        if achieved_goal.shape[-1:] != size or desired_goal.shape[-1:] != size:
             raise ValueError(
                 f"achieved_goal and desired_goal must have shape "
-                f"(..., {self.goal_dim}), got {shapes[0]} and {shapes[1]}"
+                f"(..., {self.goal_dim}), got {tuple(achieved_goal.shape)} and "
+                f"{tuple(desired_goal.shape)}"
             )
 
 
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
-    """Position, Euler angles [rad] and velocity of an object: (num_envs, 12)."""
+    """Position, Euler angles and velocities of an object, (num_envs, 12) float64.
+
+    Args:
+        simulation: The environments.
+        index: Index of the object among the objects of the task.
+
+    Returns:
+        Position [m], roll, pitch and yaw [rad], linear [m/s] and angular velocity
+        [rad/s].
+    """
     return simulation.object_state.select(1, index)

@@ -1,4 +1,4 @@
-"""Drawer: open or close a drawer to a position."""
+"""Drawer: open or close a drawer up to a position of its handle."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,33 +14,32 @@ from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Start, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
 URDF = Path(__file__).with_name("drawer.urdf")
-SLIDE = 0  # index of its joint
-TRAVEL = 0.25  # [m], from closed to open
-HANDLE = (-0.06, 0.0, 0.06)  # of the closed drawer, cabinet frame [m]
+SLIDE = 0  # index of the drawer's joint
+TRAVEL = 0.25  # distance from closed to open [m]
+HANDLE = (-0.06, 0.0, 0.06)  # position when closed, cabinet frame [m]
 HANDLE_BAR = Box((0.005, 0.07, 0.01))
 
-# A table on which the cabinet stands behind what the arm reaches [m].
-TABLE_LENGTH = 1.4
-TABLE_X_OFFSET = -0.15
-CABINET_X = 0.15  # of its front, in the middle of its range [m]
+# The table is longer than panda-gym's, because the cabinet stands at its far end.
+TABLE_LENGTH = 1.4  # [m]
+TABLE_X_OFFSET = -0.15  # [m]
+CABINET_X = 0.15  # x coordinate of the cabinet's front, mean of all episodes [m]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Drawer(Task):
-    """Open or close a drawer, by its handle, until that is at a point.
+    """Open or close a drawer until its handle is at a point.
 
-    The goal is where the handle is when the drawer is as far open as it should be. It
-    is ``min_change`` or more from where the handle starts.
+    The goal is a position of the handle, at least ``min_change`` from its start.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        cabinet_x_range: edge length along x of the rectangle of its places [m].
-        cabinet_y_range: edge length along y [m].
-        min_change: the least by which the drawer is to be moved, at most 0.125 [m].
-        drawer_mass: [kg].
-        drawer_friction: force with which the slide resists motion [N].
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        cabinet_x_range: Range of the cabinet's position along x [m].
+        cabinet_y_range: Range of the cabinet's position along y [m].
+        min_change: Smallest distance between start and goal, at most 0.125 [m].
+        drawer_mass: Mass of the drawer [kg].
+        drawer_friction: Friction force of the slide [N].
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 3
@@ -56,13 +55,14 @@ class Drawer(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.min_change <= TRAVEL / 2:  # else none may be left to draw
+        # From the middle of the slide, no goal is farther than half of its length.
+        if not 0 <= self.min_change <= TRAVEL / 2:
             raise ValueError(
                 f"min_change must be from 0 to {TRAVEL / 2} [m], got {self.min_change}"
             )
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the drawer and the marker, a handle."""
+        """Build the table, the drawer and the marker, which is a handle."""
         create_table(
             client,
             length=TABLE_LENGTH,
@@ -77,10 +77,10 @@ class Drawer(Task):
         )
 
     def sample_start(self, rng: np.random.Generator) -> Start:
-        """Draw where the cabinet stands, how far it is open, and should be."""
+        """Draw the cabinet's position, and how far it is open at start and goal."""
         x = CABINET_X + self.cabinet_x_range * rng.uniform(-0.5, 0.5)
         y = self.cabinet_y_range * rng.uniform(-0.5, 0.5)
-        # Uniform among the pairs that are far enough from each other.
+        # Rejection sampling: uniform among the pairs that are far enough apart.
         start, goal = rng.uniform(0.0, TRAVEL, size=2)
         while abs(goal - start) < self.min_change:
             start, goal = rng.uniform(0.0, TRAVEL, size=2)
@@ -88,18 +88,22 @@ class Drawer(Task):
         return Start(handle.tolist(), ((x, y, 0.0, *NO_ROTATION),), (start,))
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position of the handle, how far it is open, and its speed: (num_envs, 5)."""
+        """Position of the handle, and position and velocity of the slide.
+
+        Returns:
+            (num_envs, 5) in [m] and [m/s]. Opening the drawer is positive.
+        """
         slide = simulation.object_joint_position, simulation.object_joint_velocity
         return torch.cat((self.achieved_goal(simulation), *slide), dim=1)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """Position of the handle: (num_envs, 3)."""
+        """Position of the handle, (num_envs, 3)."""
         pose, opening = simulation.object_pose[:, 0], simulation.object_joint_position
         handle = pose.new_tensor(HANDLE) - opening * pose.new_tensor((1.0, 0.0, 0.0))
         return pose[:, :3] + rotate(pose[:, 3:], handle)
 
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
-        """The cabinet where it stands, open until its handle is at the goal."""
+        """The cabinet at its place, open so far that its handle is at the goal."""
         pose = objects.pose[:, 0]
         closed = pose[:, :3] + rotate(pose[:, 3:], pose.new_tensor(HANDLE))
         outwards = rotate(pose[:, 3:], pose.new_tensor((-1.0, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""Flip: turn a cube to an orientation."""
+"""Flip: rotate a cube to an orientation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,26 +20,27 @@ from torch_panda.tasks.table import (
     sample_on_table,
 )
 
-# Where the marker turns, out of the cube's way.
+# The marker floats above the table, where the cube does not hide it.
 MARKER_POSITION = (0.0, 0.0, 3 * CUBE_SIZE / 2)  # [m]
-# Six faces that differ in colour and, as those of a die, in their number of pips.
+# The six faces differ in colour and, like those of a die, in their number of pips.
 VISUAL = Visual(texture=Path(__file__).with_name("flip_cube.png"), opacity=0.5)
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Flip(Task):
-    """Turn a cube to an orientation, wherever it lies.
+    """Rotate a cube to an orientation. Its position does not matter.
 
-    Goals are unit quaternions xyzw. The distance of two is 1 - <q, q'>^2, the squared
-    sine of half the angle between them: q and -q are one orientation.
+    Goals are unit quaternions xyzw. The distance between two goals is 1 - <q, q'>^2,
+    the squared sine of half the angle between them. It is the same for q and -q, which
+    are one orientation.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it.
-        obj_xy_range: edge length of the square of start positions [m].
-        object_mass: of the cube [kg].
-        object_friction: lateral friction of the cube.
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance.
+        obj_xy_range: Edge length of the square of start positions [m].
+        object_mass: Mass of the cube [kg].
+        object_friction: Lateral friction of the cube.
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 4
@@ -64,27 +65,27 @@ class Flip(Task):
         )
 
     def marker_pose(self, goal: Tensor) -> Tensor:
-        """The goal's orientation above the table: (..., 4) -> (..., 1, 7)."""
+        """Pose of the marker, which shows the orientation, (..., 1, 7)."""
         position = goal.new_tensor(MARKER_POSITION).expand(*goal.shape[:-1], 3)
         return torch.cat((position, goal), dim=-1).unsqueeze(-2)
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw an orientation, all equally likely: (4,)."""
+        """Draw an orientation uniformly among all, (4,)."""
         quaternion = rng.standard_normal(4)
         return (quaternion / np.linalg.norm(quaternion)).tolist()
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
-        """Draw the cube's pose on the table: (1, 7)."""
+        """Draw the pose of the cube on the table, (1, 7)."""
         position = sample_on_table(rng, self.obj_xy_range, height=CUBE_SIZE / 2)
         return ((*position, *NO_ROTATION),)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """The cube's position, quaternion and velocity: (num_envs, 13)."""
+        """Position, quaternion and velocities of the cube, (num_envs, 13)."""
         pose, velocity = simulation.object_pose[:, 0], simulation.object_velocity[:, 0]
         return torch.cat((pose, velocity), dim=1)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """The cube's orientation: (num_envs, 4)."""
+        """Orientation of the cube, quaternion xyzw, (num_envs, 4)."""
         return simulation.object_pose[:, 0, 3:]
 
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
@@ -98,5 +99,5 @@ class Flip(Task):
         return objects._replace(pose=torch.cat((position, goal), dim=1).unsqueeze(1))
 
     def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """1 - <q, q'>^2, in [0, 1]: (..., 1)."""
+        """1 - <q, q'>^2, from 0 to 1, (..., 1)."""
         return rotation_distance(achieved_goal, desired_goal)

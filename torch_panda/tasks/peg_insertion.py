@@ -1,4 +1,4 @@
-"""PegInsertion: put a peg that the hand holds into a hole."""
+"""PegInsertion: insert a peg into a hole."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,34 +21,34 @@ from torch_panda.tasks.base import (
 from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_table
 
 URDF = Path(__file__).with_name("hole.urdf")
-HOLE_WIDTH = 0.021  # [m], of the square hole
-HOLE_DEPTH = 0.05  # [m], as high as the block is
+HOLE_WIDTH = 0.021  # edge length of the square hole [m]
+HOLE_DEPTH = 0.05  # height of the block that the hole goes through [m]
 PEG_LENGTH = 0.08  # [m]
-# Distance between the fingers at which they are kept [m]. Narrower than the peg, so
-# that they press on it; not much narrower, or it could move from one to the other.
+# Distance between the fingers throughout an episode [m]. It is a little less than the
+# width of the peg, so the fingers press on the peg. If it were much less, the peg could
+# slip from one finger towards the other.
 GRASP_WIDTH = 0.0198
-# Of the peg's centre at the start, world frame [m]: the fingers of a neutral Panda,
-# whose end-effector is at (0.0384, 0, 0.1974), hold its upper part.
+# Centre of the peg at the start, world frame [m]. The end-effector of a neutral Panda
+# is at (0.0384, 0, 0.1974), so the fingers hold the upper part of the peg.
 PEG_POSITION = (0.0384, 0.0, 0.1774)
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class PegInsertion(Task):
-    """Put a square peg into a square hole.
+    """Insert a square peg, which the hand holds from the start, into a square hole.
 
-    The hand holds the peg from the start. Goals and achieved goals are positions of the
-    peg's lower end. It is as deep as the goal asks for, within ``distance_threshold``,
-    only where it is in the hole.
+    Goals are positions of the peg's lower end. The threshold is so small that the end
+    can be near a goal only if it is in the hole.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        depth: how deep in the hole the peg's end should be [m].
-        play: by how much the hole is wider than the peg [m].
-        hole_xy_range: edge length of the square of the hole's places [m].
-        peg_mass: [kg].
-        peg_friction: lateral friction of the peg.
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        depth: Depth of the goal in the hole [m].
+        clearance: Difference between the widths of hole and peg [m].
+        hole_xy_range: Edge length of the square of positions of the hole [m].
+        peg_mass: Mass of the peg [kg].
+        peg_friction: Lateral friction of the peg.
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 3
@@ -57,7 +57,7 @@ class PegInsertion(Task):
 
     distance_threshold: float = 0.01
     depth: float = 0.03
-    play: float = 0.001
+    clearance: float = 0.001
     hole_xy_range: float = 0.2
     peg_mass: float = 0.1
     peg_friction: float = 0.5
@@ -65,9 +65,10 @@ class PegInsertion(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.play < HOLE_WIDTH:
+        if not 0 < self.clearance < HOLE_WIDTH:
             raise ValueError(
-                f"play must be between 0 and {HOLE_WIDTH} [m], got {self.play}"
+                f"clearance must be between 0 and {HOLE_WIDTH} [m], got "
+                f"{self.clearance}"
             )
         if not self.distance_threshold <= self.depth <= HOLE_DEPTH:
             raise ValueError(
@@ -76,9 +77,9 @@ class PegInsertion(Task):
             )
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the peg, the block with the hole, and the marker, a peg."""
+        """Build the table, the peg, the block with the hole, and the marker (a peg)."""
         create_table(client, friction=self.table_friction)
-        side = (HOLE_WIDTH - self.play) / 2
+        side = (HOLE_WIDTH - self.clearance) / 2
         shape = Box((side, side, PEG_LENGTH / 2))
         peg = client.create_box(
             shape.half_extents,
@@ -93,11 +94,11 @@ class PegInsertion(Task):
         )
 
     def marker_pose(self, goal: Tensor) -> Tensor:
-        """A peg whose lower end is at the goal: (..., 3) -> (..., 1, 7)."""
+        """Pose of a peg whose lower end is at the goal, (..., 1, 7)."""
         return super().marker_pose(goal + goal.new_tensor((0.0, 0.0, PEG_LENGTH / 2)))
 
     def sample_start(self, rng: np.random.Generator) -> Start:
-        """Draw where the hole is; the peg is in the hand."""
+        """Draw the position of the hole. The peg starts in the hand."""
         x, y, _ = hole = sample_on_table(rng, self.hole_xy_range, height=0.0)
         return Start(
             (x, y, HOLE_DEPTH - self.depth),
@@ -105,23 +106,24 @@ class PegInsertion(Task):
         )
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """The peg's and the hole's: (num_envs, 15).
+        """State of the peg and position of the hole.
 
-        Position of the peg's lower end, Euler angles and velocities of the peg, and the
-        position of the hole on the table.
+        Returns:
+            (num_envs, 15): position of the peg's lower end, Euler angles and velocities
+            of the peg, and the position of the hole on the table.
         """
         peg = object_observation(simulation, 0)[:, 3:]
         hole = simulation.object_pose[:, 1, :3]
         return torch.cat((self.achieved_goal(simulation), peg, hole), dim=1)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """Position of the peg's lower end: (num_envs, 3)."""
+        """Position of the peg's lower end, (num_envs, 3)."""
         pose = simulation.object_pose[:, 0]
         end = pose.new_tensor((0.0, 0.0, -PEG_LENGTH / 2))
         return pose[:, :3] + rotate(pose[:, 3:], end)
 
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
-        """The peg upright with its lower end at the goal, the hole where it is."""
+        """The peg upright with its lower end at the goal, and the hole unchanged."""
         pose = objects.pose.clone()
         pose[:, 0, :3] = goal + goal.new_tensor((0.0, 0.0, PEG_LENGTH / 2))
         pose[:, 0, 3:] = goal.new_tensor(NO_ROTATION)

@@ -1,4 +1,4 @@
-"""PickAndPlace: bring a cube to a point on or above the table."""
+"""PickAndPlace: move a cube to a point on or above the table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,23 +8,23 @@ import numpy as np
 from torch_panda.tasks.push import Push
 from torch_panda.tasks.table import CUBE_SIZE, sample_on_table
 
-# Fraction of the goals that lie on the table, in the authors' code.
+# Share of the goals that lie on the table, as in the code of the paper's authors.
 GOALS_ON_TABLE = 0.3
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class PickAndPlace(Push):
-    """Bring a cube to a point on or above the table.
+    """Move a cube to a point on or above the table.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        goal_xy_range: edge length of the goals' box along x and y [m].
-        goal_z_range: height of the goals' box [m].
-        obj_xy_range: edge length of the square of start positions [m].
-        object_mass: of the cube [kg].
-        object_friction: lateral friction of the cube.
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        goal_xy_range: Edge length of the box of goals along x and y [m].
+        goal_z_range: Height of the box of goals [m].
+        obj_xy_range: Edge length of the square of start positions [m].
+        object_mass: Mass of the cube [kg].
+        object_friction: Lateral friction of the cube.
+        table_friction: Lateral friction of the table.
     """
 
     marker_height = 0.05
@@ -33,7 +33,7 @@ class PickAndPlace(Push):
     object_friction: float = 5.0
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a position of the cube, three in ten on the table: (3,)."""
+        """Draw a position of the cube, 30 % of them on the table, (3,)."""
         height = rng.uniform(0.0, self.goal_z_range)
         if rng.random() < GOALS_ON_TABLE:
             height = 0.0

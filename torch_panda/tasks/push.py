@@ -1,4 +1,4 @@
-"""Push: move a cube over the table."""
+"""Push: push a cube to a point on the table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,22 +21,22 @@ from torch_panda.tasks.table import (
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Push(Task):
-    """Push a cube to a point of the table.
+    """Push a cube to a point on the table.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        goal_xy_range: edge length of the square of goals [m].
-        obj_xy_range: edge length of the square of start positions [m].
-        object_mass: of the cube [kg].
-        object_friction: lateral friction of the cube.
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        goal_xy_range: Edge length of the square of goals [m].
+        obj_xy_range: Edge length of the square of start positions [m].
+        object_mass: Mass of the cube [kg].
+        object_friction: Lateral friction of the cube.
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 3
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
-    # Where panda-gym creates the marker, before it moves to the first goal [m].
+    # Height at which panda-gym creates the marker, before the first goal [m].
     marker_height = CUBE_SIZE / 2
 
     goal_xy_range: float = 0.3
@@ -55,18 +55,18 @@ class Push(Task):
         )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a position of the cube on the table: (3,)."""
+        """Draw a position of the cube on the table, (3,)."""
         return sample_on_table(rng, self.goal_xy_range, height=CUBE_SIZE / 2)
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
-        """Draw the cube's pose on the table: (1, 7)."""
+        """Draw the pose of the cube on the table, (1, 7)."""
         position = sample_on_table(rng, self.obj_xy_range, height=CUBE_SIZE / 2)
         return ((*position, *NO_ROTATION),)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """The cube's position, Euler angles and velocity: (num_envs, 12)."""
+        """Position, Euler angles and velocities of the cube, (num_envs, 12)."""
         return object_observation(simulation, 0)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """The cube's position: (num_envs, 3)."""
+        """Position of the cube, (num_envs, 3)."""
         return simulation.object_pose[:, 0, :3]

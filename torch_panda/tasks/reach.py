@@ -1,4 +1,4 @@
-"""Reach: bring the end-effector to a point."""
+"""Reach: move the end-effector to a point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ MARKER = Sphere(0.02)
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Reach(Task):
-    """Bring the end-effector to a point in a cube above the table.
+    """Move the end-effector to a point in a cube above the table.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        goal_range: edge length of the cube [m].
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        goal_range: Edge length of the cube of goals [m].
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 3
@@ -37,11 +37,11 @@ class Reach(Task):
         return Bodies(markers=(client.create_marker((0.0, 0.0, 0.0), MARKER),))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a point of the cube: (3,)."""
+        """Draw a point in the cube of goals, (3,)."""
         half = self.goal_range / 2
         x, y = rng.uniform(-half, half, size=2)
         return float(x), float(y), rng.uniform(0.0, self.goal_range)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """The end-effector's position: (num_envs, 3)."""
+        """Position of the end-effector, (num_envs, 3)."""
         return simulation.ee_position

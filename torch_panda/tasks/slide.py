@@ -1,4 +1,4 @@
-"""Slide: send a puck to a point out of reach."""
+"""Slide: strike a puck so that it stops at a point out of reach."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,28 +13,29 @@ from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_tabl
 
 PUCK_RADIUS = 0.03  # [m]
 PUCK_HEIGHT = 0.03  # [m]
-# Poses are given at this height, as in panda-gym; the puck drops 1.5 cm from there.
+# Height of the centre at the start and of the goals, as in panda-gym. The puck drops
+# 1.5 cm from there.
 PUCK_START_HEIGHT = 0.03  # [m]
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Slide(Task):
-    """Hit a puck so that it slides to a point and stops there.
+    """Strike a puck so that it slides to a point and stops there.
 
-    The defaults are the paper's: a square that the arm, whose reach is 0.855 m from its
-    base at x = -0.6, cannot get to.
+    By default the goals are in the paper's square, which is out of the arm's reach of
+    0.855 m around its base at x = -0.6 m.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        goal_xy_range: edge length of the square of goals [m].
-        goal_x_offset: x of the centre of that square [m].
-        obj_xy_range: edge length of the square of start positions [m].
-        table_length: length of the table along x [m].
-        table_x_offset: x of its centre [m].
-        object_mass: of the puck [kg].
-        object_friction: lateral friction of the puck.
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        goal_xy_range: Edge length of the square of goals [m].
+        goal_x_offset: x coordinate of the centre of this square [m].
+        obj_xy_range: Edge length of the square of start positions [m].
+        table_length: Length of the table along x [m].
+        table_x_offset: x coordinate of the centre of the table [m].
+        object_mass: Mass of the puck [kg].
+        object_friction: Lateral friction of the puck.
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 3
@@ -71,7 +72,7 @@ class Slide(Task):
         return Bodies(objects=(puck,), markers=(marker,))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a position of the puck out of reach: (3,)."""
+        """Draw a position of the puck out of reach, (3,)."""
         return sample_on_table(
             rng,
             self.goal_xy_range,
@@ -80,14 +81,14 @@ class Slide(Task):
         )
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
-        """Draw the puck's pose within reach: (1, 7)."""
+        """Draw the pose of the puck within reach, (1, 7)."""
         position = sample_on_table(rng, self.obj_xy_range, height=PUCK_START_HEIGHT)
         return ((*position, *NO_ROTATION),)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """The puck's position, Euler angles and velocity: (num_envs, 12)."""
+        """Position, Euler angles and velocities of the puck, (num_envs, 12)."""
         return object_observation(simulation, 0)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """The puck's position: (num_envs, 3)."""
+        """Position of the puck, (num_envs, 3)."""
         return simulation.object_pose[:, 0, :3]

@@ -1,4 +1,4 @@
-"""Stack: put one cube on another."""
+"""Stack: stack two cubes at a point on the table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,29 +20,31 @@ from torch_panda.tasks.table import (
     sample_on_table,
 )
 
-LOWER_HEIGHT = CUBE_SIZE / 2  # [m], of the centre
-UPPER_HEIGHT = 3 * CUBE_SIZE / 2  # [m]
+# Heights of the centres [m].
+LOWER_HEIGHT = CUBE_SIZE / 2
+UPPER_HEIGHT = 3 * CUBE_SIZE / 2
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Stack(Task):
-    """Stack two cubes at a point of the table.
+    """Stack two cubes at a point on the table.
 
-    Goals are the position of the lower cube, then of the upper one. The second cube
-    starts one cube's height above the table, so it may start on the first.
+    A goal holds the position of the lower cube and then that of the upper cube. The
+    upper cube starts one cube's height above the table, so it may start on the lower
+    cube.
 
     Args:
-        reward_type: "sparse" or "dense".
-        distance_threshold: success is a distance below it [m].
-        per_object: compare the distance of each cube with the threshold, as the paper
-            does; otherwise the norm of both, as panda-gym 3.
-        goal_xy_range: edge length of the square of goals [m].
-        obj_xy_range: edge length of the square of start positions [m].
-        lower_color: of the lower cube and its marker.
-        upper_color: of the upper cube and its marker.
-        object_mass: of the lower and of the upper cube [kg].
-        object_friction: lateral friction of both cubes.
-        table_friction: lateral friction of the table.
+        reward_type: "sparse" or "dense"; see `Task`.
+        distance_threshold: A goal is reached at a smaller distance [m].
+        per_object: Whether each cube must be within the threshold, as in the paper.
+            Otherwise the norm of both distances must be, as in panda-gym 3.
+        goal_xy_range: Edge length of the square of goals [m].
+        obj_xy_range: Edge length of the square of start positions [m].
+        lower_color: Colour of the lower cube and its marker.
+        upper_color: Colour of the upper cube and its marker.
+        object_mass: Masses of the lower and the upper cube [kg].
+        object_friction: Lateral friction of both cubes.
+        table_friction: Lateral friction of the table.
     """
 
     goal_dim = 6
@@ -60,7 +62,7 @@ class Stack(Task):
     table_friction: float = TABLE_FRICTION
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the cubes, the lower one first, and their markers."""
+        """Build the table, both cubes and their markers."""
         create_table(client, friction=self.table_friction)
         lower_mass, upper_mass = self.object_mass
         friction = self.object_friction
@@ -76,27 +78,27 @@ class Stack(Task):
         return Bodies(objects=(lower, upper), markers=(lower_marker, upper_marker))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw where the stack should be: (6,)."""
+        """Draw a position of the stack, (6,)."""
         x, y, _ = sample_on_table(rng, self.goal_xy_range, height=0.0)
         return (x, y, LOWER_HEIGHT, x, y, UPPER_HEIGHT)
 
     def sample_objects(self, rng: np.random.Generator) -> Sequence[Sequence[float]]:
-        """Draw the poses of both cubes: (2, 7)."""
+        """Draw the poses of both cubes, (2, 7)."""
         return tuple(
             (*sample_on_table(rng, self.obj_xy_range, height=height), *NO_ROTATION)
             for height in (LOWER_HEIGHT, UPPER_HEIGHT)
         )
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, Euler angles and velocity of both cubes: (num_envs, 24)."""
+        """Position, Euler angles and velocities of both cubes, (num_envs, 24)."""
         return simulation.object_state.flatten(1)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
-        """The positions of both cubes: (num_envs, 6)."""
+        """Positions of both cubes, (num_envs, 6)."""
         return simulation.object_pose[:, :, :3].flatten(1)
 
     def success_distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The distance of the cube that is farther off, or the norm of both."""
+        """The larger distance of the two cubes, or the norm of both, (..., 1)."""
         if not self.per_object:
             return self.distance(achieved_goal, desired_goal)
         offset = (achieved_goal - desired_goal).unflatten(-1, (2, 3))

@@ -1,16 +1,16 @@
-"""What tasks are made of: the ground, the table, cubes on it, and places on it."""
+"""Parts that tasks share: ground, table, cubes, and positions on the table."""
 
 import numpy as np
 
 from torch_panda.bullet import Box, PhysicsClient, Visual
 from torch_panda.bullet.shapes import DARK_GREY, GREEN, LIGHT_GREY
 
-# panda-gym's table; its top is the plane z = 0.
-TABLE_LENGTH = 1.1  # [m], along x
-TABLE_X_OFFSET = -0.3  # [m], of its centre
+# The table of panda-gym. Its top is the plane z = 0.
+TABLE_LENGTH = 1.1  # along x [m]
+TABLE_X_OFFSET = -0.3  # x coordinate of its centre [m]
 TABLE_WIDTH = 0.7  # [m]
 TABLE_HEIGHT = 0.4  # [m]
-TABLE_FRICTION = 0.1  # lateral, panda-gym 1.1.0's
+TABLE_FRICTION = 0.1  # lateral friction, as in panda-gym 1.1.0
 
 CUBE_SIZE = 0.04  # [m]
 CUBE = Box((CUBE_SIZE / 2,) * 3)
@@ -26,10 +26,11 @@ def create_table(
     """Create the ground, and a table whose top is the plane z = 0.
 
     Args:
-        client: where to.
-        length: of the table along x [m].
-        x_offset: x of its centre [m].
-        friction: its lateral friction. Bullet multiplies that of both bodies.
+        client: Client in which the bodies are created.
+        length: Length of the table along x [m].
+        x_offset: x coordinate of the centre of the table [m].
+        friction: Lateral friction of the table. The friction of a contact is the
+            product of the two bodies' values.
     """
     client.create_box(
         (3.0, 3.0, 0.01),
@@ -57,11 +58,11 @@ def create_cube(
     """Create a cube on the table and return its body id.
 
     Args:
-        client: where to.
-        mass: [kg].
-        friction: its lateral friction.
-        x: of its centre [m].
-        visual: how it is drawn.
+        client: Client in which the cube is created.
+        mass: Mass [kg].
+        friction: Lateral friction.
+        x: x coordinate of its centre [m].
+        visual: Appearance.
     """
     cube = client.create_box(
         CUBE.half_extents, mass=mass, position=(x, 0.0, CUBE_SIZE / 2), visual=visual
@@ -73,6 +74,13 @@ def create_cube(
 def sample_on_table(
     rng: np.random.Generator, xy_range: float, *, height: float, x_offset: float = 0.0
 ) -> tuple[float, float, float]:
-    """Draw a point at a height, in a square centred at (x_offset, 0) [m]."""
+    """Draw a point at a fixed height above a square.
+
+    Args:
+        rng: Random generator.
+        xy_range: Edge length of the square [m].
+        height: z coordinate of the point [m].
+        x_offset: x coordinate of the centre of the square [m]; its y coordinate is 0.
+    """
     x, y = rng.uniform(-xy_range / 2, xy_range / 2, size=2)
     return float(x) + x_offset, float(y), height
