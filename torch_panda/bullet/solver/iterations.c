@@ -42,7 +42,7 @@
  * multi-body rows do not have, and data that is not what Bullet's setup leaves.
  */
 #if defined(__x86_64__) && defined(__linux__)
-#define _GNU_SOURCE /* sincos */
+#define _GNU_SOURCE /* sincos, posix_memalign */
 #include "solver.h"
 
 #include <emmintrin.h>
@@ -358,6 +358,30 @@ static void pack_rows(struct group *group, const struct solver *solver,
     }
 }
 
+/* ---- memory of a group --------------------------------------------------------- */
+
+/* What is left of the caller's stack, and the blocks that did not fit there. */
+struct memory {
+    char *rest;
+    size_t size;
+    void *blocks[2];
+    int num_blocks;
+};
+
+/* A block aligned to 16 bytes, or NULL. */
+static void *allocate(struct memory *memory, size_t size) {
+    size = (size + 15) & ~(size_t)15;
+    if (size <= memory->size) {
+        void *block = memory->rest;
+        memory->rest += size;
+        memory->size -= size;
+        return block;
+    }
+    void *block = NULL;
+    if (posix_memalign(&block, 16, size) != 0) return NULL;
+    return memory->blocks[memory->num_blocks++] = block;
+}
+
 /* ---- a group ------------------------------------------------------------------- */
 
 static int contacts_exist(const struct rows *rows, int num_normals) {
@@ -440,14 +464,16 @@ int solve_group(struct solver *solver, struct collision_object **bodies, int num
         return 1;
     }
 
+    /* Room for the groups of most scenes. Larger groups allocate theirs. */
+    char stack[49152] __attribute__((aligned(16)));
+    struct memory memory = {stack, sizeof(stack), {NULL, NULL}, 0};
     const int size = solver->data.delta_velocities.size;
+    int solved = 0;
     /* A body for each velocity is more than enough; then the body of each velocity. */
-    group.bodies = malloc(size * (sizeof(struct body) + sizeof(int)));
+    group.bodies = allocate(&memory, size * (sizeof(struct body) + sizeof(int)));
     if (group.bodies == NULL) return 0;
     int *body_at = (int *)(group.bodies + size);
     memset(body_at, -1, size * sizeof(int));
-    int solved = 0;
-    void *memory = NULL;
     for (int i = 0; i < 5; i++)
         if (!add_rows(&group, solver, sources[i], targets[i], body_at)) goto done;
     if (group.torsional.size % 2) goto done;
@@ -458,14 +484,11 @@ int solve_group(struct solver *solver, struct collision_object **bodies, int num
     const size_t row_bytes = (group.num_rows * sizeof(struct row) + 15) & ~15;
     const size_t term_bytes = group.num_terms * sizeof(struct term);
     const size_t velocity_bytes = group.num_velocities * sizeof(double);
-    if (posix_memalign(&memory, 16,
-                       velocity_bytes + group.num_units * sizeof(double) + row_bytes +
-                           term_bytes) != 0) {
-        memory = NULL;
-        goto done;
-    }
-    group.velocities = memory;
-    group.rows = (struct row *)((char *)memory + velocity_bytes);
+    group.velocities =
+        allocate(&memory, velocity_bytes + group.num_units * sizeof(double) + row_bytes +
+                              term_bytes);
+    if (group.velocities == NULL) goto done;
+    group.rows = (struct row *)((char *)group.velocities + velocity_bytes);
     group.term = (struct term *)((char *)group.rows + row_bytes);
     group.unit = (double *)((char *)group.term + term_bytes);
     double *velocity = group.velocities;
@@ -493,8 +516,7 @@ int solve_group(struct solver *solver, struct collision_object **bodies, int num
     set_analytics(solver, bodies, num_bodies, num_manifolds, num_iterations);
     solved = 1;
 done:
-    free(memory);
-    free(group.bodies);
+    for (int i = 0; i < memory.num_blocks; i++) free(memory.blocks[i]);
     return solved;
 }
 #endif
