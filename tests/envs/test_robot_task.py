@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 import torch_panda
 from torch_panda.bullet import PhysicsClient
+from torch_panda.bullet.solver import activate
 
 
 def push_towards(td, generator):
@@ -471,5 +472,7 @@ def test_a_repr_shows_the_arguments():
         text = repr(env)
     assert text.startswith("RobotTaskEnv(robot=Panda(")
     assert "task=Reach(reward_type='sparse'" in text
-    assert text.endswith("num_envs=2, seed=3, max_episode_steps=50)")
+    call, solver = text.split(" [solver: ")
+    assert call.endswith("num_envs=2, seed=3, max_episode_steps=50)")
+    assert solver == f"{activate().name}]"
     assert "device" not in text

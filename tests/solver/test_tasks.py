@@ -1,11 +1,15 @@
 """All tasks with both solvers: equal bits after every step."""
 
+import hashlib
+
 import pytest
 import torch
 
 import torch_panda
 from tests.ids import PHYSICS_IDS
 from tests.solver.solvers import assert_same, needs_packed
+from torch_panda.bullet import PhysicsClient
+from torch_panda.bullet.solver.gate import load_library
 
 pytestmark = needs_packed
 
@@ -68,6 +72,67 @@ def test_fast_physics():
 def test_randomized_physics(seed):
     build = environment("PandaPush-v1", seed=seed, randomize=RANDOMIZATION)
     assert_same(build, 60)
+
+
+def test_threads():
+    """Many clients in two threads: the same bits with either solver."""
+
+    def rollout(name):
+        library = load_library()
+        library.enable(name == "packed")
+        try:
+            with torch_panda.make(
+                "PandaStack-v3", num_envs=8, num_threads=2, seed=4
+            ) as env:
+                torch.manual_seed(0)
+                env.rollout(40, break_when_any_done=False)
+                return env.get_state()
+        finally:
+            library.enable(True)
+
+    expected, state = rollout("bullet"), rollout("packed")
+    assert (state == expected).all()
+
+
+def test_clients_created_and_closed_beside_others():
+    build = environment("PandaPush-v1", num_envs=1)
+    step, state = build()
+    expected = [(step(k), state())[1] for k in range(30)]
+    step, state = build()
+    others = []
+    for k in range(30):
+        step(k)
+        assert state() == expected[k]
+        others.append(PhysicsClient())
+        if k % 3 == 2:
+            others.pop(k % len(others)).close()
+    for other in others:
+        other.close()
+
+
+@pytest.mark.slow
+def test_soak():
+    """Half a million substeps of eight simulations with each solver."""
+
+    def digest(name):
+        library = load_library()
+        library.enable(name == "packed")
+        try:
+            with torch_panda.make("PandaPickAndPlace-v1", num_envs=8, seed=9) as env:
+                generator = torch.Generator().manual_seed(0)
+                latest, sha = env.reset(), hashlib.sha256()
+                for _ in range(3125):
+                    action = torch.rand(env.action_spec.shape, generator=generator)
+                    latest = env.step(latest.set("action", action * 2 - 1))["next"]
+                    sha.update(latest["observation"].numpy().tobytes())
+                    latest = latest.exclude("reward")
+                    if latest["done"].any():
+                        latest = env.reset(latest.set("_reset", latest["done"]))
+                return sha.hexdigest()
+        finally:
+            library.enable(True)
+
+    assert digest("packed") == digest("bullet")
 
 
 @pytest.mark.slow

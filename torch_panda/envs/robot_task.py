@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase, EnvMetaData
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
-from torch_panda.bullet import PhysicsName, PhysicsParams
+from torch_panda.bullet import PhysicsName, PhysicsParams, solver
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
 from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
@@ -204,7 +204,7 @@ class RobotTaskEnv(EnvBase):
         )
 
     def __repr__(self) -> str:
-        """The class with the arguments that differ from their defaults."""
+        """The class with the arguments that differ from their defaults; the solver."""
         args, kwargs = self._arguments
         defaults = {
             name: parameter.default
@@ -218,7 +218,8 @@ class RobotTaskEnv(EnvBase):
             for name, value in kwargs.items()
             if value is not defaults.get(name) and value != defaults.get(name)
         ]
-        return f"{type(self).__name__}({', '.join(arguments)})"
+        call = f"{type(self).__name__}({', '.join(arguments)})"
+        return f"{call} [solver: {solver.activate().name}]"
 
     # ---- start and act -------------------------------------------------------------
 
