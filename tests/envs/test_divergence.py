@@ -84,6 +84,44 @@ def test_nothing_of_it_is_left(env):
             )
 
 
+@pytest.mark.parametrize("body", ["object", "robot"])
+def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
+    """Bullet itself runs into infinite numbers: a weight of 1e309 N is one.
+
+    All environments equal, bit for bit, those of a batch in which nothing diverged,
+    except for the step that diverges.
+    """
+    diverges, only_1 = 4, torch.tensor([[False], [True], [False]])
+    generator = torch.Generator().manual_seed(0)
+    with make("reset") as env, make("reset") as other:
+        ours, theirs = env.reset(), other.reset()
+        for step in range(12):
+            if step == diverges:
+                simulation = env.episodes.simulation
+                scene, client = simulation.scene, simulation.clients[1]
+                heavy = (scene.objects[0], -1) if body == "object" else (scene.robot, 5)
+                client.set_dynamics(*heavy, mass=1.7e308)
+            action = torch.rand(3, 3, generator=generator) * 2 - 1
+            ours = env.step(ours.set("action", action))["next"]
+            theirs = other.step(theirs.set("action", action))["next"]
+            alike = [0, 2] if step == diverges else [0, 1, 2]
+            for key, value in ours.items():
+                assert value.isfinite().all(), key
+                assert torch.equal(value[alike], theirs[key][alike]), (key, step)
+            assert (env.get_state()[alike] == other.get_state()[alike]).all()
+            assert ours["truncated"].flatten().tolist() == [
+                False,
+                step == diverges,
+                False,
+            ]
+            if step == diverges:
+                assert ours["done"][1] and not ours["success"][1]
+                ours = env.reset(ours.set("_reset", only_1)).exclude("_reset")
+                for _ in range(2):  # the divergence has begun an episode, too
+                    theirs = other.reset(theirs.set("_reset", only_1))
+                theirs = theirs.exclude("_reset")
+
+
 def test_collection_goes_on():
     with make("reset") as env:
         start = env.reset()
