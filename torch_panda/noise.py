@@ -1,8 +1,9 @@
-"""Noise and delay, as transforms of torchrl, which has none of its own.
+"""Noise and delay as torchrl transforms, which torchrl does not have.
 
     env = TransformedEnv(make(...), Compose(ActionDelay(1), ActionNoise(0.05)))
 
-What is stored in a rollout is the policy's own action, and the observation it saw.
+A rollout stores the policy's own action, without delay and noise, and the observation
+that the policy saw, with its noise.
 """
 
 from collections.abc import Sequence
@@ -12,21 +13,28 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
+from torch_panda.checks import check_integer, check_not_negative
 
-class _Noise(Transform):
-    """Gaussian noise from a generator of its own."""
 
-    def __init__(
-        self, std: float, seed: int | None, **keys: Sequence[NestedKey]
-    ) -> None:
-        if not 0 <= std < float("inf"):
-            raise ValueError(f"std must be finite and at least 0, got {std}")
-        super().__init__(**keys)
+class GaussianNoise:
+    """Adds Gaussian noise from a random generator of its own.
+
+    Args:
+        std: Standard deviation.
+        seed: Seed of the generator; None draws one from the operating system.
+
+    Raises:
+        ValueError: ``std`` is negative or not finite.
+    """
+
+    def __init__(self, std: float, seed: int | None) -> None:
+        check_not_negative(std=std)
         self._std = std
         self._seed = seed
         self._generator: torch.Generator | None = None
 
-    def _add_noise(self, value: Tensor) -> Tensor:
+    def add(self, value: Tensor) -> Tensor:
+        """Return the sum of a tensor and new noise of the same shape."""
         if self._generator is None:  # in the process that uses it
             self._generator = torch.Generator(value.device)
             if self._seed is None:
@@ -39,16 +47,16 @@ class _Noise(Transform):
         return value + noise
 
     def __getstate__(self) -> dict[str, object]:
-        return {**super().__getstate__(), "_generator": None}  # cannot be copied
+        return {**vars(self), "_generator": None}  # generators cannot be pickled
 
 
-class ObservationNoise(_Noise):
-    """Adds Gaussian noise to what is observed. Goals and rewards stay exact.
+class ObservationNoise(Transform):
+    """Adds Gaussian noise to observations. Goals and rewards stay exact.
 
     Args:
-        std: its standard deviation, in the units of the observation.
-        keys: the entries.
-        seed: of the noise; None takes one from the operating system.
+        std: Standard deviation, in the units of the observation.
+        keys: Entries that get noise.
+        seed: Seed of the noise; None draws one from the operating system.
 
     Raises:
         ValueError: ``std`` is negative or not finite.
@@ -61,10 +69,11 @@ class ObservationNoise(_Noise):
         keys: Sequence[NestedKey] = ("observation",),
         seed: int | None = None,
     ) -> None:
-        super().__init__(std, seed, in_keys=list(keys), out_keys=list(keys))
+        super().__init__(in_keys=list(keys), out_keys=list(keys))
+        self._noise = GaussianNoise(std, seed)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        return self._add_noise(obs)
+        return self._noise.add(obs)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -72,54 +81,56 @@ class ObservationNoise(_Noise):
         return self._call(tensordict_reset)
 
 
-class ActionNoise(_Noise):
-    """Adds Gaussian noise to actions on their way to the environment.
+class ActionNoise(Transform):
+    """Adds Gaussian noise to the actions that the environment gets.
 
     Args:
-        std: its standard deviation; actions go from -1 to 1.
-        seed: of the noise; None takes one from the operating system.
+        std: Standard deviation. Actions range from -1 to 1.
+        seed: Seed of the noise; None draws one from the operating system.
 
     Raises:
         ValueError: ``std`` is negative or not finite.
     """
 
     def __init__(self, std: float, *, seed: int | None = None) -> None:
-        super().__init__(std, seed, in_keys_inv=["action"], out_keys_inv=["action"])
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self._noise = GaussianNoise(std, seed)
 
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
-        return self._add_noise(action)
+        return self._noise.add(action)
 
 
 class ActionDelay(Transform):
-    """Lets actions arrive some steps late; in an episode's first steps they are zero.
+    """Delays actions by some steps. The first actions of an episode are zero.
 
     Args:
-        steps: how many, at least 1.
+        steps: Number of steps, at least 1.
 
     Raises:
         ValueError: ``steps`` is below 1.
+        TypeError: ``steps`` is not an integer.
     """
 
     def __init__(self, steps: int) -> None:
-        if steps < 1:
+        if check_integer("steps", steps) < 1:
             raise ValueError(f"steps must be at least 1, got {steps}")
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
         self._steps = steps
-        self._waiting: list[Tensor] = []  # actions, the next one first
+        self._queue: list[Tensor] = []  # the next action first
 
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
-        if not self._waiting:
-            self._waiting = [torch.zeros_like(action) for _ in range(self._steps)]
-        self._waiting.append(action.clone())
-        return self._waiting.pop(0)
+        if not self._queue:
+            self._queue = [torch.zeros_like(action) for _ in range(self._steps)]
+        self._queue.append(action.clone())
+        return self._queue.pop(0)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
         if mask is None:
-            self._waiting = []
-        elif self._waiting:
-            began = mask.reshape(*self._waiting[0].shape[:-1], 1)
-            self._waiting = [action * ~began for action in self._waiting]
+            self._queue = []
+        elif self._queue:
+            is_reset = mask.reshape(*self._queue[0].shape[:-1], 1)
+            self._queue = [action * ~is_reset for action in self._queue]
         return tensordict_reset

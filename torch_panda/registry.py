@@ -240,7 +240,7 @@ def make(
             [num_envs]; None makes one environment with batch size [].
         num_threads: Number of threads that step them; None means one per core, at most
             ``num_envs``.
-        seed: Seed of all random draws.
+        seed: Seed of all random draws. Give each worker process a seed of its own.
         device: Device of the outputs.
         from_pixels: Observe ``pixels``, uint8 (*batch, height, width, 3).
         pixels_only: Leave ``observation`` out; the goals stay.

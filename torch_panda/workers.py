@@ -1,4 +1,4 @@
-"""Worker processes that die while others wait for them."""
+"""Names the worker process that died while others waited for it."""
 
 import signal
 from collections.abc import Iterable, Iterator
@@ -8,21 +8,21 @@ from multiprocessing.process import BaseProcess
 
 @contextmanager
 def name_dead_workers(processes: Iterable[BaseProcess]) -> Iterator[None]:
-    """Let an error that a killed worker has caused name the worker.
+    """Context manager that makes the error of a killed worker name the worker.
 
-    torchrl's multi-process collectors notice a killed worker within about a second, and
-    then end the others. When these take longer than 0.1 s to end, as large environments
-    do, torchrl 0.14 raises an error about them that does not tell who died::
+    torchrl's multi-process collectors notice a killed worker within about a second and
+    then end the other workers. If these take longer than 0.1 s to end, as large
+    environments do, torchrl 0.14 raises an error that does not say which worker died::
 
         with name_dead_workers(collector.procs):
             for data in collector:
                 ...
 
     Args:
-        processes: the workers, ``collector.procs``.
+        processes: The worker processes, ``collector.procs``.
 
     Raises:
-        RuntimeError: a worker has died; it names the worker and its exit code.
+        RuntimeError: A worker died. The error names the worker and its exit code.
     """
     workers = [(process, _pid(process)) for process in processes]
     try:
@@ -37,7 +37,7 @@ def name_dead_workers(processes: Iterable[BaseProcess]) -> Iterator[None]:
 
 
 def _pid(process: BaseProcess) -> int | None:
-    """None of a process that torchrl has closed."""
+    """Process id, or None if torchrl has closed the process."""
     try:
         return process.pid
     except ValueError:
@@ -45,9 +45,9 @@ def _pid(process: BaseProcess) -> int | None:
 
 
 def _exit_code(process: BaseProcess) -> int | None:
-    """Of a process that died by itself; None for one that lives or was ended."""
+    """Exit code of a process that died by itself; None if it lives or was ended."""
     try:
         code = process.exitcode
-    except ValueError:  # torchrl has closed it, which it does with those it ends
+    except ValueError:  # torchrl closes the processes that it ends
         return None
     return None if code in (0, -signal.SIGTERM) else code

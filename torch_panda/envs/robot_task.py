@@ -69,7 +69,9 @@ class RobotTaskEnv(EnvBase):
             [num_envs]. None makes one environment of batch size [].
         num_threads: Number of threads that step them; None means one per core, at most
             ``num_envs``.
-        seed: Seed of all random draws; None draws one from the operating system.
+        seed: Seed of all random draws; None draws one from the operating system. Two
+            environments with the same seed play the same episodes, so give each worker
+            process a seed of its own.
         device: Device of the outputs; None means the CPU. Physics and states stay on
             the CPU.
         max_episode_steps: Number of steps after which an episode is ``truncated``;

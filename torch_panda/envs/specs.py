@@ -1,4 +1,4 @@
-"""What torchrl is told of the tensors of an environment."""
+"""TensorSpecs of an environment."""
 
 import torch
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
@@ -11,9 +11,15 @@ class Specs:
     """Specs of a batch of environments, from the sizes of robot, task and sensors.
 
     Args:
-        episodes: the environments.
-        device: where the tensors are placed.
-        observe_state: whether ``observation`` is observed.
+        episodes: The environments.
+        device: Device of the tensors.
+        observe_state: Whether ``observation`` is observed.
+
+    Attributes:
+        observation: Spec of what is observed.
+        action: Spec of the action.
+        reward: Spec of the reward.
+        done: Spec of ``done``, ``terminated`` and ``truncated``.
     """
 
     def __init__(
@@ -31,7 +37,7 @@ class Specs:
             size = robot.observation_dim + task.observation_dim
             observed["observation"] = self._numbers(size)
         for key, entry in episodes.entries.items():
-            observed[key] = self._sensed(entry)
+            observed[key] = self._entry(entry)
         self.observation = Composite(observed, shape=self._batch, device=device)
         self.action = Bounded(
             low=-1.0,
@@ -54,7 +60,8 @@ class Specs:
     def _flag(self) -> Binary:
         return Binary(shape=(*self._batch, 1), device=self._device, dtype=torch.bool)
 
-    def _sensed(self, entry: Entry) -> TensorSpec:
+    def _entry(self, entry: Entry) -> TensorSpec:
+        """Spec of an entry of a sensor or of `Task.extra_observation`."""
         shape, dtype = (*self._batch, *entry.shape), entry.dtype
         if dtype == torch.bool:
             return Binary(shape=shape, device=self._device, dtype=dtype)

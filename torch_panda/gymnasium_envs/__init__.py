@@ -1,4 +1,4 @@
-"""The environments as Gymnasium goal environments, single and vectorised."""
+"""Gymnasium interfaces: one environment and a vector of environments."""
 
 from torch_panda.gymnasium_envs.goal_env import GoalEnv
 from torch_panda.gymnasium_envs.goal_vector_env import GoalVectorEnv

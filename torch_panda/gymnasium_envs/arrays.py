@@ -1,4 +1,4 @@
-"""Between the tensors of an environment and the arrays of Gymnasium."""
+"""Converts between the tensors of an environment and the arrays of Gymnasium."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,14 +14,14 @@ from torch_panda.envs import RobotTaskEnv
 
 Observation = dict[str, NDArray[Any]]
 
-# What Gymnasium gives beside the observation, or in the infos.
+# Entries that Gymnasium returns beside the observation or in the infos.
 _OUTCOME = {"success", "reward", "terminated", "truncated", "done"}
 
 
 def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
-    """The space of what one environment observes, and of its goals.
+    """Space of the observations and goals of one environment.
 
-    float32 without bounds, integers and booleans with those of their type.
+    float32 entries have no bounds. Integers and booleans have those of their type.
     """
     boxes: dict[str, spaces.Space[Any]] = {}
     for key in observed_keys(env):
@@ -37,43 +37,43 @@ def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
 
 
 def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
-    """The space of one environment's action, float32 in [-1, 1]."""
+    """Space of the action of one environment, float32 in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (env.robot.action_dim,))
 
 
 def observed_keys(env: RobotTaskEnv) -> list[str]:
-    """What is observed, and the goals, in the order of Gymnasium's spaces."""
+    """Keys of observations and goals, in the order of Gymnasium's spaces."""
     return sorted(set(env.observation_spec.keys()) - _OUTCOME)
 
 
 def action(values: ArrayLike) -> Tensor:
-    """An action of any real type; the environment checks the rest."""
+    """Convert an action of any real dtype. The environment checks its values."""
     return torch.from_numpy(np.asarray(values).astype(np.float64))
 
 
 def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
-    """The state to start from that the options of a reset give; None: they give none.
+    """Read the state to start from in the options of a reset; None if there is none.
 
     Raises:
-        ValueError: there are other options, or the state has no entries.
-        TypeError: the state is no mapping of names to arrays of numbers.
+        ValueError: The options hold something else, or the state has no entries.
+        TypeError: The state is not a mapping of names to arrays of numbers.
     """
     if unknown := set(options) - {"state"}:
         raise ValueError(f"accepted options are state, got {sorted(map(str, unknown))}")
     if "state" not in options:
         return None
-    given = options["state"]
-    if not isinstance(given, Mapping | TensorDictBase):
-        raise TypeError(f"the state must be a mapping to arrays, got {given!r}")
-    if not given.keys():
+    state = options["state"]
+    if not isinstance(state, Mapping | TensorDictBase):
+        raise TypeError(f"the state must be a mapping to arrays, got {state!r}")
+    if not state.keys():
         raise ValueError("the state must have entries, got none")
     return {
-        key: torch.from_numpy(np.asarray(value).copy()) for key, value in given.items()
+        key: torch.from_numpy(np.asarray(value).copy()) for key, value in state.items()
     }
 
 
 class GoalFunctions:
-    """The pure functions of goals that hindsight relabelling calls."""
+    """Pure functions of goals, as Gymnasium-Robotics' goal environments have them."""
 
     torch_env: RobotTaskEnv
 
@@ -83,18 +83,18 @@ class GoalFunctions:
         desired_goal: ArrayLike,
         info: Any = None,  # noqa: ANN401 (unused, as in Gymnasium-Robotics)
     ) -> NDArray[np.float32]:
-        """The reward for an achieved goal.
+        """Reward of achieved goals.
 
         Args:
             achieved_goal: (..., goal_dim).
             desired_goal: (..., goal_dim).
-            info: ignored.
+            info: Ignored.
 
         Returns:
             (...), float32.
 
         Raises:
-            ValueError: a last dimension is not ``goal_dim``.
+            ValueError: A last dimension is not ``goal_dim``.
         """
         goals = _tensor(achieved_goal), _tensor(desired_goal)
         return _array(self.torch_env.compute_reward(*goals))
@@ -105,7 +105,7 @@ class GoalFunctions:
         desired_goal: ArrayLike,
         info: Any = None,  # noqa: ANN401
     ) -> NDArray[np.bool_]:
-        """Whether an achieved goal ends the episode, (...); see `compute_reward`."""
+        """Whether achieved goals end the episode, (...); see `compute_reward`."""
         goals = _tensor(achieved_goal), _tensor(desired_goal)
         success = self.torch_env.is_success(*goals)
         return _array(success & self.torch_env.terminate_on_success)
@@ -116,7 +116,7 @@ class GoalFunctions:
         desired_goal: ArrayLike,
         info: Any = None,  # noqa: ANN401
     ) -> NDArray[np.bool_]:
-        """False, (...): goals do not end an episode before its time."""
+        """False, (...): only the number of steps truncates an episode."""
         goals = _tensor(achieved_goal), _tensor(desired_goal)
         return _array(torch.zeros_like(self.torch_env.is_success(*goals)))
 
@@ -126,5 +126,5 @@ def _tensor(goal: ArrayLike) -> Tensor:
 
 
 def _array(values: Tensor) -> NDArray[Any]:
-    """(..., 1) to an array (...); to a numpy scalar where that is ()."""
+    """Convert (..., 1) to an array (...), or to a numpy scalar if that is ()."""
     return values.squeeze(-1).numpy()[()]

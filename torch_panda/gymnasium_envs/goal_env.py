@@ -1,4 +1,4 @@
-"""One environment with Gymnasium's interface."""
+"""One environment with the interface of `gymnasium.Env`."""
 
 import sys
 from typing import Any
@@ -23,26 +23,27 @@ from torch_panda.rendering import Camera
 class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
     """A goal environment: ``gymnasium.make("torch_panda/PandaPush-v1")``.
 
-    Observations are dictionaries of ``observation``, ``achieved_goal`` and
-    ``desired_goal``, float32, and of pixels or sensors if asked for;
-    ``info["is_success"]`` says whether the goal is reached.
+    An observation is a dictionary of ``observation``, ``achieved_goal`` and
+    ``desired_goal``, float32, and of the entries of cameras and sensors.
+    ``info["is_success"]`` is whether the goal is reached.
 
     Args:
-        env: an id of `torch_panda.ENV_IDS`, whose episodes ``gymnasium.make``
-            truncates, or an environment of batch size [].
+        env: An id, whose episodes ``gymnasium.make`` truncates, or a `RobotTaskEnv` of
+            batch size [].
         render_mode: "rgb_array" or None.
-        render_camera: of `render`; None means panda-gym's view in 720 x 480 pixels.
-        **arguments: panda-gym's ``render_width``, ``render_height``,
+        render_camera: Camera of `render`; None means panda-gym's view in 720 x 480
+            pixels.
+        **arguments: Arguments of `torch_panda.make`, if ``env`` is an id; and
+            panda-gym's arguments of the camera: ``render_width``, ``render_height``,
             ``render_target_position``, ``render_distance``, ``render_yaw``,
-            ``render_pitch`` and ``render_roll``, which change that camera; and, for an
-            id, those of `torch_panda.make`.
+            ``render_pitch`` and ``render_roll``.
 
     Raises:
-        ValueError: the environment is batched, or the render mode is unknown.
-        TypeError: there are arguments of an id, but an environment was given.
+        ValueError: The `RobotTaskEnv` is batched, or the render mode is unknown.
+        TypeError: Arguments of `torch_panda.make` accompany a `RobotTaskEnv`.
 
     Attributes:
-        torch_env: the environment behind it.
+        torch_env: The `RobotTaskEnv` behind this environment.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as declared by Gymnasium)
@@ -80,14 +81,14 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Start an episode.
 
         Args:
-            seed: restarts the sequence of episodes, as the seed of `RobotTaskEnv`.
-            options: ``state``, as `RobotTaskEnv.get_state` returns it or a part of it,
-                to start from.
+            seed: Restarts the sequence of episodes, as the seed of `RobotTaskEnv`.
+            options: May hold ``state``, the state to start from, as
+                `RobotTaskEnv.get_state` returns it, or some of its entries.
 
         Raises:
-            ValueError: an option is unknown, or the state is wrong.
-            TypeError: the state is no mapping of names to arrays of numbers.
-            gymnasium.error.Error: the seed is negative.
+            ValueError: An option is unknown, or the state is wrong.
+            TypeError: The state is not a mapping of names to arrays of numbers.
+            gymnasium.error.Error: The seed is negative.
         """
         state = arrays.read_state(options or {})
         super().reset(seed=seed)
@@ -99,7 +100,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: ArrayLike
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for one step; see `RobotTaskEnv` for what is raised."""
+        """Act for one step. It raises the errors of `RobotTaskEnv`."""
         after = self.torch_env.episodes.step(arrays.action(action))
         return (
             self._observation(after),
@@ -110,7 +111,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """An image (height, width, 3), if the render mode is "rgb_array"."""
+        """A picture (height, width, 3) if the render mode is "rgb_array", else None."""
         if self.render_mode is None:
             return None
         return self.torch_env.render(**self._view).cpu().numpy()
@@ -124,20 +125,20 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _info(observed: Observed) -> dict[str, Any]:
-    # Not a plain bool: torchrl's readers of infos expect a dtype.
+    # A numpy bool, because torchrl's readers of infos need a dtype.
     return {"is_success": np.bool_(observed["success"].item())}
 
 
 def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:
-    """Gymnasium's metadata, with as many frames a second as there are steps."""
+    """Gymnasium's metadata, with one frame per step."""
     return {**GoalEnv.metadata, "render_fps": round(1 / env.physics.ctrl_dt)}
 
 
 def check_no_arguments(arguments: dict[str, Any]) -> None:
-    """Make sure that no arguments of an id come with an environment.
+    """Check that no arguments of `torch_panda.make` accompany a `RobotTaskEnv`.
 
     Raises:
-        TypeError: some do.
+        TypeError: An argument accompanies it.
     """
     if arguments:
         raise TypeError(f"{sorted(arguments)} are for an id, not for an environment")

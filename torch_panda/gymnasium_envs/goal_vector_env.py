@@ -1,4 +1,4 @@
-"""Many environments, stepped in threads, with Gymnasium's vector interface."""
+"""Many environments with the interface of `gymnasium.vector.VectorEnv`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,27 +27,28 @@ class GoalVectorEnv(
 ):
     """``gymnasium.make_vec("torch_panda/PandaPush-v1", num_envs=16)``.
 
-    Gives what ``SyncVectorEnv`` gives over as many `GoalEnv`, in all autoreset modes,
-    and so seeds environment i with ``seed + i``.
+    It returns the same values as ``SyncVectorEnv`` over as many `GoalEnv`, in all
+    autoreset modes. A ``seed`` therefore seeds environment i with ``seed + i``.
 
     Args:
-        env: an id of `torch_panda.ENV_IDS`, or an environment of batch size [num_envs].
-        num_envs: number of environments, for an id; None means 1.
-        autoreset_mode: when an environment whose episode has ended is reset: instead of
-            its next step (NEXT_STEP), within the last one (SAME_STEP, with
-            ``final_obs`` and ``final_info`` in the infos), or only by `reset` with
-            ``options={"reset_mask": ...}`` (DISABLED).
+        env: An id, or a `RobotTaskEnv` of batch size [num_envs].
+        num_envs: Number of environments, for an id; None means 1.
+        autoreset_mode: When an environment is reset after its episode ended. NEXT_STEP
+            resets it instead of its next step. SAME_STEP resets it within the last
+            step, with ``final_obs`` and ``final_info`` in the infos. DISABLED leaves
+            it to `reset` with ``options={"reset_mask": ...}``. torchrl's `GymWrapper`
+            takes SAME_STEP and DISABLED.
         render_mode: "rgb_array" or None.
-        render_camera: of `render`, with the same keywords as for `GoalEnv`.
-        **arguments: of `GoalEnv`.
+        render_camera: Camera of `render`, as for `GoalEnv`.
+        **arguments: Further arguments of `GoalEnv`.
 
     Raises:
-        ValueError: the environment is not batched, or a mode is unknown.
-        TypeError: there are arguments of an id, but an environment was given.
+        ValueError: The `RobotTaskEnv` is not batched, or a mode is unknown.
+        TypeError: Arguments of `torch_panda.make` accompany a `RobotTaskEnv`.
 
     Attributes:
-        torch_env: the environment behind it.
-        autoreset_mode: the same.
+        torch_env: The `RobotTaskEnv` behind these environments.
+        autoreset_mode: When environments are reset.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class GoalVectorEnv(
         render_camera: Camera | None = None,
         **arguments: Any,  # noqa: ANN401 (of GoalEnv)
     ) -> None:
-        self.closed = True  # there is nothing to close until all is built
+        self.closed = True  # until everything is built, nothing needs closing
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         check_render_mode(render_mode)
         camera, arguments = take_camera(render_camera, arguments)
@@ -68,8 +69,8 @@ class GoalVectorEnv(
         if isinstance(env, str):
             env = make(env, num_envs=1 if num_envs is None else num_envs, **arguments)
         else:
-            given = {} if num_envs is None else {"num_envs": num_envs}
-            check_no_arguments({**arguments, **given})
+            number = {} if num_envs is None else {"num_envs": num_envs}
+            check_no_arguments({**arguments, **number})
         if env.num_envs is None:
             raise ValueError("the batch size must be [num_envs], got []")
         self.torch_env = env
@@ -84,7 +85,7 @@ class GoalVectorEnv(
         )
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._all = torch.ones(self.num_envs, dtype=torch.bool, device="cpu")
-        # Which environments have to be reset: (num_envs,).
+        # Environments that need a reset, (num_envs,).
         self._ended = self._all
         self._was_reset = False
         self.closed = False
@@ -98,15 +99,17 @@ class GoalVectorEnv(
         """Start episodes.
 
         Args:
-            seed: of environment 0, the others follow; or one per environment.
-            options: ``reset_mask``, (num_envs,) bool, which environments; and
-                ``state``, as `RobotTaskEnv.get_state` returns it, to start from.
+            seed: Seed of environment 0, with ``seed + i`` for environment i; or one
+                seed per environment.
+            options: May hold ``reset_mask``, the environments to reset, (num_envs,)
+                bool; and ``state``, the state to start from, as
+                `RobotTaskEnv.get_state` returns it.
 
         Raises:
-            ValueError: an option is unknown or has a wrong shape, or the number of
+            ValueError: An option is unknown or has a wrong shape, or the number of
                 seeds is wrong.
-            TypeError: an option or a seed has a wrong type.
-            gymnasium.error.Error: the seed is negative.
+            TypeError: An option or a seed has a wrong type.
+            gymnasium.error.Error: The seed is negative.
         """
         rest = dict(options or {})
         mask = self._read_mask(rest.pop("reset_mask", None))
@@ -117,10 +120,10 @@ class GoalVectorEnv(
             own_seed = seeds[index]
             if own_seed is not None:
                 self.torch_env.set_env_seed(index, own_seed)
-        begun = self.torch_env.episodes.reset(_indices(mask), state)
+        start = self.torch_env.episodes.reset(_indices(mask), state)
         self._ended = self._ended & ~mask
         self._was_reset = True
-        return self._observation(begun), self._infos(begun, mask)
+        return self._observation(start), self._infos(start, mask)
 
     def step(
         self, actions: ArrayLike
@@ -131,11 +134,11 @@ class GoalVectorEnv(
         NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """Act for one step; see `RobotTaskEnv` for what else is raised.
+        """Act for one step. It also raises the errors of `RobotTaskEnv`.
 
         Raises:
-            ResetNeeded: before the first `reset`, or, in the mode DISABLED, when an
-                environment whose episode has ended was not reset.
+            ResetNeeded: `reset` was not called yet; or, in the mode DISABLED, an
+                environment was not reset after its episode ended.
         """
         mode, ended = self.autoreset_mode, self._ended
         if not self._was_reset or (mode is AutoresetMode.DISABLED and ended.any()):
@@ -147,7 +150,7 @@ class GoalVectorEnv(
         stepped = ~ended.unsqueeze(1) if resets_now else None
         after = episodes.step(arrays.action(actions), stepped)
         if resets_now:
-            # Gives the others once more what the step gave them.
+            # For the other environments this repeats the results of the step.
             after |= episodes.reset(_indices(ended))
         outcome = (
             after["reward"].squeeze(1).double().numpy(),
@@ -164,7 +167,7 @@ class GoalVectorEnv(
         return self._observation(after), *outcome, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """An image (height, width, 3) of each, if the render mode is "rgb_array"."""
+        """Pictures (height, width, 3) if the render mode is "rgb_array", else None."""
         if self.render_mode is None:
             return None
         return tuple(self.torch_env.render(**self._view).cpu().numpy())
@@ -192,7 +195,7 @@ class GoalVectorEnv(
         return infos
 
     def _read_mask(self, mask: NDArray[np.bool_] | None) -> Tensor:
-        """Which environments to reset: (num_envs,) bool."""
+        """The environments to reset, (num_envs,) bool."""
         if mask is None:
             return self._all
         shape = (self.num_envs,)
@@ -207,7 +210,7 @@ class GoalVectorEnv(
     def _read_seeds(
         self, seed: int | Sequence[int | None] | None
     ) -> Sequence[int | None]:
-        """One seed, or None, for each environment."""
+        """One seed or None per environment."""
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):

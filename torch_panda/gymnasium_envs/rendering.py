@@ -1,4 +1,4 @@
-"""Gymnasium's render modes, and panda-gym's names for the camera."""
+"""Render modes of Gymnasium, and camera arguments of panda-gym."""
 
 import dataclasses
 from typing import Any
@@ -7,7 +7,7 @@ from torch_panda.rendering import Camera
 
 RENDER_MODES = ("rgb_array",)
 
-# panda-gym's keywords, and the fields of a camera.
+# Fields of a camera, by panda-gym's arguments.
 _CAMERA = {
     "render_width": "width",
     "render_height": "height",
@@ -20,32 +20,34 @@ _CAMERA = {
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Make sure that there is such a render mode.
+    """Check a render mode.
 
     Raises:
-        ValueError: there is not.
+        ValueError: The render mode is unknown.
     """
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise ValueError(
             f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}; "
-            "examples/watch.py --human and open_window() of the torch environment "
-            "show a window"
+            "for a window call open_window() or open_viewer() of env.torch_env"
         )
 
 
 def take_camera(
     camera: Camera | None, arguments: dict[str, Any]
 ) -> tuple[Camera | None, dict[str, Any]]:
-    """The camera of some keyword arguments, and the arguments that are left.
+    """Separate the camera arguments of panda-gym from other arguments.
 
     Args:
-        camera: what panda-gym's keywords change; None means panda-gym's own.
-        arguments: ``render_width``, ``render_height``, ``render_target_position``,
-            ``render_distance``, ``render_yaw``, ``render_pitch`` and ``render_roll``
-            among others.
+        camera: The camera that these arguments change; None means panda-gym's.
+        arguments: Keyword arguments, among them ``render_width``, ``render_height``,
+            ``render_target_position``, ``render_distance``, ``render_yaw``,
+            ``render_pitch`` or ``render_roll``.
+
+    Returns:
+        The camera and the other arguments.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: A camera argument is out of range.
     """
     changes = {
         _CAMERA[name]: value for name, value in arguments.items() if name in _CAMERA

@@ -1,4 +1,4 @@
-"""Many environments, stepped in threads, for Stable-Baselines3.
+"""Many environments with the interface of Stable-Baselines3's ``VecEnv``.
 
 Importing this module needs ``stable-baselines3``.
 """
@@ -22,17 +22,17 @@ from torch_panda.gymnasium_envs.goal_vector_env import GoalVectorEnv
 
 
 class SB3VecEnv(VecEnv):
-    """A `GoalVectorEnv` as the ``VecEnv`` that Stable-Baselines3 takes.
+    """A `GoalVectorEnv` for Stable-Baselines3.
 
-    The environments share one object: `get_attr` and `env_method` read and call it, and
-    give its answer once for each index.
+    The environments share one object. `get_attr` reads it, `env_method` calls it, and
+    both repeat the result once per index.
 
     Args:
-        env: as for `GoalVectorEnv`.
-        **arguments: of `GoalVectorEnv`, but for the autoreset mode.
+        env: An id, or a `RobotTaskEnv` of batch size [num_envs].
+        **arguments: Arguments of `GoalVectorEnv` except ``autoreset_mode``.
 
     Attributes:
-        vector_env: the `GoalVectorEnv`.
+        vector_env: The `GoalVectorEnv`.
     """
 
     def __init__(
@@ -51,29 +51,31 @@ class SB3VecEnv(VecEnv):
         self.metadata = self.vector_env.metadata
 
     def reset(self) -> Observation:
-        """Start an episode in each environment, with the seeds given to `seed`.
+        """Start an episode in each environment, with the seeds of the last `seed` call.
 
         Raises:
-            ValueError: `set_options` was called.
+            ValueError: `set_options` was called before.
         """
         if any(self._options):
-            raise ValueError("for options, call `vector_env.reset(options=...)`")
+            raise ValueError(
+                "set_options is not supported: call vector_env.reset(options=...)"
+            )
         observation, infos = self.vector_env.reset(seed=self._seeds)
         self.reset_infos = [{"is_success": bool(x)} for x in infos["is_success"]]
         self._reset_seeds()
         return observation
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Keep the actions for `step_wait`."""
+        """Store the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Take the step, and reset the environments whose episode it ended."""
+        """Take the step and reset the environments whose episode ended."""
         observation, rewards, terminated, truncated, infos = self.vector_env.step(
             self._actions
         )
         done = terminated | truncated
-        # Of an ended episode the infos are those of its last step.
+        # Where an episode ended, report the success of its last step.
         success = np.where(
             done,
             infos.get("final_info", {}).get("is_success", False),
@@ -93,11 +95,11 @@ class SB3VecEnv(VecEnv):
         self.vector_env.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """An image of each environment."""
+        """One picture per environment."""
         return self.vector_env.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the `GoalVectorEnv`, once for each index."""
+        """An attribute of the `GoalVectorEnv`, once per index."""
         return [getattr(self.vector_env, attr_name)] * self._count(indices)
 
     def set_attr(
@@ -109,7 +111,7 @@ class SB3VecEnv(VecEnv):
         """Set an attribute of the `GoalVectorEnv`, for all environments.
 
         Raises:
-            ValueError: not all environments are meant.
+            ValueError: ``indices`` does not name all environments.
         """
         if self._count(indices) != self.num_envs:
             raise ValueError("attributes can only be set for all environments at once")
@@ -122,7 +124,7 @@ class SB3VecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,  # noqa: ANN401
     ) -> list[Any]:
-        """Call a method of the `GoalVectorEnv`; its result once for each index."""
+        """Call a method of the `GoalVectorEnv`; repeat the result once per index."""
         method: Callable[..., Any] = getattr(self.vector_env, method_name)
         return [method(*method_args, **method_kwargs)] * self._count(indices)
 
@@ -131,7 +133,7 @@ class SB3VecEnv(VecEnv):
         wrapper_class: type[gymnasium.Wrapper],
         indices: VecEnvIndices = None,
     ) -> list[bool]:
-        """False: there are no wrappers around single environments."""
+        """False: no wrapper surrounds a single environment."""
         return [False] * self._count(indices)
 
     def _count(self, indices: VecEnvIndices) -> int:
