@@ -125,8 +125,9 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _info(observed: Observed) -> dict[str, Any]:
-    # A numpy bool, because torchrl's readers of infos need a dtype.
-    return {"is_success": np.bool_(observed["success"].item())}
+    # An array of shape (), as in panda-gym: torchrl's readers of infos need a dtype, and
+    # Gymnasium's vector environments join arrays, but not numpy's scalars.
+    return {"is_success": np.array(observed["success"].item())}
 
 
 def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:

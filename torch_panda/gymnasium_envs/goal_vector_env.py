@@ -189,7 +189,7 @@ class GoalVectorEnv(
             last = {key: values[index] for key, values in after.items()}
             final = {
                 "final_obs": self._observation(last),
-                "final_info": {"is_success": last["success"].item()},
+                "final_info": {"is_success": np.array(last["success"].item())},
             }
             infos = self._add_info(infos, final, index)
         return infos

@@ -61,7 +61,7 @@ class SB3VecEnv(VecEnv):
                 "set_options is not supported: call vector_env.reset(options=...)"
             )
         observation, infos = self.vector_env.reset(seed=self._seeds)
-        self.reset_infos = [{"is_success": np.bool_(x)} for x in infos["is_success"]]
+        self.reset_infos = [{"is_success": np.array(x)} for x in infos["is_success"]]
         self._reset_seeds()
         return observation
 
@@ -82,13 +82,13 @@ class SB3VecEnv(VecEnv):
             infos["is_success"],
         )
         list_of_infos: list[dict[str, Any]] = [
-            {"is_success": np.bool_(s), "TimeLimit.truncated": bool(t)}
+            {"is_success": np.array(s), "TimeLimit.truncated": bool(t)}
             for s, t in zip(success, truncated & ~terminated, strict=True)
         ]
         for index in done.nonzero()[0]:
             list_of_infos[index]["terminal_observation"] = infos["final_obs"][index]
             self.reset_infos[index] = {
-                "is_success": np.bool_(infos["is_success"][index])
+                "is_success": np.array(infos["is_success"][index])
             }
         return observation, rewards.astype(np.float32), done, list_of_infos
 
