@@ -1,19 +1,20 @@
-"""Train on the machines of a Ray cluster: workers step environments, one learner.
+"""Train on the machines of a Ray cluster, with many workers and one learner.
 
     python -m torch_panda distributed --num-workers 4 --cpus-per-worker 8 --address auto
 
-Every worker steps `num_envs` environments in `cpus_per_worker` threads and sends what
-it saw to the learner, which stores all workers' transitions in one replay buffer, takes
-the gradient steps that are due, and gives the worker its new weights. The others go on
-meanwhile, so runs are not reproducible bit for bit.
+Each worker steps `num_envs` environments in `cpus_per_worker` threads and sends its
+transitions to the learner. The learner stores the transitions of all workers in one
+replay buffer, takes the gradient steps that are due, and sends the new weights back to
+this worker. Meanwhile the other workers continue, so runs are not reproducible bit for
+bit.
 
-Without `--address` the workers run on this machine. For a cluster of machines that all
-have torch_panda and the same Ray:
+Without `--address` the workers run on this machine. To start a cluster of machines that
+all have torch_panda and the same version of Ray:
 
-    ray get-auth-token --generate      # once; copy ~/.ray/auth_token to all machines
+    ray get-auth-token --generate      # once; then copy ~/.ray/auth_token to all
     export RAY_AUTH_MODE=token         # on all machines
-    ray start --head                   # on the first, where this command runs, too
-    ray start --address=FIRST:6379     # on the others
+    ray start --head                   # on the first machine, which runs this command
+    ray start --address=FIRST:6379     # on the other machines
 """
 
 import logging
@@ -58,23 +59,23 @@ TRAJECTORY_KEY = ("collector", "traj_ids")
 
 @dataclass
 class Args(Hyperparameters):
-    """What to train, where, and how long."""
+    """Train on the machines of a Ray cluster."""
 
     address: str = "local"
-    """Ray cluster: "local" starts one on this machine for the time of the run, "auto"
-    joins the one that this machine belongs to"""
+    """address of the Ray cluster; "local" starts one on this machine for this run,
+    "auto" joins the cluster to which this machine belongs"""
     env_id: str = "PandaReach-v1"
-    """one of torch_panda.ENV_IDS"""
+    """task to train"""
     num_workers: Positive = 2
-    """processes that collect, spread over the machines"""
+    """number of worker processes, spread over the machines"""
     num_envs: Positive = 8
-    """environments of each worker"""
+    """number of environments of each worker"""
     steps_per_batch: Positive = 50
-    """steps of each environment in a batch that a worker sends"""
+    """steps of each environment per batch that a worker sends"""
     cpus_per_worker: Positive = 1
-    """CPUs that a worker reserves, and threads that step its environments"""
+    """CPUs that a worker reserves, which is also its number of threads"""
     total_steps: Positive = 10_000
-    """environment steps, over all workers"""
+    """environment steps of all workers together"""
     updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
     batch_size: Positive = 256
@@ -82,33 +83,33 @@ class Args(Hyperparameters):
     eval_interval: Positive = 1_000
     """environment steps between evaluations"""
     seed: Seed = 0
-    """the seed of the environments, the networks and the sampling"""
+    """seed of the environments, the networks and the sampling"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     out: Path | None = None
-    """the folder of the results; None means runs/<env-id>-<algo>-distributed-<seed>"""
+    """folder of the results; None means runs/<env-id>-<algo>-distributed-<seed>"""
 
     @property
     def batch_frames(self) -> int:
-        """Transitions in a batch."""
+        """Number of transitions in a batch of one worker."""
         return self.num_envs * self.steps_per_batch
 
 
 class Learner:
-    """The workers, the replay buffer that they fill, and the agent that learns from it.
+    """The agent, the replay buffer that it learns from, and the workers that fill it.
 
     Attributes:
-        collector: iterates over the workers' batches [num_envs, steps_per_batch],
-            first come first served.
-        buffer: the replay buffer.
-        agent: the agent.
-        progress: steps so far, and the evaluations.
+        collector: Iterator over the batches [num_envs, steps_per_batch] of all workers,
+            in the order in which they arrive.
+        buffer: The replay buffer.
+        agent: The agent.
+        progress: Number of steps so far, and the evaluations.
     """
 
     def __init__(self, args: Args, out: Path) -> None:
         torch.manual_seed(args.seed)
         self.args = args
-        # As many environments as a worker has: exploration noise has their shape.
+        # The exploration noise of the agent has the batch size of a worker.
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
         self.agent = make_agent(self.env, args)
         capacity = args.total_steps + args.batch_frames
@@ -118,10 +119,10 @@ class Learner:
         self.collector = make_collector(args, self.agent.explore)
 
     def train(self, stop: object = False) -> None:
-        """Collect and learn until the last step or a stop signal.
+        """Collect and learn until the last step, or until ``stop`` is true.
 
         Raises:
-            RayActorError: a worker died.
+            RayActorError: A worker died.
         """
         args, progress = self.args, self.progress
         label = f"{args.env_id} {args.algo}"
@@ -140,7 +141,7 @@ class Learner:
                     break
 
     def learn(self, data: TensorDictBase) -> None:
-        """Store a worker's batch and take the gradient steps that are due."""
+        """Store the batch of a worker and take the gradient steps that are due."""
         stored = self.buffer[self.buffer.extend(data.reshape(-1))]
         self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
         due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
@@ -148,14 +149,15 @@ class Learner:
             self.agent.update(self.buffer.sample(self.args.batch_size))
 
     def send_weights(self, worker: int) -> None:
-        """Give a worker the weights and the normaliser for its next batch."""
+        """Send a worker the weights and the normaliser for its next batch."""
         weights = TensorDict.from_module(self.agent.explore).data
-        # It is idle until this batch is done with, so this is a matter of milliseconds.
+        # The worker waits until the learner has finished this batch, so this takes only
+        # milliseconds.
         remote = self.collector.remote_collectors[worker]
         ray.get(remote.update_policy_weights_.remote(weights))
 
     def close(self) -> None:
-        """End the workers and free the environments."""
+        """Stop the workers and free the environments."""
         self.collector.shutdown()
         self.curve.close()
         self.env.close()
@@ -163,24 +165,28 @@ class Learner:
 
 @dataclass
 class UniqueTrajectories:
-    """What a worker does to its batches: keep what is stored, and number it.
+    """Numbers the trajectories of a worker uniquely, and drops unneeded entries.
 
-    Every worker counts its trajectories from 0. In one buffer two workers' episodes
-    would be taken for one, and goals of one be given to the other.
+    Each worker counts its trajectories from 0. In one buffer, hindsight would take the
+    episodes of two workers for one episode and mix up their goals.
+
+    Attributes:
+        worker: Index of the worker.
+        num_workers: Number of workers.
     """
 
     worker: int
     num_workers: int
 
     def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        """Make trajectory t of worker w number t * num_workers + w."""
+        """Give trajectory t of worker w the number t * num_workers + w."""
         data = data.select(*STORED_KEYS)
         number = data[TRAJECTORY_KEY] * self.num_workers + self.worker
         return data.set(TRAJECTORY_KEY, number)
 
 
 def worker_of(data: TensorDictBase, num_workers: int) -> int:
-    """The worker that collected a batch."""
+    """Index of the worker that collected a batch."""
     return int(data[TRAJECTORY_KEY].flatten()[0]) % num_workers
 
 
@@ -208,7 +214,7 @@ def make_env(
 
 
 def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
-    """Start the workers, spread over the machines, each with its own seed."""
+    """Start the workers on the machines of the cluster, each with a seed of its own."""
     workers = range(args.num_workers)
     make = partial(
         make_env,
@@ -217,8 +223,8 @@ def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
         args.num_envs,
         args.cpus_per_worker,
     )
-    # torchrl's own way to send weights is a process group at the address that this
-    # machine's name resolves to, often 127.0.0.1, where no other machine reaches it.
+    # torchrl sends weights through a process group at the address of this machine's
+    # name. That is often 127.0.0.1, which other machines cannot reach, so
     # `send_weights` goes through Ray instead.
     warnings.filterwarnings("ignore", message="RayCollector iteration started before")
     return RayCollector(
@@ -243,16 +249,16 @@ def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
 
 
 def draw_seed() -> int:
-    """A seed that follows from torch's."""
+    """Draw a seed from the random state of torch."""
     return int(torch.randint(2**62, ()))
 
 
 def connect(args: Args) -> None:
-    """Join the cluster, or start one.
+    """Join the cluster, or start one on this machine.
 
     Raises:
-        ConnectionError: there is no cluster at the address.
-        ValueError: it has not enough CPUs for the workers.
+        ConnectionError: There is no cluster at the address.
+        ValueError: The cluster does not have enough CPUs for the workers.
     """
     local = args.address == "local"
     ray.init(
@@ -260,7 +266,7 @@ def connect(args: Args) -> None:
         num_cpus=args.num_workers * args.cpus_per_worker if local else None,
         include_dashboard=False if local else None,
         logging_level=logging.WARNING,
-        log_to_driver=False,  # the collectors' long repr, at every line
+        log_to_driver=False,  # each line would start with the long repr of a collector
     )
     room = sum(
         int(node["Resources"].get("CPU", 0)) // args.cpus_per_worker
@@ -269,13 +275,13 @@ def connect(args: Args) -> None:
     )
     if room < args.num_workers:
         raise ValueError(
-            f"the cluster has room for {room} workers of {args.cpus_per_worker} CPUs, "
-            f"not for {args.num_workers}"
+            f"the cluster has CPUs for {room} workers with {args.cpus_per_worker} CPUs "
+            f"each, not for {args.num_workers}: lower num_workers or cpus_per_worker"
         )
 
 
 def main(args: Args) -> None:
-    """Train, and say where the policy is."""
+    """Train, and print where the results are."""
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
@@ -284,7 +290,7 @@ def main(args: Args) -> None:
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)
-        # Where a run is made is no way to train.
+        # The place of a run is not a difference between two ways to train.
         default = Args(
             env_id=args.env_id,
             address=args.address,
@@ -300,7 +306,7 @@ def main(args: Args) -> None:
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
     finally:
-        ray.shutdown()  # ends the workers, and the cluster if it was started here
+        ray.shutdown()  # stops the workers, and a cluster that was started here
     progress = learner.progress
     print(f"success {progress.success} after {progress.steps} steps; see {out}")
 

@@ -1,4 +1,4 @@
-"""Draw success curves of runs, medians and quartiles over seeds.
+"""Draw the success curves of runs: medians and quartiles over seeds.
 
 python -m torch_panda plot runs --out curves.png
 """
@@ -16,12 +16,12 @@ from torch_panda.learning.user_modules import Imports, import_modules, read_modu
 
 @dataclass
 class Args:
-    """Which runs to draw, and where."""
+    """Draw the success curves of runs."""
 
     runs: Annotated[list[Path], tyro.conf.Positional]
-    """folders that hold runs, at any depth"""
+    """folders with runs, at any depth"""
     metric: Metric = "success"
-    """column of the curves"""
+    """column of the curves to draw"""
     out: Path = Path("curves.png")
     """picture to write"""
     imports: Imports = ()
