@@ -1,0 +1,207 @@
+"""Generates data sets for offline learning from an id, a kind and a seed.
+
+Data sets are recipes, not downloads: the same arguments give the same numbers on any
+number of environments and threads, and `sha256` shows whether they are the same.
+"""
+
+import hashlib
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+import torch_panda
+from torch_panda import RobotTaskEnv
+from torch_panda.checks import check_positive, check_seed
+from torch_panda.experts import make_expert
+from torch_panda.registry import max_episode_steps
+from torch_panda.tasks import Task
+
+Kind = Literal["noisy", "play", "random"]
+
+PLAY_STEPS = 1000  # length of an episode of "play"
+HOLD_STEPS = 10  # steps for which "play" stays at a goal that it reached
+MAX_NOISE = 0.5  # largest standard deviation of the noise of "noisy"
+OBSERVED = ("observation", "achieved_goal", "desired_goal")
+
+
+def generate(
+    env_id: str,
+    *,
+    kind: Kind,
+    transitions: int,
+    seed: int,
+    num_envs: int,
+    num_threads: int | None = None,
+    progress: Callable[[int], object] | None = None,
+    **make_options: Any,  # noqa: ANN401 (those of `torch_panda.make`)
+) -> TensorDict:
+    """Generate a data set of whole episodes.
+
+    Episodes never end early. Episode e depends on (``seed``, e) alone, so ``num_envs``
+    and ``num_threads`` change only the time that it takes.
+
+    Args:
+        env_id: Id of the task.
+        kind: "noisy": the scripted expert with Gaussian noise on its actions, whose
+            standard deviation is drawn per episode from 0 to `MAX_NOISE`. "play": the
+            expert pursues goal after goal without reset, for `PLAY_STEPS` steps; it
+            moves on when it has stayed at a goal for `HOLD_STEPS` steps, or after the
+            number of steps of the task's episodes. "random": uniform actions.
+        transitions: Number of transitions, rounded up to whole episodes.
+        seed: Seed of the data set.
+        num_envs: Number of environments stepped in parallel.
+        num_threads: Number of threads that step them; None means one per core.
+        progress: Called with the number of new transitions after every step.
+        **make_options: Further arguments of `torch_panda.make`.
+
+    Returns:
+        Transitions [episodes, steps] with ``observation``, ``achieved_goal``,
+        ``desired_goal``, ``action``, ``("collector", "traj_ids")``, and under ``next``
+        also ``reward``, ``success``, ``terminated``, ``truncated`` and ``done``. In
+        "play", ``desired_goal`` is the goal that is pursued at the step, under ``next``
+        too.
+
+    Raises:
+        ValueError: The kind is unknown, there is no expert for the id, the goals of the
+            task cannot be changed during an episode ("play"), or a number is out of
+            range.
+    """
+    if kind not in get_args(Kind):
+        names = ", ".join(get_args(Kind))
+        raise ValueError(f"kind must be one of {names}, got {kind!r}")
+    check_positive(transitions=transitions, num_envs=num_envs)
+    seed = check_seed(seed)
+    expert = None if kind == "random" else make_expert(env_id)
+    if kind == "play":
+        make_options["max_episode_steps"] = PLAY_STEPS
+    make_options["terminate_on_success"] = False
+    steps = make_options.get("max_episode_steps") or max_episode_steps(env_id)
+    num_episodes = -(-transitions // steps)
+    num_envs = min(num_envs, num_episodes)
+    parts = []
+    with torch_panda.make(
+        env_id, num_envs=num_envs, num_threads=num_threads, **make_options
+    ) as env:
+        if kind == "play" and type(env.task).sample_start is not Task.sample_start:
+            raise ValueError(
+                'kind "play" needs goals that do not depend on how an episode starts, '
+                f'unlike those of {env_id}; use "noisy" or "random"'
+            )
+        for first in range(0, num_episodes, num_envs):
+            numbers = torch.arange(first, min(first + num_envs, num_episodes))
+            episodes = _Episodes(env, expert, kind, seed, first)
+            rows = []
+            for _ in range(steps):
+                rows.append(episodes.step())
+                if progress is not None:
+                    progress(len(numbers))
+            part = torch.stack(rows, dim=1)[: len(numbers)]
+            part["collector", "traj_ids"] = numbers[:, None].repeat(1, steps)
+            parts.append(part)
+    return TensorDict.cat(parts)
+
+
+class _Episodes:
+    """One episode in every environment, numbered from ``first``."""
+
+    def __init__(
+        self,
+        env: RobotTaskEnv,
+        expert: TensorDictModuleBase | None,
+        kind: Kind,
+        seed: int,
+        first: int,
+    ) -> None:
+        self._env, self._expert, self._kind = env, expert, kind
+        self._generators = []
+        noise = []
+        for index in range(env.batch_size[0]):
+            env_seed, other_seed = np.random.SeedSequence((seed, first + index)).spawn(
+                2
+            )
+            # set_env_seed takes an int64.
+            env.set_env_seed(index, int(env_seed.generate_state(1, np.uint64)[0] >> 1))
+            self._generators.append(np.random.default_rng(other_seed))
+            noise.append(self._generators[-1].uniform(0.0, MAX_NOISE))
+        self._noise = torch.tensor(noise, dtype=torch.float32).unsqueeze(1)
+        self._state = env.reset()
+        if kind == "play":
+            self._goal = self._state["desired_goal"].clone()
+            self._steps_at_goal = torch.zeros(env.batch_size[0], dtype=torch.int64)
+            self._steps_since_goal = torch.zeros_like(self._steps_at_goal)
+            self._patience = type(env.task).max_episode_steps
+
+    @torch.no_grad()
+    def step(self) -> TensorDictBase:
+        """Act for one step.
+
+        Returns:
+            The transitions of all environments, (num_envs,).
+        """
+        env = self._env
+        row = self._state.select(*OBSERVED)
+        if self._kind == "play":
+            row["desired_goal"] = self._goal.clone()
+        row["action"] = self._act(row)
+        row = env.step(row)
+        self._state = row["next"].select(*OBSERVED)
+        if self._kind == "play":
+            self._pursue(row)
+        return row
+
+    def _act(self, row: TensorDictBase) -> Tensor:
+        shape = self._env.action_spec.shape[1:]
+        if self._expert is None:
+            return self._draw(lambda rng: rng.uniform(-1.0, 1.0, shape))
+        action = self._expert(row.copy())["action"]
+        if self._kind == "noisy":
+            noise = self._draw(lambda rng: rng.normal(0.0, 1.0, shape))
+            action = (action + self._noise * noise).clamp(-1.0, 1.0)
+        return action
+
+    def _pursue(self, row: TensorDictBase) -> None:
+        """Judge the step by the pursued goal, and choose the next goals."""
+        after = row["next"]
+        after["desired_goal"] = row["desired_goal"].clone()
+        goals = after["achieved_goal"], after["desired_goal"]
+        after["reward"] = self._env.compute_reward(*goals)
+        after["success"] = self._env.is_success(*goals)
+        success = after["success"].squeeze(-1)
+        self._steps_at_goal = torch.where(success, self._steps_at_goal + 1, 0)
+        self._steps_since_goal += 1
+        changes = self._steps_at_goal >= HOLD_STEPS
+        changes |= self._steps_since_goal >= self._patience
+        for index in changes.nonzero().flatten().tolist():
+            goal = self._env.task.sample_start(self._generators[index]).goal
+            self._goal[index] = torch.as_tensor(goal, dtype=self._goal.dtype)
+        self._steps_at_goal[changes] = 0
+        self._steps_since_goal[changes] = 0
+
+    def _draw(self, draw: Callable[[np.random.Generator], Any]) -> Tensor:
+        """Draw from the generator of each episode: (num_envs, ...) float32."""
+        values = np.stack([draw(generator) for generator in self._generators])
+        return torch.from_numpy(values).float()
+
+
+def sha256(data: TensorDictBase) -> str:
+    """The hash of the keys, shapes, types and numbers of a data set.
+
+    Returns:
+        64 hexadecimal digits. They do not depend on the order of the keys.
+    """
+    digest = hashlib.sha256()
+    leaves = {
+        ".".join(key if isinstance(key, tuple) else (key,)): value
+        for key, value in data.items(include_nested=True, leaves_only=True)
+    }
+    for name in sorted(leaves):
+        values = leaves[name].cpu().contiguous().numpy()
+        little_endian = values.astype(values.dtype.newbyteorder("<"), copy=False)
+        digest.update(f"{name} {little_endian.dtype.str} {values.shape}\n".encode())
+        digest.update(little_endian.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,44 @@
+"""Fixed evaluation tasks: named start states with goals, the same for everybody."""
+
+import torch
+from tensordict import TensorDict
+
+from torch_panda.registry import make
+
+NUM_STARTS = 100  # starts from which the tasks are chosen
+SEED = 0
+# Names of the tasks, and the quantile of their start's distance from its goal.
+QUANTILES = {
+    "very_near": 0.05,
+    "near": 0.25,
+    "medium": 0.5,
+    "far": 0.75,
+    "very_far": 0.95,
+}
+
+
+def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
+    """Five named states to start from, with their goals.
+
+    They are chosen among `NUM_STARTS` starts of the task by the distance between the
+    achieved and the desired goal, so a registered task of your own has them too.
+
+    Args:
+        env_id: Id of the task.
+
+    Returns:
+        States of batch size [] by name, for ``env.reset(state, set_state=True)``. The
+        names are "very_near", "near", "medium", "far" and "very_far".
+
+    Raises:
+        ValueError: The id is unknown.
+    """
+    with make(env_id, num_envs=NUM_STARTS, seed=SEED) as env:
+        start = env.reset()
+        distance = env.task.distance(start["achieved_goal"], start["desired_goal"])
+        states = env.get_state()
+    order = torch.argsort(distance.squeeze(-1), stable=True)
+    return {
+        name: states[order[round(quantile * (NUM_STARTS - 1))]].clone()
+        for name, quantile in QUANTILES.items()
+    }
