@@ -274,7 +274,7 @@ def test_a_setpoint_of_another_shape(env):
 
 
 def test_forces_of_another_robot(env):
-    with pytest.raises(ValueError, match="a force for each of 9 joints, got 4"):
+    with pytest.raises(ValueError, match="a force for each of 9 movable joints, got 4"):
         env.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
 
 

@@ -1,7 +1,7 @@
-"""What Bullet reports of a body, as views of its memory.
+"""The state of a body as Bullet reports it, in views of Bullet's memory.
 
-They are valid until the client's next command; copy what is to be kept. All numbers are
-float64 and in the world frame.
+The views are valid until the client's next command: copy numbers that you keep. All
+numbers are float64 and in the world frame.
 """
 
 from ctypes import byref, c_double, c_int, c_void_p
@@ -13,7 +13,8 @@ from torch_panda.bullet import capi
 
 Doubles = npt.NDArray[np.float64]
 
-# Joints follow the base in Bullet's coordinates: 7 of its pose, 6 of its velocity.
+# In Bullet's coordinates q and u, joints follow the base, whose pose has 7 numbers and
+# whose velocity has 6.
 Q_OFFSET = 7
 U_OFFSET = 6
 
@@ -21,8 +22,8 @@ _DOUBLE = 8  # bytes
 
 
 def _view(address: int | None, first: int, *shape: int) -> Doubles:
-    """Doubles from the one with number ``first`` on."""
-    assert address is not None  # Bullet has answered
+    """A view of doubles in Bullet's memory, from the double with index ``first`` on."""
+    assert address is not None  # the status was checked
     count = shape[0] if len(shape) == 1 else shape[0] * shape[1]
     array = (c_double * count).from_address(address + _DOUBLE * first)
     view: Doubles = np.ctypeslib.as_array(array)
@@ -33,7 +34,7 @@ class BodyState:
     """The state of a body with n joints of one degree of freedom and m links.
 
     Args:
-        status: Bullet's answer to a request for the state.
+        status: Handle of Bullet's answer to a request for the state.
     """
 
     def __init__(self, status: int) -> None:
@@ -61,62 +62,62 @@ class BodyState:
 
     @property
     def base_pose(self) -> Doubles:
-        """(7,): position [m] and quaternion xyzw."""
+        """Pose of the base (7,): position [m] and quaternion xyzw."""
         return _view(self._q, 0, 7)
 
     @property
     def base_velocity(self) -> Doubles:
-        """(6,): linear [m/s] and angular [rad/s]."""
+        """Velocity of the base (6,): linear [m/s] and angular [rad/s]."""
         return _view(self._u, 0, 6)
 
     @property
     def joint_positions(self) -> Doubles:
-        """(n,) [rad] or [m]."""
+        """Positions of the joints (n,) [rad] or [m]."""
         return _view(self._q, Q_OFFSET, self._num_joints)
 
     @property
     def joint_velocities(self) -> Doubles:
-        """(n,) [rad/s] or [m/s]."""
+        """Velocities of the joints (n,) [rad/s] or [m/s]."""
         return _view(self._u, U_OFFSET, self._num_joints)
 
     def link_pose(self, link: int) -> Doubles:
-        """(7,): of a link's centre of mass."""
+        """Pose of a link's centre of mass (7,): position [m], quaternion xyzw."""
         return _view(self._poses, 7 * link, 7)
 
     def link_velocity(self, link: int) -> Doubles:
-        """(6,): of a link's centre of mass; filled only if it was asked for."""
+        """Velocity of a link's centre of mass (6,), if velocities were requested."""
         return _view(self._velocities, 6 * link, 6)
 
     @property
     def link_poses(self) -> Doubles:
-        """(m, 7): of the centres of mass."""
+        """Poses of the links' centres of mass (m, 7)."""
         return _view(self._poses, 0, self._read_forces()[0], 7)
 
     @property
     def wrenches(self) -> Doubles:
-        """(m, 6): what each link's parent exerts on it in the last step.
+        """Forces [N] and torques [N m] of the last step on links by parents (m, 6).
 
-        Force [N] and torque [N m], at the joint and in the link's frame; zero without a
-        sensor.
+        They act at the joint and are given in the link's frame. They are zero unless
+        the joint has a wrench sensor.
         """
         num_links, wrenches, _ = self._read_forces()
         return _view(wrenches, 0, num_links, 6)
 
     @property
     def motor_forces(self) -> Doubles:
-        """(m,): what each joint's motor exerts in the last step [N m] or [N]."""
+        """Torques [N m] or forces [N] of the joints' motors in the last step (m,)."""
         num_links, _, motors = self._read_forces()
         return _view(motors, 0, num_links)
 
     def _read_forces(self) -> tuple[int, int | None, int | None]:
-        """Number of links, and where wrenches and motor forces are."""
+        """Number of links, and addresses of wrenches and motor forces."""
         links, wrenches, motors = c_int(), c_void_p(), c_void_p()
-        nothing = (None,) * 5
+        unused = (None,) * 5
         capi.state_result(
             self._status,
             None,
             byref(links),
-            *nothing,
+            *unused,
             byref(wrenches),
             None,
             byref(motors),

@@ -1,18 +1,18 @@
-"""The way back to the broad phase of a world as it was built.
+"""Restores Bullet's broad phase to its state after the scene was built.
 
-A step depends on more than poses and velocities: Bullet solves contacts in the order
-in which its broad phase found the pairs of bodies, and that order depends on what
-happened before. The broad phase holds
+A step depends on more than poses and velocities. Bullet solves contacts in the order in
+which its broad phase found the pairs of bodies, and this order depends on the past. The
+state of the broad phase consists of
 
-* the pairs whose boxes overlap, in an order that additions and removals shuffle;
-* a tree of all boxes, whose shape decides the order of pairs that are found together;
-* a counter of collision detections, whose bits pick the leaf of the tree that each
-  detection inserts anew;
-* a mark in the order of pairs, from which each detection looks for pairs that overlap
-  no longer.
+* the pairs whose AABBs overlap, in an order that additions and removals shuffle;
+* a tree of all AABBs, whose shape determines the order of pairs found together;
+* a counter of collision detections, whose bits choose the leaf of the tree that each
+  detection inserts again;
+* a cursor in the list of pairs, at which each detection starts to look for pairs that
+  no longer overlap.
 
-No command resets them, so each is led back to where it was: by ``reset.c``, and where
-that was not compiled by `BroadPhase.restore`, with the same commands.
+No command of Bullet resets this state. `BroadPhase.restore` does it by a sequence of
+commands. ``reset.c`` gives the same commands from C.
 """
 
 from ctypes import pointer
@@ -22,33 +22,34 @@ from torch_panda.bullet import capi, native
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.rotations import rotate_vector
 
-# [m]; so much farther than the world is wide that a box put back lands beside those
-# that are back already, never among those that still wait.
+# Where bodies wait until they are inserted again [m]. The distance is much larger than
+# the scene, so that Bullet inserts an AABB beside those in the scene, and never among
+# those that wait.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
-# A detection reads one bit of the counter for each level of the tree. Trees of the
-# shipped tasks have up to 11 levels, but no episode of 120 changed with bits from 6 on.
+# A detection reads one bit of the counter per level of the tree. Trees of the shipped
+# tasks have up to 11 levels. In 120 episodes, bits from the seventh on had no effect.
 _DETECTION_CYCLE = 256
 
-_NOTHING = (0, 0)  # collision group and mask of what touches nothing
+_NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
 
 
 class _Link(NamedTuple):
-    """A link as its body was built."""
+    """A link as it was when its body was built."""
 
     body: int
     link: int
     group_mask: tuple[int, int]  # collision group and mask
-    snapshot: int  # in which the link is where it entered the broad phase
+    snapshot: int  # has the link at the pose at which it entered the broad phase
 
 
 class BroadPhase:
-    """A client's broad phase as its world was built, and the way back to it.
+    """Restores a client's broad phase to its state after the scene was built.
 
-    Bodies go back by snapshots, which leave the links' boxes where they are: a link
-    enters the broad phase anew when its collision filter is set, and no other one does.
+    Loading a snapshot moves bodies without updating their AABBs. A link therefore
+    enters the broad phase exactly when its collision filter is set.
 
     Args:
-        client: a client that will get no more bodies, and whose bodies have not moved
+        client: A client that gets no more bodies, and whose bodies have not moved
             since they were built.
     """
 
@@ -57,10 +58,10 @@ class BroadPhase:
         self._num_detections = client.num_detections
         self._links: list[_Link] = []
         bodies = {body: _read_poses(client, body) for body in client.bodies}
-        # A snapshot with contacts would detect collisions when it is loaded.
+        # Loading a snapshot that has contacts would detect collisions.
         for body, poses in bodies.items():
             for link in range(-1, len(poses) - 1):
-                client.set_collision_filter(body, link, *_NOTHING)
+                client.set_collision_filter(body, link, *_NO_CONTACTS)
         self._built = client.save()
         for body, poses in bodies.items():
             self._read_links(body, poses)
@@ -72,25 +73,24 @@ class BroadPhase:
         self.restore()
 
     def restore(self) -> None:
-        """Put all bodies where they were built, and make Bullet forget the rest.
+        """Move all bodies to where they were built and restore the broad phase.
 
-        Takes each link out of the broad phase and puts them back one by one, in the
-        order in which they were built. What is put in anew has no overlaps and no
-        contacts, and once nothing of the old tree is near, the tree of what is back
-        depends on the way back alone.
+        All links leave the broad phase and enter it one by one, in the order in which
+        they were built. A link that enters has no overlaps and no contacts. Because the
+        old tree is far away, the new tree depends on this sequence only.
         """
         client = self._client
         client.load(self._away)
-        # Links overlap there, too, unless they touch nothing.
+        # Far away the links overlap too, so they must touch nothing.
         for body, link, _, _ in self._links:
-            client.set_collision_filter(body, link, *_NOTHING)
-        # A detection that finds a single pair puts the mark at the first one.
+            client.set_collision_filter(body, link, *_NO_CONTACTS)
+        # A detection that finds a single pair moves the cursor to the first pair.
         for body in self._pair:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
         for body in self._pair:
-            client.set_collision_filter(body, -1, *_NOTHING)
-        # Cheap here, where nothing overlaps: about 1 us each.
+            client.set_collision_filter(body, -1, *_NO_CONTACTS)
+        # Detections are cheap while nothing overlaps: about 1 us.
         past = client.num_detections - self._num_detections
         client.detect_collisions(-past % _DETECTION_CYCLE)
         for body, link, group_mask, snapshot in self._links:
@@ -112,12 +112,13 @@ class BroadPhase:
         )
 
     def _read_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
-        """Find how the loader added a body's base and links to the broad phase.
+        """Find out how the importer added a body's base and links to the broad phase.
 
-        It adds each one with its centre of mass at the origin of its frame, and when it
-        has added the last, moves them to their places, but not their boxes. That it
-        also turns those whose inertial frame is turned, as in no shipped robot, is not
-        repeated: then what follows is always the same, but not as in a new client.
+        The importer adds every link with its centre of mass at the origin of the link's
+        frame. In the end it moves the links to their poses, but not their AABBs. It
+        also rotates links whose inertial frame is rotated. This is not repeated here,
+        because no shipped robot has such links: episodes with such a robot are
+        reproducible, but differ from the first episode of a new client.
         """
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):

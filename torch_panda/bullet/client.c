@@ -1,8 +1,8 @@
-/* One client: it sets the motors of its robot, advances time by some substeps, and
-   copies the state of its world into the caller's memory.
+/* A step of one client: set the motors of its robot, advance time by substeps, and copy
+   the state into the caller's memory.
 
-   client.py and simulation.py do the same in Python where this file was not compiled,
-   and both give the same numbers. */
+   Without this library, control.py, client.py and state.py do the same in Python and
+   compute the same numbers. */
 
 #include "client.h"
 
@@ -19,8 +19,8 @@ enum {
     TORQUE = 1,                   /* enum for b3JointControlCommandInit2 */
     POSITION_VELOCITY_PD = 2,
     MAX_DEGREES_OF_FREEDOM = 128, /* of a body */
-    Q_OFFSET = 7,                 /* joints follow the base: 7 of its pose, */
-    U_OFFSET = 6                  /* 6 of its velocity */
+    Q_OFFSET = 7, /* joints follow the 7 numbers of the base's pose */
+    U_OFFSET = 6  /* joints follow the 6 numbers of the base's velocity */
 };
 
 handle client_submit(struct batch *batch, int env, handle command, int expected,
@@ -75,7 +75,7 @@ static int set_motors(struct batch *batch, int env, doubles joints) {
             bullet->motor_set_kp(command, U_OFFSET + k, 0);
         }
         bullet->motor_set_kd(command, U_OFFSET + k, control->velocity_gain);
-        /* Where torques are applied, motors must not brake. */
+        /* The motor must not brake a joint that a torque drives. */
         bullet->motor_set_force(command, U_OFFSET + k,
                                 has_torque ? 0 : control->forces[k]);
     }
@@ -97,11 +97,12 @@ static int apply_torques(struct batch *batch, int env) {
 static int advance(struct batch *batch, int env, int num_substeps) {
     struct client *client = batch->clients[env];
     int has_torques = batch->control->arm_mode == TORQUES;
-    /* A client has one command buffer, and stepping leaves it as it was. */
+    /* A client has one command buffer, which stepping does not change: submitting the
+       same command again steps again. */
     handle command = batch->bullet->step_init(client->handle);
     for (; client->num_substeps < num_substeps; client->num_substeps++) {
         client->num_detections++;
-        if (has_torques) { /* which Bullet forgets when it has stepped */
+        if (has_torques) { /* Bullet applies a torque for one time step only */
             if (!apply_torques(batch, env)) return 0;
             command = batch->bullet->step_init(client->handle);
         }

@@ -1,7 +1,8 @@
-/* What client.c, reset.c and loop.c are told, and what one client does.
+/* Structs and functions that client.c, reset.c and loop.c share.
 
-   Nothing is linked: Bullet's functions are given by address. native.py declares these
-   structs once more, in the same order, and capi.py the functions by full names. */
+   The library does not link to Bullet: the caller passes the addresses of Bullet's
+   functions. native.py declares the same structs in the same order. capi.py has the full
+   names of the functions. */
 
 #ifndef TORCH_PANDA_CLIENT_H
 #define TORCH_PANDA_CLIENT_H
@@ -12,7 +13,7 @@
 enum { LOOP_VERSION = 1 }; /* native.py refuses a library of another version */
 
 typedef void *handle;          /* of a client, a command or a status */
-typedef const double *doubles; /* to be read */
+typedef const double *doubles; /* input */
 
 struct functions {
     handle (*submit)(handle client, handle command);
@@ -55,93 +56,97 @@ struct functions {
                                    double velocity);
 };
 
-struct link { /* as its body was built */
+struct link { /* _Link of broad_phase.py */
     int body, link, group, mask, snapshot;
 };
 
-struct broad_phase { /* BroadPhase of broad_phase.py: snapshots, and what it counts */
+struct broad_phase { /* BroadPhase of broad_phase.py */
     int64_t num_detections;
     int cycle, away, built, num_links, pair_size, pair[2];
     const struct link *links;
 };
 
 struct client {
-    handle handle;          /* NULL when it is closed */
-    int64_t num_detections; /* how often collisions have been detected */
-    int num_substeps;       /* in the present step, so far */
+    handle handle;          /* NULL if the client is closed */
+    int64_t num_detections; /* collision detections so far */
+    int num_substeps;       /* substeps of the present step so far */
     const struct broad_phase *broad_phase;
 };
 
 struct scene { /* the same in every client */
     int robot, ee_link, num_joints, num_objects, num_object_joints, num_markers;
     int num_substeps;
-    const int *joints;              /* indices of the robot's */
+    const int *joints;              /* indices of the robot's movable joints */
     const int *objects;             /* body ids */
-    const int *object_joint_counts; /* how many each object has */
-    const int *object_joints;       /* indices, of the first object, then of the next */
+    const int *object_joint_counts; /* number of movable joints per object */
+    const int *object_joints;       /* their indices, object by object */
     const int *markers;             /* body ids */
 };
 
 enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
 struct control { /* MotorControl of control.py */
-    int ik_link; /* whose position setpoints give; -1: they are of all joints */
+    int ik_link; /* link whose target setpoints contain; -1: they contain joints */
     int num_arm_joints, setpoint_size;
-    int turns;    /* whether they give its orientation, too */
-    int arm_mode; /* of the arm's joints */
+    int turns;    /* whether setpoints contain the orientation of ik_link */
+    int arm_mode; /* enum arm_mode */
     int ik_iterations;
     double orientation[4], position_gain, velocity_gain;
-    doubles forces, ik_damping; /* one a joint */
+    doubles forces, ik_damping; /* a number per joint */
 };
 
 enum { NO_ANSWER = -1, CLIENT_CLOSED = -2, DIVERGED = -3 };
 struct failure {
-    int expected; /* status code, CLIENT_CLOSED, or DIVERGED, when the state is read but
-                     not finite; 0 where nothing has failed */
-    int answer;   /* status code, or NO_ANSWER */
-    const char *action; /* what Bullet could not do */
+    int expected; /* expected status code, CLIENT_CLOSED, DIVERGED if the state is not
+                     finite, or 0 if nothing failed */
+    int answer;   /* status code of Bullet's answer, or NO_ANSWER */
+    const char *action; /* the action that failed */
 };
 
 struct batch { /* many clients of one scene */
     const struct functions *bullet;
     const struct scene *scene;
     struct client *const *clients;
-    double *state;            /* a row a client; client_row has the order */
-    doubles marker_pose;      /* a row a client, 7 a marker */
-    struct failure *failures; /* one a client */
+    double *state;            /* a row per client, in the order of client_row */
+    doubles marker_pose;      /* a row per client: 7 numbers per marker */
+    struct failure *failures; /* one per client */
 
-    const struct control *control; /* of the present step, as what follows */
-    doubles setpoint;              /* a row a client */
+    /* For the present step: */
+    const struct control *control;
+    doubles setpoint; /* a row per client */
 };
 
-enum { STATE_SIZE = 12, VELOCITY = 6 }; /* position, Euler angles, velocity */
-struct row { /* a client's */
+/* An object's state is position (3), Euler angles (3) and velocity (6). */
+enum { STATE_SIZE = 12, VELOCITY = 6 };
+struct row { /* parts of a client's row of the state */
     double *joint_position, *joint_velocity, *ee_position, *ee_velocity;
     double *ee_orientation, *object_pose, *object_joint_position;
-    double *object_joint_velocity, *object_state; /* STATE_SIZE an object */
+    double *object_joint_velocity, *object_state; /* STATE_SIZE per object */
 };
 
 struct row client_row(const struct batch *batch, int env);
 
-/* The following answer whether all has gone well; if not, they note the failure. */
+/* The following functions return 1 on success. Otherwise they return 0 or NULL and store
+   the failure. */
 
 int client_is_open(struct batch *batch, int env);
 
-/* The status; NULL: Bullet could not do it. */
+/* Submit a command and return its status if the code is the expected one. */
 handle client_submit(struct batch *batch, int env, handle command, int expected,
                      const char *action);
 
-/* Copy the state of a client's world into its row. */
+/* Copy the state of a client into its row. */
 int client_read_state(struct batch *batch, int env);
 
+/* Restore a client's broad phase, place its bodies, and copy its state into its row. */
 int client_reset(struct batch *batch, int env);
 
-/* Take so many substeps of a step; answer whether more of them are to be taken. */
+/* Take up to `piece` substeps of a step. Return 1 if substeps remain, else 0. */
 int client_take_piece(struct batch *batch, int env, int piece);
 
 /* LOOP_VERSION of the sources from which the library was compiled. */
 int loop_version(void);
 
-/* Roll, pitch and yaw of a quaternion xyzw; euler.py says more. */
+/* Roll, pitch and yaw of a quaternion xyzw; see euler.py. */
 void euler_angles(doubles quaternion, double *angles);
 
 #endif

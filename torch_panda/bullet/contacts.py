@@ -1,4 +1,4 @@
-"""Contacts and the forces in them."""
+"""Contact points of two bodies, with their forces."""
 
 from typing import NamedTuple
 
@@ -18,12 +18,12 @@ class ContactPoint(NamedTuple):
     position_on_b: Vector  # [m]
     normal_on_b: Vector  # from b towards a
     distance: float  # [m], negative where the bodies penetrate
-    normal_force: float  # [N], along the normal on a, against it on b
-    friction_force: Vector  # [N], on a; the reverse acts on b
+    normal_force: float  # [N], pushes a along the normal and b against it
+    friction_force: Vector  # [N], on a; its negative acts on b
 
     @property
     def force_on_a(self) -> Vector:
-        """All that b exerts on a here [N]."""
+        """Normal and friction force that body b exerts on body a [N]."""
         x, y, z = (
             self.normal_force * n + f
             for n, f in zip(self.normal_on_b, self.friction_force, strict=True)
@@ -47,7 +47,7 @@ class ContactPoint(NamedTuple):
 
 
 def read_contact(point: capi.ContactPoint) -> ContactPoint:
-    """A contact as Bullet reports it."""
+    """Convert a contact point from Bullet's struct."""
     friction = (
         point.friction_force_1 * d1 + point.friction_force_2 * d2
         for d1, d2 in zip(

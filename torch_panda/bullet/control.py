@@ -1,4 +1,4 @@
-"""What sets the motors of a robot."""
+"""Control of a robot's motors, as a function or as data."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ import numpy as np
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import PhysicsClient
 
-# Sets the motors of one client's robot, in the thread that steps the client, given the
-# client, the robot's body id and a row of setpoints.
+# A function that sets the motors of one client's robot, in the thread that steps the
+# client. Its arguments are the client, the robot's body id and a row of setpoints.
 Control = Callable[[PhysicsClient, int, Doubles], None]
 
-# What the setpoints of the arm's joints are.
+# Meaning of the setpoints of the arm's joints.
 ArmMode = Literal["position", "velocity", "torque"]
 
 
@@ -21,22 +21,25 @@ ArmMode = Literal["position", "velocity", "torque"]
 class MotorControl:
     """Drives all movable joints of a robot.
 
-    It is a `Control`, and as data one that the native loop carries out without Python.
-    A setpoint holds what all joints are driven to: the arm's, the first ones, to
-    positions [rad], velocities [rad/s] or by torques [N m], the others to positions
-    [rad] or [m]. With an ``ik_link`` it holds instead of the arm's where the centre of
-    mass of that link is to be, world frame [m], and without an ``ik_orientation`` its
-    orientation, a quaternion xyzw, too.
+    It is a `Control`, and because it is data, the native loop carries it out without
+    Python. The arm's joints are the first joints. A setpoint is a row of numbers:
+
+    * for the arm's joints, by ``arm_mode``: positions [rad], velocities [rad/s] or
+      torques [N m];
+    * or, with an ``ik_link``, the target of its centre of mass, world frame [m],
+      followed by its target orientation (quaternion xyzw) unless ``ik_orientation`` is
+      given;
+    * then the positions of the other joints [rad] or [m].
 
     Attributes:
-        forces: the most each joint's motor may exert [N m] or [N]; torques are not
-            limited.
-        ik_link: the link for which inverse kinematics find the arm's joint positions;
-            None: setpoints are of joints.
-        ik_orientation: quaternion xyzw that this link keeps, world frame; None:
-            setpoints have it.
-        num_arm_joints: how many joints are the arm's.
-        arm_mode: what setpoints of the arm's joints are.
+        forces: Maximum force of every joint's motor [N m] or [N]. Torques of
+            ``arm_mode="torque"`` are not limited.
+        ik_link: Link for which inverse kinematics find the arm's joint positions; None
+            means that setpoints contain the arm's joints.
+        ik_orientation: Orientation that this link keeps, quaternion xyzw in the world
+            frame; None means that setpoints contain it.
+        num_arm_joints: Number of the arm's joints.
+        arm_mode: Meaning of the setpoints of the arm's joints.
     """
 
     forces: tuple[float, ...]
@@ -53,8 +56,8 @@ class MotorControl:
         return self._pose_dim + len(self.forces) - self.num_arm_joints
 
     @property
-    def num_unheld_joints(self) -> int:
-        """How many joints, the first ones, are not driven to positions."""
+    def num_free_joints(self) -> int:
+        """Number of joints, the first ones, that are not driven to positions."""
         return 0 if self.arm_mode == "position" else self.num_arm_joints
 
     @property
@@ -62,15 +65,20 @@ class MotorControl:
         return 7 if self.ik_orientation is None else 3
 
     def check(self, setpoint: Doubles, num_envs: int, num_joints: int) -> None:
-        """Make sure that this control drives these robots to these setpoints.
+        """Make sure that setpoints and robots fit this control.
+
+        Args:
+            setpoint: Setpoints of all robots.
+            num_envs: Number of robots.
+            num_joints: Number of movable joints of a robot.
 
         Raises:
-            ValueError: it has the forces of another robot, or other setpoints.
+            ValueError: the number of forces or the shape of the setpoints is wrong.
         """
         if len(self.forces) != num_joints:
             raise ValueError(
-                f"a MotorControl needs a force for each of {num_joints} joints, "
-                f"got {len(self.forces)}"
+                f"a MotorControl needs a force for each of {num_joints} movable "
+                f"joints, got {len(self.forces)}"
             )
         if setpoint.shape != (num_envs, self.setpoint_dim):
             raise ValueError(
@@ -87,21 +95,23 @@ class MotorControl:
             orientation = self.ik_orientation or pose[3:].tolist()
             client.inverse_kinematics(body, self.ik_link, pose[:3], orientation, joints)
             joints[self.num_arm_joints :] = setpoint[self._pose_dim :]
-        free = self.num_unheld_joints
-        velocities = setpoint[:free] if self.arm_mode == "velocity" else np.zeros(free)
+        first = self.num_free_joints  # first joint that is driven to a position
+        velocities = np.zeros(first)
+        if self.arm_mode == "velocity":
+            velocities = setpoint[:first]
         forces = self.forces
         if self.arm_mode == "torque":  # the motors must not brake
-            forces = (0.0,) * free + forces[free:]
-        client.control_joints(body, joints[free:], forces, velocities)
+            forces = (0.0,) * first + forces[first:]
+        client.control_joints(body, joints[first:], forces, velocities)
 
     def advance(
         self, client: PhysicsClient, body: int, setpoint: Doubles, count: int
     ) -> None:
-        """Take ``count`` time steps, for which the motors are set."""
+        """Take ``count`` time steps after the motors were set."""
         if self.arm_mode != "torque":
             client.step(count)
             return
         torques = setpoint[: self.num_arm_joints]
-        for _ in range(count):  # Bullet forgets torques when it has stepped
+        for _ in range(count):  # Bullet applies a torque for one time step only
             client.apply_torques(body, torques)
             client.step()

@@ -6,8 +6,9 @@ import math
 def euler_angles(x: float, y: float, z: float, w: float) -> tuple[float, float, float]:
     """Roll, pitch and yaw [rad] of a quaternion xyzw.
 
-    As pybullet's ``getEulerFromQuaternion``: near a pitch of 90 degrees, where only the
-    sum or difference of the others is defined, roll is 0. ``loop.c`` has the same.
+    Equals pybullet's ``getEulerFromQuaternion``. Near a pitch of 90 degrees only the
+    sum or the difference of roll and yaw is defined, and roll is 0. ``client.c`` has
+    the same function in C.
     """
     sine = -2 * (x * z - w * y)
     if abs(sine) >= 0.99999:

@@ -1,4 +1,4 @@
-"""One thread at a time."""
+"""A lock that refuses a second thread instead of letting it wait."""
 
 import threading
 
@@ -6,10 +6,13 @@ from torch_panda.bullet.connection import BulletError
 
 
 class ThreadGuard:
-    """Lets one thread in, and refuses the others for as long as it is there.
+    """A context manager that one thread at a time may enter.
 
-    Bullet's clients are not for two threads at once: they crash the interpreter. The
-    thread that is in may enter again, and another one once it has left.
+    Two threads in one Bullet client crash the interpreter. The thread that is inside
+    may enter again.
+
+    Raises:
+        BulletError: another thread is inside.
     """
 
     def __init__(self) -> None:
@@ -19,7 +22,7 @@ class ThreadGuard:
         if not self._lock.acquire(blocking=False):
             raise BulletError(
                 "another thread is using this environment: it serves one thread at a "
-                "time, so give each thread an environment of its own"
+                "time, so make an environment for each thread"
             )
 
     def __exit__(self, *error: object) -> None:

@@ -1,13 +1,13 @@
-"""The extension module that the pybullet wheel installs: found, loaded and bound.
+"""Finds and loads Bullet: the extension module that pybullet's wheel installs.
 
-It is opened twice, because ctypes ties the lock to the library object:
+The module is loaded twice, because in ctypes the library object decides about the GIL:
 
-* ``CDLL`` releases the GIL around a call. It serves the calls that do real work, so
+* ``CDLL`` releases the GIL during a call. It serves the calls that do real work, so
   that clients in different threads step at the same time.
-* ``PyDLL`` keeps the GIL. It serves the setters, which take less time than handing
-  the lock over; through ``CDLL`` two threads would pass it back and forth.
+* ``PyDLL`` keeps the GIL. It serves the cheap setters: releasing the GIL costs more
+  than they do, and two threads would pass it back and forth.
 
-The file is found, not imported: importing pybullet prints a line on stdout.
+The module is not imported, because importing pybullet prints a line.
 """
 
 import ctypes
@@ -19,7 +19,7 @@ SUPPORTED_VERSION = "3.2.7"
 
 
 def wrong_pybullet(reason: str) -> ImportError:
-    """The one error for a pybullet whose C API is not the one declared here."""
+    """The error for a pybullet whose C API differs from the one declared in `capi`."""
     try:
         installed = importlib.metadata.version("pybullet")
     except importlib.metadata.PackageNotFoundError:
@@ -32,7 +32,11 @@ def wrong_pybullet(reason: str) -> ImportError:
 
 
 def library_path(module: str = "pybullet") -> str:
-    """Path of the extension module, without importing it."""
+    """Path of an extension module, without importing it.
+
+    Raises:
+        ImportError: pybullet is not installed.
+    """
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:
         raise wrong_pybullet("pybullet is not installed")
@@ -40,7 +44,7 @@ def library_path(module: str = "pybullet") -> str:
 
 
 def bind(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any:  # noqa: ANN401 (ctypes function types)
-    """Declare one C function.
+    """Declare a C function: its name, its result type and its argument types.
 
     Raises:
         ImportError: the library does not export the name.
@@ -55,5 +59,5 @@ def bind(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any: 
 
 
 _path = library_path()
-WORK = ctypes.CDLL(_path)  # for calls that do real work
-CHEAP = ctypes.PyDLL(_path)  # for those that take less time than the GIL's handover
+WORK = ctypes.CDLL(_path)  # releases the GIL
+CHEAP = ctypes.PyDLL(_path)  # keeps the GIL

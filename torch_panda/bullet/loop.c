@@ -1,11 +1,10 @@
-/* A vector step of many clients, or their reset, in threads of its own and without
-   Python.
+/* Steps and resets many clients in threads of C, without Python.
 
-   Clients, each as in client.c, are drawn by whichever thread is free; the caller's
-   takes part, and returns when all are done. The last clients are drawn in pieces of a
-   few substeps each, in turns, so that all threads end at about the same time: steps
-   last 0.8 ms give or take 0.2, and so four clients drawn whole take two threads 8 %
-   longer than half their work, in pieces 4 %. */
+   A free thread draws the next client from a queue. The caller's thread takes part and
+   returns when all clients are done. The last clients are drawn in pieces of a few
+   substeps, in turns, so that all threads finish at about the same time. A step of a
+   client takes 0.6 to 1.0 ms. With four whole clients, two threads need 8 % more than
+   half of the total time. With pieces they need 4 % more. */
 
 #define _POSIX_C_SOURCE 200809L
 
@@ -19,28 +18,28 @@
 int loop_version(void) { return LOOP_VERSION; }
 
 enum {
-    STACK_SIZE = 8 << 20, /* of a thread: as on Linux; macOS gives less */
-    PIECE = 5             /* substeps; other threads begin with a cold cache */
+    STACK_SIZE = 8 << 20, /* of a thread, as on Linux; the default of macOS is less */
+    PIECE = 5 /* substeps; shorter pieces change threads, and caches, more often */
 };
 
-/* Do a part of a client's work; answer whether more of it is to be done. */
+/* Do a part of a client's work and return 1 if more remains, else 0. */
 typedef int work(struct batch *batch, int env, int piece);
 
 struct loop {
     struct batch *batch;
     work *work;
     int num_envs, num_done, num_failed;
-    int *queue; /* a ring of num_envs clients that wait to be drawn */
-    int first, num_waiting, num_whole; /* of them the first ones are not cut up */
+    int *queue; /* ring buffer of the clients that wait to be drawn */
+    int first, num_waiting, num_whole; /* the first num_whole are not drawn in pieces */
 
-    pthread_mutex_t mutex; /* of all that changes */
+    pthread_mutex_t mutex; /* protects everything that changes */
     pthread_cond_t begun, done;
     int is_over;
-    int num_threads; /* beside the caller's */
+    int num_threads; /* without the caller's */
     pthread_t threads[];
 };
 
-/* Work on clients until none is left to be drawn; the mutex is held before and after. */
+/* Work on clients until the queue is empty. The caller holds the mutex. */
 static void take_part(struct loop *loop) {
     while (loop->num_waiting) {
         int env = loop->queue[loop->first];
@@ -62,7 +61,7 @@ static void take_part(struct loop *loop) {
 
 static void *serve(void *argument) {
     struct loop *loop = argument;
-    fesetenv(FE_DFL_ENV); /* and not its creator's */
+    fesetenv(FE_DFL_ENV); /* the thread inherited its creator's */
     pthread_mutex_lock(&loop->mutex);
     while (!loop->is_over) {
         take_part(loop);
@@ -72,8 +71,8 @@ static void *serve(void *argument) {
     return NULL;
 }
 
-/* Start the threads, or as many as the system grants; NULL: there is no memory. The
-   batch, and what it points to, must outlive the loop. */
+/* Start the threads, or as many as the system allows. Return NULL if there is no memory.
+   The batch, and the memory that it points to, must outlive the loop. */
 struct loop *loop_create(struct batch *batch, int num_threads) {
     struct loop *loop = calloc(1, sizeof *loop + num_threads * sizeof(pthread_t));
     if (!loop) return NULL;
@@ -84,7 +83,7 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
     pthread_attr_t attributes;
     pthread_attr_init(&attributes);
     pthread_attr_setstacksize(&attributes, STACK_SIZE);
-    sigset_t all, before; /* signals are for Python's threads alone */
+    sigset_t all, before; /* Python's threads handle signals */
     sigfillset(&all);
     pthread_sigmask(SIG_SETMASK, &all, &before);
     for (; loop->num_threads < num_threads - 1; loop->num_threads++) {
@@ -96,10 +95,11 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
     return loop;
 }
 
-/* Work on some clients, the last ones in pieces; return how many have failed. */
+/* Do the work of some clients and return the number of failures. All but the first
+   num_whole clients are drawn in pieces. */
 static int share_out(struct loop *loop, work *work, int *envs, int num_envs,
                      int num_whole) {
-    fenv_t before; /* of the caller, who may flush denormal numbers to zero */
+    fenv_t before; /* the caller may flush denormal numbers to zero */
     fegetenv(&before);
     fesetenv(FE_DFL_ENV);
     pthread_mutex_lock(&loop->mutex);
@@ -115,14 +115,14 @@ static int share_out(struct loop *loop, work *work, int *envs, int num_envs,
     return loop->num_failed;
 }
 
-/* Step some clients, of which none may be named twice; return how many have failed.
-   The array that names them is shuffled. */
+/* Step some clients and return the number of failures. Their indices in envs must be
+   unique, and their order is changed. */
 int loop_step(struct loop *loop, const struct control *control, doubles setpoint,
               int *envs, int num_envs) {
     struct batch *batch = loop->batch;
     batch->control = control, batch->setpoint = setpoint;
     for (int k = 0; k < num_envs; k++) batch->clients[envs[k]]->num_substeps = 0;
-    /* More than the last two of each thread would gain less than it costs. */
+    /* Cutting more than the last two clients per thread costs more than it gains. */
     int num_pieces = loop->num_threads ? 2 * (loop->num_threads + 1) : 0;
     return share_out(loop, client_take_piece, envs, num_envs, num_envs - num_pieces);
 }
@@ -133,12 +133,12 @@ static int reset(struct batch *batch, int env, int piece) {
     return 0;
 }
 
-/* Reset some clients, as `loop_step` steps them. */
+/* Reset some clients and return the number of failures. */
 int loop_reset(struct loop *loop, int *envs, int num_envs) {
     return share_out(loop, reset, envs, num_envs, num_envs);
 }
 
-/* End the threads. A forked child, which has none, must not call this. */
+/* End the threads. A forked child has no threads and must not call this. */
 void loop_destroy(struct loop *loop) {
     pthread_mutex_lock(&loop->mutex);
     loop->is_over = 1;

@@ -38,10 +38,10 @@ LOOP_VARIABLE = "TORCH_PANDA_LOOP"
 # ``enum arm_mode``
 ARM_MODES = {"position": 0, "velocity": 1, "torque": 2}
 
-# In a `Failure`, beside status codes.
-NO_ANSWER = -1  # as answer
-CLIENT_CLOSED = -2  # as expected
-DIVERGED = -3  # as expected
+# Values of a `Failure` beside Bullet's status codes.
+NO_ANSWER = -1  # of its answer
+CLIENT_CLOSED = -2  # of its expected status
+DIVERGED = -3  # of its expected status
 
 # In the order of ``struct functions``.
 _BULLET = (
@@ -294,5 +294,5 @@ def _reinstall_command() -> str:
 
 
 def bullet_functions() -> Any:  # noqa: ANN401 (a ctypes array)
-    """``struct functions``: where Bullet's functions are."""
+    """``struct functions``: the addresses of Bullet's functions."""
     return Functions(*(ctypes.cast(f, c_void_p).value for f in _BULLET))

@@ -1,4 +1,4 @@
-"""A vector step of all clients in threads of C, without Python, and their reset."""
+"""Steps and resets all clients in threads of C, without Python."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -21,14 +21,14 @@ from torch_panda.bullet.state import SimulationState
 
 
 class NativeLoop:
-    """Steps clients as ``loop.c`` does, resets them, and owns its threads.
+    """Steps and resets clients with the functions of ``loop.c``, and owns its threads.
 
     Args:
-        clients: the clients, which `replace` may replace.
-        scene: what they hold.
-        state: what every step overwrites, and resets start from.
-        physics: how they integrate.
-        num_threads: threads that step them, the caller's among them.
+        clients: The clients.
+        scene: Body ids of the scene.
+        state: Tensors that steps overwrite and from which resets start.
+        physics: Parameters of the integration.
+        num_threads: Number of threads, including the caller's.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class NativeLoop:
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
         self._failures = (native.Failure * n)()
-        # It keeps alive what it points to, but for the tensors.
+        # A ctypes struct keeps alive the objects that it points to, except tensors.
         self._batch = native.Batch(
             pointer(native.bullet_functions()),
             pointer(native_scene),
@@ -72,15 +72,15 @@ class NativeLoop:
             state.marker_pose.data_ptr(),
             self._failures,
         )
-        self._described: MotorControl | None = None  # by _control
         self._control = native.Control()
+        self._motor_control: MotorControl | None = None  # the source of _control
         self._loop: int | None = None
         self._process = os.getpid()
         for env, client in enumerate(clients):
             self.replace(env, client)
 
     def replace(self, env: int, client: PhysicsClient) -> None:
-        """Step and reset another client from now on."""
+        """Use another client for an environment from now on."""
         self._clients[env] = pointer(client.native)
 
     def step(
@@ -89,24 +89,25 @@ class NativeLoop:
         setpoint: Doubles,
         envs: Sequence[int] | None = None,
     ) -> list[int]:
-        """Control, advance and read some clients; None means all.
+        """Set the motors, advance time and read the state.
 
-        Ctrl-C is raised when it is done.
+        Ctrl-C raises when the step is done.
 
         Args:
-            control: what drives the robots.
-            setpoint: (num_envs, setpoint_dim) float64 and contiguous.
-            envs: which clients, none of them twice.
+            control: Control of the robots.
+            setpoint: Setpoints (num_envs, setpoint_dim), float64 and contiguous.
+            envs: Indices of the clients to step, without duplicates; None means all.
 
         Returns:
-            the clients whose state is not finite.
+            Indices of the clients whose state is not finite.
 
         Raises:
-            WorkerError: Bullet failed in one client; all others are done nevertheless.
+            WorkerError: Bullet failed in at least one client. All others took the step.
         """
         self._start()
-        if control is not self._described:
-            self._describe(control)
+        if control is not self._motor_control:
+            self._control = self._convert(control)
+            self._motor_control = control
         chosen = range(len(self._clients)) if envs is None else envs
         queue = (c_int * len(chosen))(*chosen)
         if not self._library.step(
@@ -118,14 +119,18 @@ class NativeLoop:
         return [e for e in chosen if failures[e].expected == native.DIVERGED]
 
     def reset(self, envs: Sequence[int]) -> None:
-        """Put some clients where the state says, with no past; errors as of `step`."""
+        """Start episodes from the state tensors; see `VectorSimulation.reset`.
+
+        Raises:
+            WorkerError: Bullet failed in at least one client. All others were reset.
+        """
         self._start()
         queue = (c_int * len(envs))(*envs)
         if self._library.reset(self._loop, queue, len(queue)):
             self._check(envs)
 
     def reset_one(self, env: int) -> None:
-        """Put a client where the state says, with no past, in the calling thread.
+        """Reset one client in the calling thread; see `reset`.
 
         Raises:
             BulletError: Bullet failed, or the client is closed.
@@ -136,7 +141,7 @@ class NativeLoop:
 
     def close(self) -> None:
         """End the threads. Closing again does nothing."""
-        # A forked child has none of them.
+        # A forked child has no threads of the loop.
         if self._loop is not None and self._process == os.getpid():
             self._library.destroy(self._loop)
         self._loop = None
@@ -149,8 +154,8 @@ class NativeLoop:
         if self._loop is None:
             raise MemoryError
 
-    def _describe(self, control: MotorControl) -> None:
-        self._control = native.Control(
+    def _convert(self, control: MotorControl) -> native.Control:
+        return native.Control(
             -1 if control.ik_link is None else control.ik_link,
             control.num_arm_joints,
             control.setpoint_dim,
@@ -163,16 +168,15 @@ class NativeLoop:
             doubles(control.forces),
             doubles([self._physics.ik_damping] * len(control.forces)),
         )
-        self._described = control
 
     def _check(self, envs: Sequence[int]) -> None:
-        """Raise the error of the first of these clients that has one."""
+        """Raise the error of the first client that failed."""
         for env in sorted(envs):
             if error := self._error(env):
                 raise WorkerError(env, error) from error
 
     def _error(self, env: int) -> BulletError | None:
-        """Why a client has failed in this step or reset, if it has."""
+        """The error of a client in the present step or reset, if it failed."""
         failure = self._failures[env]
         if failure.expected == native.CLIENT_CLOSED:
             return client_closed()

@@ -1,4 +1,4 @@
-"""Threads that share out the clients of a vector step."""
+"""A pool of threads that share the clients of a vector step."""
 
 import os
 import queue
@@ -9,7 +9,7 @@ Work = Callable[[int], None]
 
 
 class _Job:
-    """One parallel loop: indices that the threads draw from, and its outcome."""
+    """One parallel loop: the indices from which threads draw, and their errors."""
 
     def __init__(self, work: Work, indices: Sequence[int], num_threads: int) -> None:
         self.work = work
@@ -18,12 +18,12 @@ class _Job:
         self.errors: list[tuple[int, Exception]] = []
         self._running = num_threads
         self._lock = threading.Lock()
-        # Held until all is done. A bare lock takes less time to wake than an Event.
+        # Locked until all work is done. A lock wakes its waiter faster than an Event.
         self._unfinished = threading.Lock()
         self._unfinished.acquire()
 
     def take_part(self) -> None:
-        """Work until no index is left; the last thread to leave says so."""
+        """Work until no index is left. The last thread to leave ends the wait."""
         for index in self.indices:
             try:
                 self.work(index)
@@ -36,7 +36,7 @@ class _Job:
             self._unfinished.release()
 
     def wait(self) -> None:
-        """Return when all is done."""
+        """Return when all work is done."""
         with self._unfinished:
             pass
 
@@ -46,7 +46,7 @@ class _Worker:
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        # A daemon thread: it does not keep the interpreter alive.
+        # A daemon thread does not keep the interpreter alive.
         self._thread = threading.Thread(target=self._loop, name=name, daemon=True)
         self._thread.start()
 
@@ -59,12 +59,17 @@ class _Worker:
     def _loop(self) -> None:
         while (job := self._jobs.get()) is not None:
             job.take_part()
-            # An idle thread must not keep the environment alive.
+            # The job refers to the environment, which an idle thread must not keep.
             del job
 
 
 class WorkerError(RuntimeError):
-    """The work on one index failed; the work on the other indices was done."""
+    """The work on one environment failed. The other environments' work was done.
+
+    Args:
+        index: Index of the environment.
+        error: The error that the work raised.
+    """
 
     def __init__(self, index: int, error: Exception) -> None:
         super().__init__(f"environment {index}: {type(error).__name__}: {error}")
@@ -74,11 +79,11 @@ class WorkerError(RuntimeError):
 class WorkerPool:
     """Persistent threads that run a function on many indices.
 
-    A thread that is done with an index draws the next one, so a slow client does not
-    hold back the clients that would have followed it.
+    A thread that finishes an index draws the next one, so that a slow client does not
+    delay the others.
 
     Args:
-        num_threads: how many threads work at the same time.
+        num_threads: Number of threads.
     """
 
     def __init__(self, num_threads: int) -> None:
@@ -88,13 +93,14 @@ class WorkerPool:
         self._last_job: _Job | None = None
 
     def run(self, work: Work, indices: Sequence[int]) -> None:
-        """Call ``work(index)`` for every index, and return when all are done.
+        """Call ``work(index)`` for every index, and return when all calls are done.
 
-        An exception in the calling thread (Ctrl-C) is raised after the running work
-        is done, so that no client is left in the middle of a step.
+        An exception in the calling thread (Ctrl-C) is raised when the running work is
+        done, so that no client remains in the middle of a step.
 
         Raises:
-            WorkerError: ``work`` raised; all other indices are done nevertheless.
+            WorkerError: ``work`` raised for at least one index. It was called for all
+                indices nevertheless, and the error is that of the lowest index.
         """
         self.wait()
         self._start()
@@ -107,7 +113,7 @@ class WorkerPool:
         finally:
             self.wait()
         if job.errors:
-            index, error = min(job.errors, key=lambda failed: failed[0])
+            index, error = min(job.errors, key=lambda pair: pair[0])
             raise WorkerError(index, error) from error
 
     def close(self) -> None:
@@ -115,20 +121,20 @@ class WorkerPool:
         self.wait()
         workers, self._workers = self._workers, []
         if self._process != os.getpid():
-            return  # a forked child: these threads live in its parent
+            return  # a forked child has none of its parent's threads
         for worker in workers:
             worker.send(None)
         for worker in workers:
             worker.join()
 
     def wait(self) -> None:
-        """Wait until no thread touches a client, also after a second Ctrl-C."""
+        """Wait until no thread uses a client, even after a second Ctrl-C."""
         if self._last_job is not None and self._process == os.getpid():
             self._last_job.wait()
         self._last_job = None
 
     def _start(self) -> None:
-        if self._process != os.getpid():  # a forked child has no threads yet
+        if self._process != os.getpid():  # in a forked child
             self._process = os.getpid()
             self._workers = []
         if not self._workers:

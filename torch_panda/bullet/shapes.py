@@ -1,4 +1,4 @@
-"""The shapes of bodies, and their visuals."""
+"""Shapes of bodies, and how renderers draw them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,14 +40,14 @@ Shape = Box | Cylinder | Sphere
 
 @dataclass(frozen=True)
 class Visual:
-    """How a body is drawn.
+    """How renderers draw a body.
 
     Attributes:
-        color: red, green and blue, from 0 to 1.
-        texture: of a box, instead of the colour: an image of three by two squares,
-            the faces +x, +y, +z above and -x, -y, -z below.
-        opacity: of a marker, which is seen through; other bodies are opaque.
-        name: what segmented images call the body; None: what the task uses it for.
+        color: Red, green and blue, from 0 to 1.
+        texture: Image file that replaces the colour of a box. It has three by two
+            squares: the faces +x, +y, +z in the upper row and -x, -y, -z in the lower.
+        opacity: Opacity of a marker, from 0 to 1. Other bodies are opaque.
+        name: Name of the body in `segmentation_ids`; None means its role in the task.
     """
 
     color: Color = GREEN

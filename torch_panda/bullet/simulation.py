@@ -93,12 +93,12 @@ class VectorSimulation:
 
     @property
     def num_threads(self) -> int:
-        """Number of threads that step them."""
+        """Number of threads."""
         return self._pool.num_threads
 
     @property
     def clients(self) -> Sequence[PhysicsClient]:
-        """The clients, by environment."""
+        """The clients, by index of the environment."""
         return self._clients
 
     @property
@@ -178,28 +178,29 @@ class VectorSimulation:
     def step(
         self, control: Control, setpoint: Doubles, envs: Sequence[int] | None = None
     ) -> list[int]:
-        """Control the robots, advance time and read the state.
+        """Set the motors, advance time and read the state.
 
-        In C where that was compiled and ``control`` is data, else in Python threads:
-        the numbers are the same.
+        The native loop does this if it is compiled and ``control`` is data. Otherwise
+        Python threads do it and compute the same numbers.
 
         Args:
-            control: sets the motors.
-            setpoint: (num_envs, k) float64, a row for each client's robot.
-            envs: which clients; None means all.
+            control: Control of the robots.
+            setpoint: Setpoints (num_envs, k) float64, a row per robot.
+            envs: Indices of the clients to step; None means all.
 
         Returns:
-            the clients whose state is not finite.
+            Indices of the clients whose state is not finite.
 
         Raises:
-            WorkerError: Bullet failed in one client; it names the client.
-            ValueError: ``control`` needs another ``setpoint``, or another robot.
+            WorkerError: Bullet failed in at least one client. The error names it, and
+                all others took the step.
+            ValueError: ``control`` does not fit the setpoints or the robot.
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                self._pool.wait()  # after a second Ctrl-C, its threads may be at work
+                self._pool.wait()  # its threads may still work after a second Ctrl-C
                 return self._native.step(control, setpoint, envs)
 
         def step_one(env: int) -> None:
@@ -217,27 +218,29 @@ class VectorSimulation:
         return self.diverged()
 
     def run(self, work: Work, envs: Sequence[int]) -> None:
-        """Call ``work(env)`` for these environments, in the threads that step them.
+        """Call ``work(env)`` for some environments in the simulation's threads.
 
         Raises:
-            WorkerError: it raised; all others are done nevertheless.
+            WorkerError: ``work`` raised for at least one environment. It was called for
+                all others nevertheless.
         """
         self._pool.run(work, envs)
 
     def reset(self, envs: Sequence[int], vary: Work | None = None) -> None:
-        """Start an episode from what the state tensors hold for these clients.
+        """Start episodes from the state tensors.
 
-        Bullet remembers more than the state. `BroadPhase` makes it forget, so that what
-        follows depends on the start state and the actions alone. In C where that was
-        compiled, else in Python: the numbers are the same.
+        Bullet's state is more than poses and velocities. `BroadPhase` restores the
+        rest, so that an episode depends on its start state and its actions only. The
+        native loop does this if it is compiled, otherwise Python threads do.
 
         Args:
-            envs: which clients.
-            vary: is called with each of them first, in the thread that resets it, to
-                change its physics.
+            envs: Indices of the clients to reset.
+            vary: Function that changes the physics of an environment. It is called
+                first, in the thread that resets the environment.
 
         Raises:
-            WorkerError: Bullet or ``vary`` failed in one client; it names the client.
+            WorkerError: Bullet or ``vary`` failed in at least one client. The error
+                names it, and all others were reset.
         """
         if self._native is not None and vary is None:
             self._pool.wait()
@@ -258,11 +261,11 @@ class VectorSimulation:
         self._pool.run(reset_one, envs)
 
     def diverged(self) -> list[int]:
-        """The clients whose state, as it was last read, is not finite."""
+        """Indices of the clients whose state was not finite when it was last read."""
         return self.state.diverged()
 
     def rebuild(self, env: int) -> None:
-        """Replace a client by a new one: no reset cures Bullet of a NaN."""
+        """Replace a client by a new one, because no reset removes NaN from Bullet."""
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
         self._broad_phases[env] = self._build_again(client)
@@ -270,7 +273,7 @@ class VectorSimulation:
             self._native.replace(env, client)
 
     def close(self) -> None:
-        """Free all clients and end the threads. Closing again does nothing."""
+        """Free all clients and end all threads. Closing again does nothing."""
         self._pool.close()
         if self._native is not None:
             self._native.close()
@@ -299,12 +302,12 @@ class VectorSimulation:
         return BroadPhase(client)
 
     def _check_joints(self) -> None:
-        """Make sure that a robot's state is that of its joints, and of no others."""
+        """Make sure that the scene lists all joints of the robot's state."""
         scene = self.scene
-        found = len(self._clients[0].state(scene.robot).joint_positions)
-        if found != len(scene.joints):
+        count = len(self._clients[0].state(scene.robot).joint_positions)
+        if count != len(scene.joints):
             raise BulletError(
-                f"a scene must name the robot's {found} joints of one degree of "
+                f"a scene must list the robot's {count} joints of one degree of "
                 f"freedom, got {len(scene.joints)}"
             )
 
