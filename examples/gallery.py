@@ -19,7 +19,6 @@ import torch_panda
 from torch_panda.experts import make_expert
 from torch_panda.learning.files import prepare
 from torch_panda.learning.limits import Limit, Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_policy, read_checkpoint
 from torch_panda.learning.video import FPS, play, tile
 
 TASKS = (
@@ -53,7 +52,7 @@ class Args:
 
 def draw(
     env_id: str,
-    policy: TensorDictModuleBase | Path,
+    policy: TensorDictModuleBase,
     steps: int,
     *,
     seed: int,
@@ -63,7 +62,7 @@ def draw(
 
     Args:
         env_id: the task.
-        policy: what acts, or its checkpoint.
+        policy: what acts.
         steps: how many.
         seed: of the environment.
         size: height and width [pixels].
@@ -71,8 +70,6 @@ def draw(
     name = env_id.removeprefix("Panda").partition("-")[0]
     cells = []
     with torch_panda.make(env_id, num_envs=1, seed=seed) as env:
-        if isinstance(policy, Path):
-            policy = load_policy(read_checkpoint(policy), env)
         for step, _ in zip(range(steps + 1), play(env, policy), strict=False):
             camera = FAR if name == "Slide" else NEAR
             cell = Image.fromarray(env.render(0, camera=camera, size=size).numpy())
@@ -109,10 +106,8 @@ def main(args: Args) -> None:
         if args.policies:
             rows = [
                 np.hstack([cells[step] for step in COLUMNS])
-                for path in args.policies
-                for cells in [
-                    draw(read_checkpoint(path)["env_id"], path, max(COLUMNS), **options)
-                ]
+                for policy in map(torch_panda.load_policy, args.policies)
+                for cells in [draw(policy.env_id, policy, max(COLUMNS), **options)]
             ]
             pictures = [np.vstack(rows)]
         else:

@@ -25,7 +25,6 @@ import torch_panda
 from torch_panda import Randomization
 from torch_panda.learning.files import prepare
 from torch_panda.learning.limits import Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_policy, read_checkpoint
 
 
 @dataclass
@@ -141,14 +140,13 @@ def main(args: Args) -> None:
     randomize = Randomization(object_mass=ranges[0], object_friction=ranges[1])
     grids: list[tuple[str, torch.Tensor]] = []
     for run, name in zip(args.runs, name_all(args.runs), strict=True):
-        checkpoint = read_checkpoint(run)
+        policy = torch_panda.load_policy(run)
         with torch_panda.make(
-            checkpoint["env_id"],
+            policy.env_id,
             num_envs=len(factors),
             seed=args.seed,
             randomize=randomize,
         ) as env:
-            policy = load_policy(checkpoint, env)
             success = success_grid(env, policy, factors, args.episodes)
         grid = success.reshape(len(args.frictions), len(args.masses))
         grids.append((name, grid))

@@ -37,7 +37,7 @@ import torch_panda
 print(time.process_time() - before)
 assert warnings.filters == filters
 assert "torch_panda/PandaPush-v1" in gymnasium.registry
-for module in ("pybullet", "torch_panda.gymnasium_envs", "torch_panda.commands.bench"):
+for module in ("pybullet", "torch_panda.gymnasium_envs", "torch_panda.learning"):
     assert module not in sys.modules, module
 """
 

@@ -1,5 +1,8 @@
 """Goal-conditioned Franka Panda tasks as one vectorised TorchRL environment."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from torch_panda.bullet import BulletError, PhysicsName, PhysicsParams, WorkerError
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.randomization import Randomization
@@ -55,10 +58,29 @@ __all__ = [
     "WorkerError",
     "XArm6",
     "XArm6Gripper",
+    "evaluate",
+    "load_policy",
     "make",
     "max_episode_steps",
     "register",
 ]
+
+if TYPE_CHECKING:
+    from torch_panda.learning.evaluation import evaluate
+    from torch_panda.learning.policy_files import load_policy
+
+# Imported at their first use: torchrl's losses take long to import.
+_MODULES = {
+    "evaluate": "torch_panda.learning.evaluation",
+    "load_policy": "torch_panda.learning.policy_files",
+}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
+
 
 # So that `gymnasium.register_envs(torch_panda)` reads as for any other package.
 register_with_gymnasium()

@@ -10,16 +10,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import torch_panda
 from torch_panda.commands import refine
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.evaluation import evaluate
-from torch_panda.learning.policy_files import (
-    load_agent,
-    load_policy,
-    read_checkpoint,
-    save_policy,
-)
+from torch_panda.learning.policy_files import SavedPolicy, save_policy
+from torch_panda.policies import shipped_policies
 
 pytestmark = pytest.mark.usefixtures("quick")
-POLICIES = refine.Path(refine.__file__).parent / "policies"
 
 
 def episode(achieved: list[float], asked: list[float]) -> TensorDict:
@@ -51,9 +45,7 @@ def test_an_episode_that_achieves_what_is_never_asked_for_is_left_out():
 @pytest.fixture
 def crooked(tmp_path):
     """A policy of Reach whose hand comes to rest beside the goal."""
-    saved = read_checkpoint(POLICIES / "PandaReach-v1.pt")
-    with torch_panda.make("PandaReach-v1", num_envs=2) as env:
-        agent = load_agent(saved, env)
+    agent = SavedPolicy.read(shipped_policies()["PandaReach-v1"]).make_agent()
     with torch.no_grad():
         agent.actor[0][-1].bias[0] += 1.5
     save_policy(tmp_path / "crooked.pt", agent, "PandaReach-v1")
@@ -61,9 +53,9 @@ def crooked(tmp_path):
 
 
 def success(path: refine.Path) -> float:
-    with torch_panda.make("PandaReach-v1", num_envs=32, seed=5) as env:
-        policy = load_policy(read_checkpoint(path), env)
-        return float(evaluate(env, policy, 64).success.float().mean())
+    policy = torch_panda.load_policy(path)
+    options = {"episodes": 64, "num_envs": 32, "seed": 5}
+    return torch_panda.evaluate(policy, "PandaReach-v1", **options).success_rate
 
 
 def test_a_policy_that_misses_learns_to_hit(crooked, tmp_path):

@@ -75,7 +75,7 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
     report = capsys.readouterr().out
     assert "PandaReach-v1, 8 episodes" in report
     assert "success at the end" in report
-    with pytest.raises(SystemExit, match="trained on PandaReach-v1"):
+    with pytest.raises(SystemExit, match="where observation has size 6, got 18"):
         evaluate.main(evaluate.Args(run=out, env_id="PandaPush-v1"))
     plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "all.png"))
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")

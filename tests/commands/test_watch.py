@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
-from pathlib import Path
 from unittest.mock import Mock
 
 import gallery
@@ -17,6 +16,7 @@ import pytest
 import torch_panda
 from torch_panda.commands import watch
 from torch_panda.experts import make_expert
+from torch_panda.policies import shipped_policies
 
 
 @pytest.mark.parametrize("policy", ["random", "expert"])
@@ -36,7 +36,7 @@ def test_video_shows_every_step(tmp_path, policy):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"policy": "nothing"}, "random, expert, or .* a run, .* got 'nothing'"),
+        ({"policy": "nothing"}, "no policy 'nothing': pass the folder of a run"),
         ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
         ({"out": "watch.txt"}, "must end in .mp4 or .gif, got 'watch.txt'"),
         ({"env_id": "PandaPushJoints-v1"}, "no expert for 'PandaPushJoints-v1'"),
@@ -53,7 +53,8 @@ def start_human(display, episodes):
     environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
     if display is not None:
         environment["DISPLAY"] = display
-    command = [sys.executable, watch.__file__, "--human", f"--num-envs={episodes}"]
+    command = [sys.executable, "-m", "torch_panda", "watch"]
+    command += ["--human", f"--num-envs={episodes}"]
     return subprocess.Popen(
         command,
         env=environment,
@@ -134,8 +135,8 @@ def test_gallery(tmp_path):
 
 def test_gallery_of_policies(tmp_path):
     out = tmp_path / "policies.png"
-    box = sorted(Path(gallery.__file__).parent.glob("policies/*.pt"))
-    gallery.main(gallery.Args(policies=tuple(box), size=(60, 80), out=out))
+    box = tuple(shipped_policies().values())
+    gallery.main(gallery.Args(policies=box, size=(60, 80), out=out))
     picture = iio.imread(out).astype(int)
     assert picture.shape == (60 * len(box), 80 * len(gallery.COLUMNS), 3)
     first, last = picture[:, :80], picture[:, -80:]

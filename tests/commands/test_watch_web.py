@@ -34,7 +34,7 @@ def test_a_run_is_read_again_when_it_is_saved(tmp_path):
             os.utime(tmp_path / "checkpoint.pt", (seed, seed))
 
         save(1)
-        policies = watch.follow(tmp_path, env)
+        policies = watch.follow(tmp_path)
         first = next(policies)
         assert next(policies) is first
         save(2)

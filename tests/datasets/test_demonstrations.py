@@ -12,7 +12,7 @@ from torch_panda.commands.train import make_run
 from torch_panda.datasets.demonstrations import read_demos
 from torch_panda.learning import pretraining
 from torch_panda.learning.options import Args
-from torch_panda.learning.policy_files import read_checkpoint
+from torch_panda.learning.policy_files import SavedPolicy
 from torch_panda.learning.pretraining import make_demo_buffer
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -125,8 +125,8 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
     assert not stopped.train(After(15))
     stopped.close()
     assert len(stopped.progress.curve) == 1
-    kept, policy = read_checkpoint(tmp_path)["policy"], stopped.agent.policy
-    torch.testing.assert_close(kept, dict(policy.state_dict()), rtol=0, atol=0)
+    kept, policy = SavedPolicy.read(tmp_path).weights, stopped.agent.policy
+    torch.testing.assert_close(dict(kept), dict(policy.state_dict()), rtol=0, atol=0)
     args.resume = True
     resumed = make_run(args, tmp_path)
     assert resumed.progress.pretrained == 15

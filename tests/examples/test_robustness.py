@@ -10,7 +10,6 @@ import torch
 
 import torch_panda
 from torch_panda import Randomization
-from torch_panda.learning.policy_files import load_policy, read_checkpoint
 
 POLICY = Path(__file__).parents[2] / "torch_panda" / "policies" / "PandaPush-v1.pt"
 
@@ -99,7 +98,7 @@ def test_an_episode_that_ends_early_leaves_the_others_their_time():
             seed=0,
             randomize=Randomization(object_mass=(0.5, 2), object_friction=(1, 1)),
         ) as env:
-            policy = load_policy(read_checkpoint(POLICY), env)
+            policy = torch_panda.load_policy(POLICY)
             return robustness.success_grid(env, policy, cells, episodes=4).tolist()
 
     alone = [play(cell[None])[0] for cell in factors]

@@ -6,12 +6,11 @@ import torch
 import torch_panda
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.learning.normalizer import CLIP_NORMALIZED, FINE, Normalizer
+from torch_panda.learning.spaces import read_spaces
 
 
 def make(env, relative_inputs="none"):
-    spec = env.observation_spec
-    size = sum(spec[key].shape[-1] for key in ("observation", "desired_goal"))
-    return Normalizer(size, read_geometry(env), relative_inputs)
+    return Normalizer(read_spaces(env), relative_inputs)
 
 
 def test_relative_inputs():

@@ -6,16 +6,14 @@ python -m torch_panda evaluate runs/PandaPush-v1-ddpg-relabel-0 --episodes 200
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import sqrt
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-import torch_panda
-from torch_panda import PhysicsName
+from torch_panda.bullet import PhysicsName
 from torch_panda.learning.evaluation import evaluate, wilson_interval
 from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_policy, read_checkpoint
+from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 
@@ -23,8 +21,8 @@ from torch_panda.learning.user_modules import Imports, import_modules, read_modu
 class Args:
     """Which policy to evaluate, and how long."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """folder of a run, or its checkpoint.pt"""
+    run: Annotated[str, tyro.conf.Positional]
+    """folder of a run, its checkpoint.pt, or an id whose policy torch_panda ships"""
     env_id: str | None = None
     """another task with the same spaces; None means the one it was trained on"""
     episodes: Positive = 200
@@ -48,18 +46,18 @@ def main(args: Args) -> None:
     try:
         check_limits(args)
         import_modules(read_modules(args.imports))
-        checkpoint = read_checkpoint(args.run)
-        env_id = args.env_id or checkpoint["env_id"]
-        with torch_panda.make(
+        policy = load_policy(args.run)
+        env_id = args.env_id or policy.env_id
+        result = evaluate(
+            policy,
             env_id,
-            num_envs=min(args.num_envs, args.episodes),
-            num_threads=args.num_threads,
+            episodes=args.episodes,
             seed=args.seed,
+            num_envs=args.num_envs,
+            num_threads=args.num_threads,
             physics=args.physics,
             task_options=args.task_options,
-        ) as env:
-            policy = load_policy(checkpoint, env)
-            result = evaluate(env, policy, args.episodes)
+        )
     except (ValueError, TypeError) as error:
         raise SystemExit(str(error)) from None
     changes = "".join(f", {key} {value}" for key, value in args.task_options.items())
@@ -72,12 +70,13 @@ def main(args: Args) -> None:
         low, high = wilson_interval(int(flags.sum()), args.episodes)
         share = flags.float().mean()
         print(f"{name:20s} {share:6.1%}  [{low:.1%}, {high:.1%}]")
-    mean = result.episode_return.mean()
+    mean = result.mean_return
     interval = ""
     if args.episodes > 1:
-        half = 1.96 * result.episode_return.std() / sqrt(args.episodes)
+        half = 1.96 * float(result.returns.std()) / sqrt(args.episodes)
         interval = f"  [{mean - half:.2f}, {mean + half:.2f}]"
     print(f"{'return':20s} {mean:6.2f}{interval}")
+    print(f"{'steps':20s} {result.mean_length:6.1f}")
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -36,7 +36,7 @@ from torch_panda.learning.checkpoint import (
 )
 from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.limits import Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_agent, read_checkpoint
+from torch_panda.learning.policy_files import SavedPolicy
 from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
@@ -83,10 +83,10 @@ class Refinement:
         self.args = args
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         torch.manual_seed(args.seed)
-        saved = read_checkpoint(args.policy)
-        args.env_id = args.env_id or saved["env_id"]
+        saved = SavedPolicy.read(args.policy)
+        args.env_id = args.env_id or saved.env_id
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
-        self.agent = load_agent(saved, self.env)
+        self.agent = saved.make_agent(self.env)
         rng = np.random.default_rng(0)
         goals = [self.env.task.sample_start(rng).goal for _ in range(100)]
         self.varies = torch.from_numpy(np.ptp(goals, axis=0) > 0)

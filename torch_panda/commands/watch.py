@@ -20,7 +20,7 @@ from torchrl.envs.utils import RandomPolicy
 import torch_panda
 from torch_panda.experts import make_expert
 from torch_panda.learning.limits import Port, Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_policy, read_checkpoint
+from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 from torch_panda.learning.video import FPS, play, record
 
@@ -76,19 +76,18 @@ def serve(
                 time.sleep(max(0.0, due - time.perf_counter()))
 
 
-def follow(path: Path, env: torch_panda.RobotTaskEnv) -> Iterator[TensorDictModuleBase]:
+def follow(path: Path) -> Iterator[TensorDictModuleBase]:
     """The policy of a run, time and again; anew when a training has saved it.
 
     Args:
         path: folder of the run, or a checkpoint.
-        env: where it acts.
     """
     file = path / "checkpoint.pt" if path.is_dir() else path
     seen = None
     while True:
         saved = file.stat().st_mtime_ns
         if saved != seen:
-            policy, seen = load_policy(read_checkpoint(file), env), saved
+            policy, seen = load_policy(file), saved
         yield policy
 
 
@@ -97,7 +96,8 @@ class Args:
     """What to watch, and where to write it."""
 
     policy: str = "expert"
-    """a run's folder or checkpoint, "random", or "expert" """
+    """a run's folder or checkpoint, an id whose policy torch_panda ships, "random", or
+    "expert" """
     env_id: str | None = None
     """task; None means the one the policy was trained on, or Push"""
     num_envs: Positive = 6
@@ -127,28 +127,23 @@ def main(args: Args) -> None:
         check_limits(args)
         import_modules(read_modules(args.imports))
         torch.manual_seed(args.seed)
-        checkpoint = None
+        trained = None
         if args.policy not in ("random", "expert"):
-            if not Path(args.policy).exists():
-                raise ValueError(
-                    "a policy is random, expert, or the folder or checkpoint of a run, "
-                    f"such as examples/policies/PandaPush-v1.pt, got {args.policy!r}"
-                )
-            checkpoint = read_checkpoint(Path(args.policy))
-        env_id = args.env_id or (checkpoint["env_id"] if checkpoint else "PandaPush-v1")
+            trained = load_policy(args.policy)
+        env_id = args.env_id or (trained.env_id if trained else "PandaPush-v1")
         num_envs = 1 if args.human else args.num_envs
         with torch_panda.make(env_id, num_envs=num_envs, seed=args.seed) as env:
             policy: TensorDictModuleBase
-            if checkpoint:
-                policy = load_policy(checkpoint, env)
+            if trained:
+                policy = trained
             elif args.policy == "expert":
                 policy = make_expert(env_id)
             else:
                 policy = RandomPolicy(env.action_spec)
             if args.web:
                 policies: Iterator[TensorDictModuleBase] = itertools.repeat(policy)
-                if checkpoint:
-                    policies = follow(Path(args.policy), env)
+                if trained and Path(args.policy).exists():
+                    policies = follow(Path(args.policy))
                 serve(
                     env,
                     policies,

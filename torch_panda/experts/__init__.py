@@ -13,7 +13,6 @@ from functools import partial
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-import torch_panda
 from torch_panda.experts import (
     drawer,
     flip,
@@ -24,6 +23,7 @@ from torch_panda.experts import (
     slide,
     stack,
 )
+from torch_panda.registry import ENV_IDS
 
 # (observation, achieved_goal, desired_goal), each (..., size), to the action.
 Expert = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -52,7 +52,7 @@ def make_expert(env_id: str) -> TensorDictModule:
         ValueError: there is no expert for it.
     """
     match = re.fullmatch(r"Panda([A-Za-z]+?)(Dense)?-v([13])", env_id)
-    if match is None or match[1] not in EXPERTS or env_id not in torch_panda.ENV_IDS:
+    if match is None or match[1] not in EXPERTS or env_id not in ENV_IDS:
         raise ValueError(
             f"no expert for {env_id!r}; there are experts for the ids of "
             f"{', '.join(EXPERTS)} with end-effector control"

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-import torch_panda
 from torch_panda.experts.moves import unit
 from torch_panda.experts.slide import DEVIATION, STRENGTH, strike, strike_terms
+from torch_panda.registry import make
 
 ENV_ID, NUM_ENVS, ROUNDS = "PandaSlide-v1", 64, 40
 STEPS = 70  # until every puck lies still
@@ -32,7 +32,7 @@ def strike_at_random(seed: int) -> Tensor:
     low, high = STRENGTHS
     strength = low + (high - low) * torch.rand(NUM_ENVS, 1, generator=generator)
     struck = torch.zeros(NUM_ENVS, 1, dtype=torch.bool)
-    with torch_panda.make(ENV_ID, num_envs=NUM_ENVS, seed=seed) as env:
+    with make(ENV_ID, num_envs=NUM_ENVS, seed=seed) as env:
         td = env.reset()
         start, aim = td["achieved_goal"], torch.zeros(NUM_ENVS, 2)
         for _ in range(STEPS):

@@ -25,8 +25,8 @@ class Augmentation:
         ValueError: the robot is not controlled by its end-effector.
     """
 
-    def __init__(self, geometry: Geometry, kind: AugmentationKind) -> None:
-        if kind != "none" and geometry.action is None:
+    def __init__(self, geometry: Geometry | None, kind: AugmentationKind) -> None:
+        if geometry is not None and geometry.action is None and kind != "none":
             raise ValueError(
                 f"augmentation {kind!r} is for end-effector control: with joint "
                 "control pass --augmentation none"
@@ -35,10 +35,10 @@ class Augmentation:
 
     def __call__(self, rows: Transitions) -> Transitions:
         """Augment a batch; what was given stays as it is."""
-        if self.kind != "none":
+        if self.geometry is not None and self.kind != "none":
             rows = mirror(rows, self.geometry)
-        if self.kind == "mirror-shift":
-            rows = shift(rows, self.geometry, SHIFT)
+            if self.kind == "mirror-shift":
+                rows = shift(rows, self.geometry, SHIFT)
         return rows
 
 

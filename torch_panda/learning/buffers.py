@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torch_panda import RobotTaskEnv
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "augment", "none"]

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import torch
 
-import torch_panda
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import Progress
-from torch_panda.learning.evaluation import evaluate
+from torch_panda.learning.evaluation import evaluate_in
 from torch_panda.learning.plots import plot_curve
 from torch_panda.learning.policy_files import save_policy
+from torch_panda.registry import make
 
 EPISODES = 80  # of an evaluation, all fresh
 NUM_ENVS = 16  # that play them
@@ -28,17 +29,17 @@ class Curve:
 
     def __init__(self, env_id: str, agent: Agent, out: Path, *, device: str) -> None:
         self.env_id, self.agent, self.out = env_id, agent, out
-        self.env = torch_panda.make(env_id, num_envs=NUM_ENVS, device=device)
+        self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
         """Evaluate, add a row to the run's curve, write and draw it."""
         reseed(self.env)
-        result = evaluate(self.env, self.agent.policy, EPISODES)
+        result = evaluate_in(self.env, self.agent.policy, EPISODES)
         row = {
             "step": progress.steps,
             "success": float(result.success.float().mean()),
             "ever_success": float(result.ever.float().mean()),
-            "return": float(result.episode_return.mean()),
+            "return": float(result.returns.mean()),
             "updates": self.agent.updates,
             "seconds": round(progress.seconds, 2),
         }
@@ -56,6 +57,6 @@ class Curve:
         self.env.close()
 
 
-def reseed(env: torch_panda.RobotTaskEnv) -> None:
+def reseed(env: RobotTaskEnv) -> None:
     """Make the next episodes follow from torch's random state, which runs save."""
     env.set_seed(int(torch.randint(2**62, ())))

@@ -1,35 +1,105 @@
-"""Evaluates a policy over many episodes, played in parallel."""
+"""Evaluates a policy over many episodes, which run in parallel."""
 
+from dataclasses import dataclass, fields
 from math import sqrt
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import torch_panda
+from torch_panda.checks import check_positive
+from torch_panda.envs import RobotTaskEnv
+from torch_panda.registry import make
 
 
-class Evaluation(NamedTuple):
-    """What n episodes came to, each (n,).
+@dataclass(frozen=True)
+class Evaluation:
+    """Results of n episodes.
 
     Attributes:
-        success: whether the episode's last state is a success.
-        ever: whether any state after the first step was.
-        at_start: whether the start already was.
-        episode_return: sum of the rewards.
+        success: Whether the last state of each episode is a success, (n,) bool.
+        ever: Whether any state after the first step is a success, (n,) bool.
+        at_start: Whether the start of each episode is a success, (n,) bool.
+        returns: Sum of the rewards of each episode, (n,).
+        lengths: Number of steps of each episode, (n,).
     """
 
-    success: torch.Tensor
-    ever: torch.Tensor
-    at_start: torch.Tensor
-    episode_return: torch.Tensor
+    success: Tensor
+    ever: Tensor
+    at_start: Tensor
+    returns: Tensor
+    lengths: Tensor
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that end with success."""
+        return float(self.success.double().mean())
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the success rate."""
+        return wilson_interval(int(self.success.sum()), len(self.success))
+
+    @property
+    def mean_return(self) -> float:
+        """Mean of the returns."""
+        return float(self.returns.double().mean())
+
+    @property
+    def mean_length(self) -> float:
+        """Mean number of steps; episodes of ``-v3`` end with their first success."""
+        return float(self.lengths.double().mean())
+
+    def __repr__(self) -> str:
+        low, high = self.interval
+        return (
+            f"Evaluation({len(self.success)} episodes, success_rate="
+            f"{self.success_rate:.3f} [{low:.3f}, {high:.3f}], mean_return="
+            f"{self.mean_return:.2f}, mean_length={self.mean_length:.1f})"
+        )
 
 
 def evaluate(
-    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase, episodes: int
+    policy: TensorDictModuleBase,
+    env_id: str,
+    *,
+    episodes: int = 200,
+    seed: int | None = 1_000,
+    num_envs: int = 32,
+    **options: Any,  # noqa: ANN401 (those of `make`)
 ) -> Evaluation:
-    """Run fresh episodes of a batched environment without exploration noise."""
+    """Evaluate a policy on an environment, without exploration noise.
+
+    Args:
+        policy: Trained policy, scripted expert, or any module that writes ``action``
+            into a batch of observations.
+        env_id: Id of the environment.
+        episodes: Number of episodes.
+        seed: Seed of the episodes; None draws one.
+        num_envs: Number of environments stepped in parallel, at most one per episode.
+        **options: Other arguments of `make`, such as ``task_options`` and ``device``.
+
+    Raises:
+        ValueError: The id is unknown, or an argument is out of range.
+        TypeError: The policy is not a module, or an argument is unknown.
+    """
+    check_positive(episodes=episodes, num_envs=num_envs)
+    if not callable(policy):
+        raise TypeError(
+            f"policy must be a TensorDictModule, got {policy!r}: load_policy reads one "
+            "from a file"
+        )
+    num_envs = min(num_envs, episodes)
+    with make(env_id, num_envs=num_envs, seed=seed, **options) as env:
+        return evaluate_in(env, policy, episodes)
+
+
+def evaluate_in(
+    env: RobotTaskEnv, policy: TensorDictModuleBase, episodes: int
+) -> Evaluation:
+    """Evaluate a policy over the next episodes of a batch of environments."""
     parts: list[Evaluation] = []
     steps = env.max_episode_steps
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -42,15 +112,18 @@ def evaluate(
             lived = done.cumsum(1) - done.long() == 0
             parts.append(
                 Evaluation(
-                    (success & first_done).any(1).squeeze(-1),
-                    (success & lived).any(1).squeeze(-1),
-                    rollout["success"][:, 0].squeeze(-1),
-                    (following["reward"] * lived).sum(1).squeeze(-1),
+                    success=(success & first_done).any(1).squeeze(-1),
+                    ever=(success & lived).any(1).squeeze(-1),
+                    at_start=rollout["success"][:, 0].squeeze(-1),
+                    returns=(following["reward"] * lived).sum(1).squeeze(-1),
+                    lengths=lived.sum(1).squeeze(-1),
                 )
             )
-    return Evaluation(
-        *(torch.cat(x)[:episodes].cpu() for x in zip(*parts, strict=True))
-    )
+    joined = {
+        field.name: torch.cat([getattr(part, field.name) for part in parts])
+        for field in fields(Evaluation)
+    }
+    return Evaluation(**{name: x[:episodes].cpu() for name, x in joined.items()})
 
 
 def wilson_interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:

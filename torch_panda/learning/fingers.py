@@ -7,21 +7,6 @@ action: less than a network errs by. On the scale of cube roots they are tenths.
 import torch
 from torch import Tensor
 
-from torch_panda import RobotTaskEnv
-
-
-def check_fingers(env: RobotTaskEnv) -> None:
-    """Make sure that the last number of an action is for the fingers.
-
-    Raises:
-        ValueError: the gripper is blocked, or there is none.
-    """
-    if not env.robot.has_free_gripper:
-        raise ValueError(
-            "fine_fingers is for tasks whose actions move the fingers: not Reach, "
-            "Push, Slide, Drawer or PegInsertion"
-        )
-
 
 def to_fine(action: Tensor) -> Tensor:
     """The fingers' part of actions on the scale of cube roots, (..., n) both."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_panda import Drawer, PegInsertion, RobotTaskEnv, Slide, Task
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.experts.cube_orientations import (
     STRAIGHT,
     compose,
@@ -14,6 +14,7 @@ from torch_panda.experts.cube_orientations import (
     straighten,
     to_matrix,
 )
+from torch_panda.tasks import Drawer, PegInsertion, Slide, Task
 
 # Factors that mirror a quantity in the plane y = 0, in which robot and table are
 # symmetric.
@@ -88,14 +89,16 @@ class Geometry:
         return observation, turn, to_matrix(turn).flatten(-2), likeness
 
 
-def read_geometry(env: RobotTaskEnv) -> Geometry:
-    """The geometry of one of `torch_panda.ENV_IDS`."""
+def read_geometry(env: RobotTaskEnv) -> Geometry | None:
+    """The geometry of an environment; None if the layout of its task is unknown."""
     robot, task = env.robot, env.task
     gripper = ("number",) * (robot.observation_dim - 6)
     layout = ("position", "velocity", *gripper, *_task_layout(task))
     sizes = [len(_FACTORS[kind]) for kind in layout]
     places = [sum(sizes[:k]) for k in range(len(layout))]
     size = sum(sizes)
+    if size != robot.observation_dim + task.observation_dim:
+        return None
 
     positions = zip(places, layout, strict=True)
     _, *starts = (place for place, kind in positions if kind == "position")
@@ -119,25 +122,6 @@ def read_geometry(env: RobotTaskEnv) -> Geometry:
         goal_height=SLIDE_GOAL_HEIGHT if isinstance(task, Slide) else None,
         orientation=starts[0] + 3 if rotates else None,
     )
-
-
-def check_layout(geometry: Geometry, sizes: list[int]) -> None:
-    """Make sure that a task, perhaps one's own, observes what the geometry says.
-
-    Args:
-        geometry: of the task.
-        sizes: of its observation and its goal.
-
-    Raises:
-        ValueError: they are others.
-    """
-    known = [len(geometry.observation), len(geometry.goal)]
-    if sizes != known:
-        raise ValueError(
-            "relative inputs and augmentation need observations and goals laid out as "
-            f"those of the shipped tasks, of {known} numbers here, got {sizes}: pass "
-            "--relative-inputs none --augmentation none"
-        )
 
 
 def _task_layout(task: Task) -> tuple[str, ...]:

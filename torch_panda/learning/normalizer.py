@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from torch_panda.learning.geometry import Geometry
 from torch_panda.learning.hyperparameters import RelativeInputs
+from torch_panda.learning.spaces import Spaces
 
 CLIP_OBSERVATION = 200.0  # the panda-gym paper
 CLIP_NORMALIZED = 5.0  # OpenAI Baselines' HER
@@ -15,9 +15,8 @@ class Normalizer(nn.Module):
     """Running standardisation of the inputs, as in OpenAI Baselines.
 
     Args:
-        size: of an observation and a goal together.
-        geometry: of the task.
-        relative_inputs: which differences of positions the networks see, too.
+        spaces: Sizes and layout of observations and goals.
+        relative_inputs: Differences of positions that the networks see in addition.
     """
 
     count: Tensor
@@ -26,16 +25,16 @@ class Normalizer(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(
-        self, size: int, geometry: Geometry, relative_inputs: RelativeInputs
-    ) -> None:
+    def __init__(self, spaces: Spaces, relative_inputs: RelativeInputs) -> None:
         super().__init__()
+        geometry = spaces.geometry
+        size = spaces.observation_size + spaces.goal_size
+        if geometry is not None:
+            num_parts = ("none", "coarse", "fine").index(relative_inputs)
+            size += len(geometry.later) * num_parts
+            if num_parts and geometry.orientation is not None:
+                size += 9 + 24  # the turn's matrix and likenesses
         self.geometry, self.relative_inputs = geometry, relative_inputs
-        self.heights = [start + 2 for start in geometry.goal_positions]
-        kinds = ("none", "coarse", "fine").index(relative_inputs)
-        size += len(geometry.later) * kinds
-        # The turn's matrix and likenesses.
-        size += 9 + 24 if kinds and geometry.orientation is not None else 0
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("total_squared", torch.zeros(size, dtype=torch.float64))
@@ -60,11 +59,12 @@ class Normalizer(nn.Module):
 
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
         inputs = [observation, goal]
-        if self.relative_inputs != "none":
-            geometry = self.geometry
+        geometry = self.geometry
+        if geometry is not None and self.relative_inputs != "none":
             if geometry.goal_height is not None:
+                heights = [start + 2 for start in geometry.goal_positions]
                 goal = goal.clone()
-                goal[..., self.heights] = geometry.goal_height
+                goal[..., heights] = geometry.goal_height
             differences = geometry.differences(observation, goal)
             inputs = [observation, goal, differences]
             if geometry.orientation is not None:

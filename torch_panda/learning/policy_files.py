@@ -1,71 +1,212 @@
-"""Trained policies as files: weights, normaliser and how to build them."""
+"""Trained policies as files: their weights, and the numbers to build them from."""
 
-from dataclasses import fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from tensordict.nn import TensorDictModuleBase
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from typing_extensions import Self
 
-from torch_panda import RobotTaskEnv
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
-from torch_panda.learning.agents import Agent, Hyperparameters, make_agent
+from torch_panda.learning.agents import AGENTS, Agent, Hyperparameters
+from torch_panda.learning.spaces import Spaces, read_spaces
+from torch_panda.policies import shipped_policies
+
+
+class Policy(TensorDictModuleBase):
+    """A trained policy, from ``observation`` and ``desired_goal`` to ``action``.
+
+    It acts deterministically, whatever torchrl's exploration type is, and computes no
+    gradients. Batches may have any shape.
+
+    Args:
+        module: The networks, as `Agent.policy`.
+        env_id: Id of the environment that the policy was trained on.
+        spaces: Sizes of observations, goals and actions.
+    """
+
+    in_keys = ("observation", "desired_goal")
+    out_keys = ("action",)
+
+    def __init__(
+        self, module: TensorDictModuleBase, env_id: str, spaces: Spaces
+    ) -> None:
+        super().__init__()
+        self.module, self.env_id, self.spaces = module, env_id, spaces
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action for every observation and goal.
+
+        Raises:
+            ValueError: Observations or goals have other sizes than in training.
+        """
+        state = tensordict.select(*self.in_keys)
+        sizes = (self.spaces.observation_size, self.spaces.goal_size)
+        for key, size in zip(self.in_keys, sizes, strict=True):
+            if state[key].shape[-1] != size:
+                raise ValueError(
+                    f"the policy was trained on {self.env_id}, where {key} has size "
+                    f"{size}, got {state[key].shape[-1]}: use it on a task with the "
+                    "same spaces"
+                )
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = self.module(state)["action"]
+        return tensordict.set("action", action)
+
+
+@dataclass(frozen=True)
+class SavedPolicy:
+    """The content of a policy's file.
+
+    Attributes:
+        path: The file.
+        env_id: Id of the environment that the policy was trained on.
+        hp: Hyperparameters of the agent.
+        spaces: Sizes and layout of observations, goals and actions.
+        weights: State dict of `Agent.policy`.
+    """
+
+    path: Path
+    env_id: str
+    hp: Hyperparameters
+    spaces: Spaces
+    weights: Mapping[str, Tensor]
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read what `save_policy` wrote, onto the CPU. No code in the file is run.
+
+        Args:
+            path: The file, or the folder of a run.
+
+        Raises:
+            ValueError: There is no file, it holds no policy, or another version of
+                torch_panda wrote it.
+        """
+        if path.is_dir():
+            path = path / "checkpoint.pt"
+        keys = ("env_id", "hyperparameters", "policy")
+        content = files.read(path, "a policy", keys, map_location="cpu")
+        hp = _read_hyperparameters(path, content["hyperparameters"])
+        try:
+            spaces = Spaces.from_dict(content["spaces"])
+        except (KeyError, TypeError):
+            raise ValueError(
+                f"{path} was saved by an older version of torch_panda, which did not "
+                "store the sizes of the spaces: train the policy again"
+            ) from None
+        return cls(path, content["env_id"], hp, spaces, content["policy"])
+
+    def make_agent(self, env: RobotTaskEnv | None = None) -> Agent:
+        """A new agent with this policy, and with critics that have learned nothing.
+
+        Args:
+            env: Environments in which the agent explores; None means such as in
+                training.
+
+        Raises:
+            ValueError: The environments have other spaces than in training, or the
+                weights do not fit the hyperparameters.
+        """
+        spaces = self.spaces
+        if env is not None:
+            sizes = read_spaces(env).sizes
+            if sizes != spaces.sizes:
+                raise ValueError(
+                    f"{self.path} was trained on {self.env_id}, where the sizes of "
+                    f"observation, goal and action are {spaces.sizes}, got {sizes}: "
+                    "choose a task with the same spaces"
+                )
+            spaces = replace(spaces, num_envs=env.batch_size.numel())
+        with torch.device("cpu"):
+            agent = AGENTS[self.hp.algo](spaces, self.hp)
+        try:
+            agent.policy.load_state_dict(self.weights)
+        except RuntimeError:
+            raise ValueError(
+                f"{self.path} does not hold a policy, or is damaged: its weights do "
+                "not fit its hyperparameters"
+            ) from None
+        return agent
+
+
+def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparameters:
+    """Build hyperparameters from those of a file.
+
+    Raises:
+        ValueError: The file has options or values that this version does not have.
+    """
+    accepted = {field.name for field in fields(Hyperparameters)}
+    if unknown := values.keys() - accepted:
+        raise ValueError(
+            f"{path} was saved by another version of torch_panda, with options that "
+            f"this one does not have: {', '.join(sorted(unknown))}"
+        )
+    for name, hint in get_type_hints(Hyperparameters).items():
+        choices = get_args(hint) if get_origin(hint) is Literal else ()
+        if choices and name in values and values[name] not in choices:
+            raise ValueError(
+                f"{path} was saved by another version of torch_panda: {name} must be "
+                f"one of {choices}, got {values[name]!r}"
+            )
+    return Hyperparameters(**values)
 
 
 def save_policy(path: Path, agent: Agent, env_id: str) -> None:
-    """Write what `load_policy` needs, plain tensors and numbers."""
+    """Write what `load_policy` needs: tensors, numbers and strings.
+
+    Args:
+        path: The file to write.
+        agent: The agent with the policy.
+        env_id: Id of the environment that it was trained on.
+    """
     hp = {
         field.name: getattr(agent.hp, field.name) for field in fields(Hyperparameters)
     }
-    policy = agent.policy.state_dict()
-    files.save(path, {"env_id": env_id, "hyperparameters": hp, "policy": policy})
+    content = {
+        "env_id": env_id,
+        "hyperparameters": hp,
+        "spaces": agent.spaces.to_dict(),
+        "policy": agent.policy.state_dict(),
+    }
+    files.save(path, content)
 
 
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """What `save_policy` wrote, on the CPU.
+def load_policy(id_or_path: str | Path) -> Policy:
+    """Load a trained policy: one that torch_panda ships, or one of your own runs.
+
+    The file is read without running code in it. Neither the environment's id nor an
+    extra is needed.
 
     Args:
-        path: of the file, or of the folder of a run.
+        id_or_path: Id of an environment whose policy ships with torch_panda, such as
+            ``"PandaPush-v1"``; or the folder of a run; or a file of such a folder.
+
+    Returns:
+        A TensorDictModule on the CPU, which acts deterministically and computes no
+        gradients.
 
     Raises:
-        ValueError: there is no file, or it holds no policy.
+        ValueError: There is no such policy, or the file holds none.
     """
-    if path.is_dir():
-        path = path / "checkpoint.pt"
-    keys = ("env_id", "hyperparameters", "policy")
-    return files.read(path, "a policy", keys, map_location="cpu")
-
-
-def load_agent(checkpoint: dict[str, Any], env: RobotTaskEnv) -> Agent:
-    """A new agent with the policy of a checkpoint that `save_policy` wrote.
-
-    Raises:
-        ValueError: the environment's spaces are not those it was trained on, or
-            another version wrote the checkpoint.
-    """
-    options = checkpoint["hyperparameters"]
-    if unknown := options.keys() - {field.name for field in fields(Hyperparameters)}:
+    shipped = shipped_policies()
+    if isinstance(id_or_path, str) and id_or_path in shipped:
+        path = shipped[id_or_path]
+    else:
+        path = Path(id_or_path)
+    if not path.exists():
         raise ValueError(
-            f"the policy was saved by another version, with options that this one does "
-            f"not have: {', '.join(sorted(unknown))}"
+            f"no policy {str(id_or_path)!r}: pass the folder of a run, a .pt file, or "
+            f"an id with a policy, which are {', '.join(shipped)}"
         )
-    for name, hint in get_type_hints(Hyperparameters).items():
-        accepted = get_args(hint) if get_origin(hint) is Literal else ()
-        if accepted and name in options and options[name] not in accepted:
-            raise ValueError(
-                f"the policy was saved by another version: {name} must be one of "
-                f"{accepted}, got {options[name]!r}"
-            )
-    agent = make_agent(env, Hyperparameters(**options))
-    try:
-        agent.policy.load_state_dict(checkpoint["policy"])
-    except RuntimeError:
-        raise ValueError(
-            f"the policy was trained on {checkpoint['env_id']}, whose spaces are not "
-            "those of this environment"
-        ) from None
-    return agent
-
-
-def load_policy(checkpoint: dict[str, Any], env: RobotTaskEnv) -> TensorDictModuleBase:
-    """The policy of a checkpoint; raises as `load_agent`."""
-    return load_agent(checkpoint, env).policy
+    saved = SavedPolicy.read(path)
+    with torch.random.fork_rng(devices=[]):  # new networks draw random weights
+        module = saved.make_agent().policy
+    return Policy(module, saved.env_id, saved.spaces)

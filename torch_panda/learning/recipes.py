@@ -8,7 +8,7 @@ import re
 from dataclasses import asdict
 from typing import Any
 
-from torch_panda import ENV_IDS
+from torch_panda.registry import ENV_IDS
 
 # Every object task: hindsight about what moved, and symmetry.
 OBJECT: dict[str, Any] = {

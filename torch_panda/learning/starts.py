@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Transform
 
-import torch_panda
-from torch_panda import Flip, Push, Slide, Stack
 from torch_panda.experts.moves import carry, go_over, is_held, norm
 from torch_panda.learning.geometry import read_geometry
+from torch_panda.registry import make
+from torch_panda.tasks import Flip, Push, Slide, Stack
 
 APPROACH = 45  # steps
 # How far beside an object a hand that cannot grasp stops, between the centres [m]: the
@@ -53,15 +53,15 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
     def uniform(low: float, high: float) -> torch.Tensor:
         return low + (high - low) * torch.rand(number, 1, generator=generator)
 
-    with torch_panda.make(env_id, num_envs=number, seed=seed) as env, torch.no_grad():
+    with make(env_id, num_envs=number, seed=seed) as env, torch.no_grad():
         geometry = read_geometry(env)
-        _, *objects = geometry.positions
         lies = isinstance(env.task, Push | Slide | Stack | Flip)
-        if not lies or geometry.action is None:
+        if geometry is None or geometry.action is None or not lies:
             raise ValueError(
                 "starts at objects need end-effector control and a task with objects "
                 f"on the table, got {env_id}"
             )
+        _, *objects = geometry.positions
         last = objects[-1]
         turns = [*objects, last, last] if len(objects) > 1 else objects
         turn = (torch.arange(number) % len(turns)).unsqueeze(1)

@@ -19,8 +19,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
-import torch_panda
-from torch_panda import Randomization
+from torch_panda.envs.randomization import Randomization
 from torch_panda.learning.agents import make_agent
 from torch_panda.learning.buffers import make_buffer, select_episodes
 from torch_panda.learning.checkpoint import (
@@ -33,6 +32,7 @@ from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.options import Args
 from torch_panda.learning.pretraining import make_demo_buffer, pretrain
 from torch_panda.learning.starts import StartFrom, states_at_objects
+from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # of each batch: what is drawn from the demonstrations, if any
 STARTED_STEPS = 50  # of an episode at most, where some begin in the course of the task
@@ -66,7 +66,7 @@ class Run:
             randomize = Randomization(
                 object_mass=factors, object_friction=factors, table_friction=factors
             )
-        self.env = torch_panda.make(
+        self.env = make(
             args.env_id,
             num_envs=args.num_envs,
             device=args.device,

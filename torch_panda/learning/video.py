@@ -17,7 +17,7 @@ from torchrl.envs import step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-import torch_panda
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.files import prepare
 
 CELL = (240, 320)  # height and width [pixels]
@@ -26,9 +26,7 @@ BORDER = 4  # [pixels]
 GREEN, GREY = (40, 170, 70), (120, 120, 120)
 
 
-def record(
-    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase, path: Path
-) -> None:
+def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
     """Write one episode of each environment into a video.
 
     Args:
@@ -55,9 +53,7 @@ def record(
     iio.imwrite(path, np.stack(frames), **options)
 
 
-def play(
-    env: torch_panda.RobotTaskEnv, policy: TensorDictModuleBase
-) -> Iterator[TensorDictBase]:
+def play(env: RobotTaskEnv, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
     """Run an episode: what it starts with, and what every step leads to."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
@@ -67,9 +63,7 @@ def play(
             yield state
 
 
-def draw(
-    env: torch_panda.RobotTaskEnv, state: TensorDictBase, step: int
-) -> npt.NDArray[np.uint8]:
+def draw(env: RobotTaskEnv, state: TensorDictBase, step: int) -> npt.NDArray[np.uint8]:
     """All environments in one picture, with step and success, (height, width, 3)."""
     cells = []
     for pixels, success in zip(env.render(size=CELL), state["success"], strict=True):

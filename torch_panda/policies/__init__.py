@@ -3,4 +3,8 @@
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-"""The folder of the files, ``{env_id}.pt``."""
+
+
+def shipped_policies() -> dict[str, Path]:
+    """The files of the policies by the id of their environment."""
+    return {path.stem: path for path in sorted(FOLDER.glob("*.pt"))}

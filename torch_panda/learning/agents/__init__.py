@@ -2,13 +2,14 @@
 
 import torch
 
-from torch_panda import RobotTaskEnv
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.ddpg import DDPG
 from torch_panda.learning.agents.sac import SAC
 from torch_panda.learning.agents.td3 import TD3
 from torch_panda.learning.agents.tqc import TQC
 from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.spaces import read_spaces
 
 AGENTS: dict[str, type[Agent]] = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC}
 
@@ -18,4 +19,4 @@ __all__ = ["AGENTS", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
 def make_agent(env: RobotTaskEnv, hp: Hyperparameters) -> Agent:
     """An untrained agent on the environment's device."""
     with torch.device(env.device or "cpu"):
-        return AGENTS[hp.algo](env, hp)
+        return AGENTS[hp.algo](read_spaces(env), hp)

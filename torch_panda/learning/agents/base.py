@@ -9,12 +9,11 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torch_panda import RobotTaskEnv
 from torch_panda.learning.augmentation import Augmentation
-from torch_panda.learning.fingers import check_fingers, from_fine, to_fine
-from torch_panda.learning.geometry import check_layout, read_geometry
+from torch_panda.learning.fingers import from_fine, to_fine
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
 STATE_KEYS = ["observation", "desired_goal"]
@@ -26,8 +25,8 @@ class Agent(nn.Module, ABC):
     """A policy, how it explores, and how it learns.
 
     Args:
-        env: the environment, for the sizes and the layout of its spaces.
-        hp: what to build.
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
 
     Attributes:
         normalizer: standardises observation and goal.
@@ -42,20 +41,14 @@ class Agent(nn.Module, ABC):
     explore: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
+    def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__()
-        self.hp = hp
-        if hp.fine_fingers:
-            check_fingers(env)
-        geometry = read_geometry(env)
-        sizes = [env.observation_spec[key].shape[-1] for key in STATE_KEYS]
-        if (hp.relative_inputs, hp.augmentation) != ("none", "none"):
-            check_layout(geometry, sizes)
-        self.normalizer = Normalizer(sum(sizes), geometry, hp.relative_inputs)
-        self.augmentation = Augmentation(geometry, hp.augmentation)
+        self.spaces, self.hp = spaces, hp
+        check_spaces(spaces, hp)
+        self.normalizer = Normalizer(spaces, hp.relative_inputs)
+        self.augmentation = Augmentation(spaces.geometry, hp.augmentation)
         self.state_size = len(self.normalizer.mean)
-        self.action_size = env.action_spec.shape[-1]
-        self.gamma = hp.gamma or 1 - 1 / env.max_episode_steps
+        self.gamma = hp.gamma or 1 - 1 / spaces.max_episode_steps
         self.updates = 0
 
     def assemble(
@@ -157,3 +150,23 @@ class Agent(nn.Module, ABC):
         """Let the next gradient steps have so much of the learning rate."""
         for group in self.optimizer.param_groups:
             group["lr"] = factor * LEARNING_RATE
+
+
+def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
+    """Check that hyperparameters fit an environment.
+
+    Raises:
+        ValueError: A hyperparameter needs a gripper or a layout that is not there.
+    """
+    if hp.fine_fingers and not spaces.has_free_gripper:
+        raise ValueError(
+            "fine_fingers needs a task whose actions move the fingers, such as "
+            "PickAndPlace, Stack or Flip: pass --no-fine-fingers"
+        )
+    uses_layout = (hp.relative_inputs, hp.augmentation) != ("none", "none")
+    if uses_layout and spaces.geometry is None:
+        raise ValueError(
+            "relative inputs and augmentation need to know what the numbers of an "
+            "observation are, and this task does not say it: pass "
+            "--relative-inputs none --augmentation none"
+        )

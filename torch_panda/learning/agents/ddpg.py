@@ -12,11 +12,11 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
-from torch_panda import RobotTaskEnv, Task
 from torch_panda.learning.agents.base import TAU, Agent
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.imitation import imitation_loss
 from torch_panda.learning.networks import make_mlp
+from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
 # Weight of the squares of what enters the actor's tanh: where tanh is flat no gradient
@@ -30,9 +30,9 @@ class DDPG(Agent):
     num_critics = 1
     actor_interval = 1  # gradient steps of the critics to one of the actor
 
-    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
-        super().__init__(env, hp)
-        inputs, action_size = self.state_size, self.action_size
+    def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
+        super().__init__(spaces, hp)
+        inputs, action_size = self.state_size, spaces.action_size
         self.actor = nn.Sequential(make_mlp(inputs, action_size, hp.network), nn.Tanh())
         self.critics = nn.ModuleList(
             make_mlp(inputs + action_size, 1, hp.network)
@@ -40,14 +40,15 @@ class DDPG(Agent):
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.lowest = lowest_return(env.task, self.gamma)
+        self.lowest = lowest_return(self.gamma) if spaces.has_sparse_reward else None
 
+        action_spec = spaces.action_spec(spaces.num_envs)
         noise = AdditiveGaussianModule(
-            env.action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
+            action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
         )
-        random_action = EGreedyModule(env.action_spec)
+        random_action = EGreedyModule(action_spec)
         # (num_envs,): compared with one random number per environment.
-        random_action.eps = torch.linspace(*hp.random_eps, env.batch_size[0])
+        random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
         self.actor_parameters = list(self.actor.parameters())
         self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
         self.target: list[Tensor] = [
@@ -102,12 +103,6 @@ class DDPG(Agent):
             torch._foreach_lerp_(self.target, self.online, TAU)
 
 
-def lowest_return(task: Task, gamma: float) -> float | None:
-    """What rewards of -1 and 0 sum up to at least, as in Baselines; None: not known."""
-    kind = type(task)
-    has_own = (
-        kind.compute_reward is not Task.compute_reward or kind.reward is not Task.reward
-    )
-    if has_own or task.reward_type != "sparse":
-        return None
+def lowest_return(gamma: float) -> float:
+    """Lower bound of returns whose rewards are -1 and 0, as in Baselines."""
     return -1 / (1 - gamma) if gamma < 1 else -math.inf

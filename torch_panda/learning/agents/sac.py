@@ -6,10 +6,10 @@ from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
-from torch_panda import RobotTaskEnv
 from torch_panda.learning.agents.base import TAU, Agent
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.networks import make_mlp
+from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
 ALPHA = 0.2  # the entropy coefficient, which stays
@@ -20,10 +20,10 @@ class SAC(Agent):
 
     critic_outputs = 1
 
-    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
-        super().__init__(env, hp)
+    def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
+        super().__init__(spaces, hp)
         inputs = self.state_size
-        net = make_mlp(inputs, 2 * self.action_size, hp.network)
+        net = make_mlp(inputs, 2 * spaces.action_size, hp.network)
         parameters = nn.Sequential(net, NormalParamExtractor())
         actor = ProbabilisticActor(
             TensorDictModule(parameters, ["normalized"], ["loc", "scale"]),
@@ -31,7 +31,7 @@ class SAC(Agent):
             distribution_class=TanhNormal,
         )
         critic = TensorDictModule(
-            make_mlp(inputs + self.action_size, self.critic_outputs, hp.network),
+            make_mlp(inputs + spaces.action_size, self.critic_outputs, hp.network),
             ["normalized", "action"],
             ["state_action_value"],
         )
@@ -42,7 +42,7 @@ class SAC(Agent):
             deactivate_vmap=True,  # faster on CPU
             alpha_init=ALPHA,
             fixed_alpha=True,
-            action_spec=env.action_spec_unbatched,
+            action_spec=spaces.action_spec(),
         )
         self.loss.make_value_estimator(gamma=self.gamma)
         # A buffer, but only once it was asked for: in the states that runs save.

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from torch_panda import RobotTaskEnv
 from torch_panda.learning.agents.ddpg import DDPG
 from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.spaces import Spaces
 
 POLICY_NOISE = 0.2  # standard deviation of the noise on target actions
 NOISE_CLIP = 0.5
@@ -16,9 +16,9 @@ class TD3(DDPG):
 
     actor_interval = 2
 
-    def __init__(self, env: RobotTaskEnv, hp: Hyperparameters) -> None:
+    def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         self.num_critics = 2 if hp.double_q else 1
-        super().__init__(env, hp)
+        super().__init__(spaces, hp)
 
     def target_action(self, next_state: Tensor) -> Tensor:
         """The target actor's action with clipped noise, (n, action size)."""

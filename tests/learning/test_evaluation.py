@@ -1,0 +1,80 @@
+"""Evaluations: which episodes run, and what is measured."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs.utils import RandomPolicy
+
+import torch_panda
+from torch_panda.experts import make_expert
+from torch_panda.learning.evaluation import wilson_interval
+
+
+def test_a_policy_that_succeeds():
+    policy = torch_panda.load_policy("PandaReach-v1")
+    result = torch_panda.evaluate(policy, "PandaReach-v1", episodes=40, seed=1)
+    assert result.success.shape == (40,)
+    assert result.success.dtype == torch.bool
+    assert result.success_rate == 1.0
+    assert result.interval == wilson_interval(40, 40)
+    assert 0.9 < result.interval[0] < result.interval[1] == 1.0
+    assert result.mean_return == pytest.approx(float(result.returns.mean()))
+    assert -5 < result.mean_return < 0
+    assert (result.lengths == 50).all()
+    assert "40 episodes, success_rate=1.000" in repr(result)
+
+
+def test_a_policy_that_does_nothing():
+    still = TensorDictModule(lambda goal: 0 * goal, ["desired_goal"], ["action"])
+    options = {"episodes": 30, "num_envs": 8, "seed": 3}
+    result = torch_panda.evaluate(still, "PandaReach-v1", **options)
+    assert result.success_rate < 0.5
+    # The hand stays where it starts.
+    assert torch.equal(result.success, result.at_start)
+    assert torch.equal(result.success, result.ever)
+    assert torch.equal(result.returns, torch.where(result.success, 0.0, -50.0))
+
+
+def test_episodes_of_v3_end_at_success():
+    expert = make_expert("PandaReach-v3")
+    result = torch_panda.evaluate(expert, "PandaReach-v3", episodes=20, num_envs=5)
+    assert result.success_rate == 1.0
+    assert torch.equal(result.ever, result.success)
+    assert 1 <= result.lengths.min() < result.lengths.max() < 50
+    assert result.mean_length == float(result.lengths.double().mean())
+    # Every step but the last one costs 1.
+    assert torch.equal(result.returns, 1.0 - result.lengths)
+
+
+def test_a_seed_fixes_the_episodes():
+    expert = make_expert("PandaPush-v1")
+    first, again, other = (
+        torch_panda.evaluate(expert, "PandaPush-v1", episodes=8, seed=seed)
+        for seed in (1, 1, 2)
+    )
+    assert torch.equal(first.returns, again.returns)
+    assert not torch.equal(first.returns, other.returns)
+
+
+def test_options_of_make_are_passed_on():
+    policy = torch_panda.load_policy("PandaReach-v1")
+    options = {"task_options": {"distance_threshold": 10.0}, "physics": "fast"}
+    result = torch_panda.evaluate(policy, "PandaReach-v1", episodes=4, **options)
+    assert result.mean_return == 0.0
+    assert result.at_start.all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"episodes": 0}, ValueError, "episodes must be"),
+        ({"num_envs": 0}, ValueError, "num_envs must be"),
+        ({"env_id": "PandaFly-v1"}, ValueError, "unknown environment id"),
+        ({"policy": "PandaReach-v1"}, TypeError, "load_policy reads one from a file"),
+        ({"n_envs": 4}, TypeError, "n_envs"),
+    ],
+)
+def test_bad_arguments(arguments, error, message):
+    arguments = {"policy": RandomPolicy(None), "env_id": "PandaReach-v1", **arguments}
+    with pytest.raises(error, match=message):
+        torch_panda.evaluate(**arguments)

@@ -1,0 +1,176 @@
+"""Trained policies as files: shipped ones, those of runs, and how they act."""
+
+import subprocess
+import sys
+from contextlib import nullcontext
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import torch_panda
+from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
+from torch_panda.learning.policy_files import SavedPolicy, save_policy
+from torch_panda.policies import shipped_policies
+
+
+@pytest.fixture(scope="module")
+def env():
+    with torch_panda.make("PandaPickAndPlace-v1", num_envs=4, seed=0) as env:
+        yield env
+
+
+def save(env, path, **options):
+    """Write the policy of a new agent, and return the agent."""
+    torch.manual_seed(0)
+    agent = make_agent(env, Hyperparameters(**options))
+    agent.normalizer.update(*(torch.randn(50, n) for n in agent.spaces.sizes[:2]))
+    save_policy(path, agent, "PandaPickAndPlace-v1")
+    return agent
+
+
+def inputs(spaces, *batch_size):
+    observation = torch.randn(*batch_size, spaces.observation_size)
+    goal = torch.randn(*batch_size, spaces.goal_size)
+    td = TensorDict(observation=observation, desired_goal=goal)
+    return td.auto_batch_size_(len(batch_size))
+
+
+@pytest.mark.parametrize("algo", AGENTS)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"relative_inputs": "fine", "fine_fingers": True, "network": "layer-norm"}],
+    ids=["paper", "tuned"],
+)
+def test_a_loaded_policy_acts_as_the_saved_agent(env, tmp_path, algo, options):
+    agent = save(env, tmp_path / "checkpoint.pt", algo=algo, **options)
+    state = torch.get_rng_state()
+    policy = torch_panda.load_policy(tmp_path)
+    assert torch.equal(state, torch.get_rng_state())
+    assert policy.env_id == "PandaPickAndPlace-v1"
+    td = inputs(policy.spaces, 16)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected = agent.policy(td.clone())["action"]
+    found = policy(td)
+    assert torch.equal(found["action"], expected)
+    assert set(found.keys()) == {"observation", "desired_goal", "action"}
+
+
+@pytest.mark.parametrize("exploration", [None, *ExplorationType])
+def test_actions_are_the_same_under_any_exploration_type(env, tmp_path, exploration):
+    save(env, tmp_path / "sac.pt", algo="sac")
+    policy = torch_panda.load_policy(tmp_path / "sac.pt")
+    td = inputs(policy.spaces, 16)
+    expected = policy(td.clone())["action"]
+    with set_exploration_type(exploration) if exploration else nullcontext():
+        found = policy(td.clone())["action"]
+    assert torch.equal(found, expected)
+    assert not found.requires_grad
+
+
+@pytest.mark.parametrize("env_id", shipped_policies())
+def test_shipped_policies_act_on_batches_of_any_shape(env_id):
+    policy = torch_panda.load_policy(env_id)
+    assert policy.env_id == env_id
+    td = inputs(policy.spaces, 6)
+    actions = policy(td.clone())["action"]
+    assert actions.shape == (6, policy.spaces.action_size)
+    grid = policy(td.reshape(2, 3))["action"]
+    torch.testing.assert_close(grid.flatten(0, 1), actions)
+    torch.testing.assert_close(policy(td[0])["action"], actions[0])
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_a_loaded_policy_serves_rollouts_and_collectors(num_envs):
+    policy = torch_panda.load_policy("PandaReach-v1")
+    env = torch_panda.make("PandaReach-v1", num_envs=num_envs, seed=0)
+    rollout = env.rollout(50, policy)
+    assert rollout["next", "success"][..., -1, :].all()
+    frames = 50 * (num_envs or 1)
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=frames,
+        total_frames=frames,
+        auto_register_policy_transforms=True,
+    )
+    (data,) = list(collector)
+    collector.shutdown()
+    assert data["next", "success"][..., -1, :].all()
+
+
+def test_a_policy_of_an_unregistered_id_loads(tmp_path):
+    scene = {"robot": torch_panda.Panda(), "task": torch_panda.Flip()}
+    options = {"relative_inputs": "coarse"}
+    with torch_panda.RobotTaskEnv(**scene, num_envs=2) as env:
+        agent = make_agent(env, Hyperparameters(**options))
+        save_policy(tmp_path / "checkpoint.pt", agent, "Nowhere-v0")
+    policy = torch_panda.load_policy(str(tmp_path))
+    assert policy.env_id == "Nowhere-v0"
+    assert policy(inputs(policy.spaces, 2))["action"].shape == (2, 4)
+
+
+LOAD = """
+import sys
+for name in ("tyro", "matplotlib", "imageio", "viser", "minari"):
+    sys.modules[name] = None  # importing it raises
+import torch_panda
+policy = torch_panda.load_policy("PandaReach-v1")
+print(torch_panda.evaluate(policy, "PandaReach-v1", episodes=4).success_rate)
+"""
+
+
+def test_loading_and_evaluating_need_no_extra():
+    done = subprocess.run([sys.executable, "-c", LOAD], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "1.0\n"
+
+
+def test_ids_without_a_policy_name_those_with_one():
+    with pytest.raises(ValueError, match=r"no policy 'PandaPush-v3': .* PandaPush-v1"):
+        torch_panda.load_policy("PandaPush-v3")
+
+
+def test_a_folder_without_a_policy(tmp_path):
+    with pytest.raises(ValueError, match=r"there is no file .*checkpoint\.pt"):
+        torch_panda.load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"spaces": None}, "was saved by an older version of torch_panda"),
+        ({"spaces": {"size": 3}}, "was saved by an older version of torch_panda"),
+        ({"policy": {}}, "its weights do not fit its hyperparameters"),
+        ({"hyperparameters": {"depth": 3}}, "another version .*: depth$"),
+        ({"hyperparameters": {"algo": "ppo"}}, r"algo must be one of .*, got 'ppo'$"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_files_of_other_versions(tmp_path, change, message):
+    content = torch.load(shipped_policies()["PandaReach-v1"]) | change
+    path = tmp_path / "policy.pt"
+    torch.save(content, path)
+    with pytest.raises(ValueError, match=f"^{path} .*{message}"):
+        torch_panda.load_policy(path)
+
+
+def test_observations_of_another_task_are_refused():
+    policy = torch_panda.load_policy("PandaPush-v1")
+    td = TensorDict(observation=torch.zeros(2, 6), desired_goal=torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="observation has size 18, got 6"):
+        policy(td.auto_batch_size_(1))
+
+
+def test_an_agent_is_rebuilt_for_environments_of_the_same_sizes(env):
+    saved = SavedPolicy.read(shipped_policies()["PandaPickAndPlace-v1"])
+    agent = saved.make_agent(env)
+    td = agent.explore(env.reset())
+    assert td["action"].shape == (4, 4)
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=1) as other,
+        pytest.raises(ValueError, match=r"are \(19, 3, 4\), got \(6, 3, 3\)"),
+    ):
+        saved.make_agent(other)

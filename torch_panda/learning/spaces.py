@@ -1,0 +1,87 @@
+"""The numbers of an environment that agents are built from.
+
+They are saved with a policy, so that a file alone is enough to build it again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torchrl.data import Bounded, TensorSpec
+from typing_extensions import Self
+
+from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.geometry import Geometry, read_geometry
+from torch_panda.tasks import Task
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """Sizes, layout and rewards of an environment.
+
+    Attributes:
+        observation_size: Size of ``observation``.
+        goal_size: Size of ``desired_goal``.
+        action_size: Size of ``action``.
+        num_envs: Number of environments that explore in parallel.
+        max_episode_steps: Number of steps after which an episode is truncated.
+        has_free_gripper: Whether the last number of an action moves the fingers.
+        has_sparse_reward: Whether every reward is -1 or 0.
+        geometry: Layout of observation, goal and action; None if it is unknown.
+    """
+
+    observation_size: int
+    goal_size: int
+    action_size: int
+    num_envs: int
+    max_episode_steps: int
+    has_free_gripper: bool
+    has_sparse_reward: bool
+    geometry: Geometry | None
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Sizes of observation, goal and action."""
+        return self.observation_size, self.goal_size, self.action_size
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Undo `to_dict`."""
+        geometry = values["geometry"]
+        if geometry is not None:
+            geometry = Geometry(**geometry)
+        return cls(**{**values, "geometry": geometry})
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as nested dicts of numbers and tuples, which `torch.save` writes."""
+        return asdict(self)
+
+    def action_spec(self, *batch_size: int) -> TensorSpec:
+        """The spec of actions in [-1, 1], on torch's default device."""
+        device = torch.get_default_device()
+        return Bounded(-1.0, 1.0, (*batch_size, self.action_size), device=device)
+
+
+def read_spaces(env: RobotTaskEnv) -> Spaces:
+    """The numbers of a batch of environments."""
+    robot, task = env.robot, env.task
+    return Spaces(
+        observation_size=robot.observation_dim + task.observation_dim,
+        goal_size=task.goal_dim,
+        action_size=robot.action_dim,
+        num_envs=env.batch_size.numel(),
+        max_episode_steps=env.max_episode_steps,
+        has_free_gripper=robot.has_free_gripper,
+        has_sparse_reward=has_sparse_reward(task),
+        geometry=read_geometry(env),
+    )
+
+
+def has_sparse_reward(task: Task) -> bool:
+    """Whether the rewards of a task are the sparse ones of `Task`, -1 and 0."""
+    cls = type(task)
+    overrides = (
+        cls.compute_reward is not Task.compute_reward or cls.reward is not Task.reward
+    )
+    return task.reward_type == "sparse" and not overrides
