@@ -4,6 +4,7 @@ python examples/first_steps.py
 """
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
@@ -22,15 +23,16 @@ test_env = torch_panda.make("PandaReach-v1", num_envs=50, seed=1)
 class Net(MLP):
     """Sees the goal beside the observation, in decimetres: of the size of actions."""
 
-    def forward(self, observation: Tensor, goal: Tensor, *action: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, goal: Tensor, *action: Tensor) -> Tensor:  # type: ignore[override]
         """Concatenate the inputs, (..., 6), (..., 3) and, if given, (..., 3)."""
-        return super().forward(10 * observation, 10 * goal, *action)
+        inputs = 10 * observation, 10 * goal, *action
+        return super().forward(*inputs)  # type: ignore[arg-type]
 
 
-inputs = ["observation", "desired_goal"]
+inputs: list[NestedKey] = ["observation", "desired_goal"]
 net = Net(9, 3, depth=2, num_cells=256, activation_class=nn.ReLU)
 policy = TensorDictModule(net, inputs, ["action"])
-actor = TensorDictSequential(policy, TanhModule(in_keys=["action"]))
+actor = TensorDictSequential(policy, TanhModule(in_keys=["action"]))  # type: ignore[call-overload]
 value = Net(12, 1, depth=2, num_cells=256, activation_class=nn.ReLU)
 critic = TensorDictModule(value, [*inputs, "action"], ["state_action_value"])
 noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
@@ -43,7 +45,7 @@ optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
 relabel = HindsightRelabel.from_env(env, her_ratio=0.8)
 storage = LazyTensorStorage(100_000)
 buffer = TensorDictReplayBuffer(storage=storage, transform=relabel, batch_size=256)
-explore = TensorDictSequential(actor, noise)
+explore = TensorDictSequential(actor, noise)  # type: ignore[call-overload]
 for data in Collector(env, explore, frames_per_batch=400, total_frames=2_400):
     buffer.extend(data.reshape(-1))
     for _ in range(200):

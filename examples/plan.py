@@ -58,20 +58,21 @@ class Fork(EnvBase):
         return super().__new__(cls, *args, _batch_locked=False, **kwargs)
 
     def __init__(self, args: Args) -> None:
-        super().__init__(batch_size=[])
+        super().__init__(batch_size=())
         self.hold = args.hold
         self.model = make(args, num_envs=args.num_candidates)
         self.action_spec = Bounded(-1.0, 1.0, self.model.action_spec.shape[-1:])
-        self.observation_spec = Composite(index=Unbounded((1,), dtype=torch.int64))
-        self.reward_spec = Unbounded((1,))
+        self.observation_spec = Composite(index=Unbounded(1, dtype=torch.int64))
+        self.reward_spec = Unbounded(1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not tensordict["index"].any():
-            self.now = self.model.reset(tensordict["state"], set_state=True)
+            state = tensordict.get("state")
+            self.now = self.model.reset(state, set_state=True)
         reward = torch.zeros(*tensordict.batch_size, 1)
         for _ in range(self.hold):
             self.now["action"] = tensordict["action"]
-            self.now = self.model.step(self.now)["next"]
+            self.now = self.model.step(self.now)["next"]  # type: ignore[assignment]
             goal, achieved = self.now["desired_goal"], self.now["achieved_goal"]
             behind = achieved - BEHIND * torch.nn.functional.normalize(goal - achieved)
             far = (behind - self.now["observation"][:, :3]).norm(dim=1, keepdim=True)
@@ -80,7 +81,9 @@ class Fork(EnvBase):
         td = {"index": tensordict["index"] + 1, "reward": reward, "done": reward > 0}
         return TensorDict(td, reward.shape[:1])  # never done: rewards are negative
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDict:
         raise NotImplementedError("a fork starts from a state")
 
     def _set_seed(self, seed: int | None) -> None:
@@ -97,7 +100,7 @@ def solve(env: torch_panda.RobotTaskEnv, fork: Fork, args: Args) -> TensorDictBa
         action = planner(TensorDict(start))["action"]
         for _ in range(args.hold):
             if not td["done"]:
-                td = env.step(td.set("action", action))["next"]
+                td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
     return td
 
 

@@ -68,7 +68,7 @@ def success_grid(
             env.reset()
             state = env.get_state()
             # All cells play the episodes of the first one.
-            state = state[[0] * len(factors)]
+            state = state[[0] * len(factors)]  # type: ignore[assignment]
             state["physics_parameters"] = factors.double()
             start = env.reset(state, set_state=True)
             played = env.rollout(

@@ -43,7 +43,9 @@ class HindsightAugment(BufferTransform):
         # Batches of unfinished episodes. The first one has the oldest transition.
         self._unfinished: list[TensorDictBase] = []
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+    def _inv_call(  # type: ignore[override]  # buffers accept None
+        self, tensordict: TensorDictBase
+    ) -> TensorDictBase | None:
         """Takes transitions, and returns those of the episodes that have ended."""
         buffer, method = find_buffer()
         if method == "add" or not tensordict.ndim:
@@ -58,7 +60,7 @@ class HindsightAugment(BufferTransform):
         batch = tensordict if mask is None else tensordict[mask]
         with self._lock:
             self._claim(buffer)
-            ended = self._take_ended(batch)
+            ended = self._take_ended(batch)  # type: ignore[arg-type]  # rows
             if ended is None:
                 return None
             copies = ended.repeat_interleave(self.k, dim=0)
@@ -91,8 +93,8 @@ class HindsightAugment(BufferTransform):
         """Leaves sampled transitions as they are."""
         return tensordict
 
-    def _reset(self) -> None:
-        super()._reset()
+    def _forget(self) -> None:
+        super()._forget()
         self._unfinished = []
 
     def get_extra_state(self) -> dict[str, Any]:

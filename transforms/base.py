@@ -241,7 +241,7 @@ class BufferTransform(envs.Transform):
                     "buffer: make one transform for each buffer, or call empty() on "
                     "the transform to forget the other buffer's transitions"
                 )
-            self._reset()
+            self._forget()
         if owner is None or owner() is not buffer:
             self._memory.buffer = weakref.ref(buffer)
 
@@ -309,9 +309,9 @@ class BufferTransform(envs.Transform):
     def empty(self) -> None:
         """Forgets all transitions and the buffer, which does not call this itself."""
         with self._lock:
-            self._reset()
+            self._forget()
 
-    def _reset(self) -> None:
+    def _forget(self) -> None:
         self._memory, self._is_checked = GoalMemory(), False
 
     def empty_cache(self) -> None:

@@ -174,7 +174,8 @@ class DataCheck:
         both = torch.cat(self._goals(rows), 1).double()
         goal_dim = both.shape[1] // 2
         is_finite = both.isfinite().all(1)
-        rows, both = rows[is_finite], both[is_finite]
+        both = both[is_finite]
+        rows = rows[is_finite]  # type: ignore[assignment]  # a TensorDict
         achieved, desired = both.split(goal_dim, 1)
         if len(desired.unique(dim=0)) <= 2 * goal_dim + 1:
             return False
@@ -268,8 +269,9 @@ def _cat(pool: TensorDictBase | None, rows: TensorDictBase) -> TensorDictBase:
     """Appends rows to a pool, keeps their common entries, and thins a large pool."""
     if pool is not None:
         common = {*pool.keys(True, True)} & {*rows.keys(True, True)}
-        rows = torch.cat([pool.select(*common), rows.select(*common)])
-    return rows[::2].clone() if len(rows) > MAX_POOL else rows
+        # torch's functions are annotated for tensors only.
+        rows = torch.cat([pool.select(*common), rows.select(*common)])  # type: ignore[assignment]
+    return rows[::2].clone() if len(rows) > MAX_POOL else rows  # type: ignore[return-value]
 
 
 def _format(goal: Tensor) -> str:

@@ -60,7 +60,7 @@ class SampleTimeTransform(BufferTransform):
             self._claim(buffer)
             stored = self._count_stored(buffer)
             self._last_write = stored, batch.numel()
-            batch = self._remember(batch, stored)
+            batch = self._remember(batch, stored)  # type: ignore[arg-type]  # rows
         return batch.squeeze(-1) if is_one_item else batch
 
     def _count_stored(self, buffer: ReplayBuffer | None) -> int:

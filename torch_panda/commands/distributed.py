@@ -228,7 +228,7 @@ def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
     # `send_weights` goes through Ray instead.
     warnings.filterwarnings("ignore", message="RayCollector iteration started before")
     return RayCollector(
-        [partial(make, draw_seed()) for _ in workers],
+        [partial(make, draw_seed()) for _ in workers],  # type: ignore[arg-type]
         policy,
         frames_per_batch=args.batch_frames,
         total_frames=args.total_steps,

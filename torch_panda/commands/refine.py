@@ -143,7 +143,9 @@ class Refinement:
         while progress.steps < last and not stop:
             reseed(self.env)
             policy = self.agent.policy
-            episodes = play(self.env, policy, ExplorationType.DETERMINISTIC)
+            # torchrl makes the members of this enum strings.
+            exploration = ExplorationType.DETERMINISTIC
+            episodes = play(self.env, policy, exploration)  # type: ignore[arg-type]
             asked = [ask_for_achieved(x, self.env.task, self.varies) for x in episodes]
             if rows := [row for row in asked if row is not None]:
                 self.buffer.extend(TensorDict.cat(rows))

@@ -139,7 +139,8 @@ def main(args: Args) -> None:
             elif args.policy == "expert":
                 policy = make_expert(env_id)
             else:
-                policy = RandomPolicy(env.action_spec)
+                # A callable is enough for rollouts.
+                policy = RandomPolicy(env.action_spec)  # type: ignore[assignment]
             if args.web:
                 policies: Iterator[TensorDictModuleBase] = itertools.repeat(policy)
                 if trained and Path(args.policy).exists():

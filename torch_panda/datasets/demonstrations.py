@@ -69,9 +69,9 @@ def _check_rewards(path: Path, demos: TensorDictBase, env: RobotTaskEnv) -> None
     Raises:
         ValueError: More than `DIFFERENT_REWARDS` of them differ.
     """
-    after = demos["next"]
-    expected = env.compute_reward(after["achieved_goal"], demos["desired_goal"])
-    stored = after["reward"].to(expected)
+    achieved_goal = demos["next", "achieved_goal"]
+    expected = env.compute_reward(achieved_goal, demos["desired_goal"])
+    stored = demos["next", "reward"].to(expected)
     differs = ~torch.isclose(stored, expected, rtol=1e-3, atol=1e-3)
     if differs.double().mean() > DIFFERENT_REWARDS:
         k = int(differs.flatten().nonzero()[0])

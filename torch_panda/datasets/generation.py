@@ -100,7 +100,8 @@ def generate(
                 rows.append(episodes.step())
                 if progress is not None:
                     progress(len(numbers))
-            part = torch.stack(rows, dim=1)[: len(numbers)]
+            part: TensorDictBase
+            part = torch.stack(rows, dim=1)[: len(numbers)]  # type: ignore
             part["collector", "traj_ids"] = numbers[:, None].repeat(1, steps)
             parts.append(part)
     return TensorDict.cat(parts)
@@ -149,7 +150,8 @@ class _Episodes:
             row["desired_goal"] = self._goal.clone()
         row["action"] = self._act(row)
         row = env.step(row)
-        self._state = row["next"].select(*OBSERVED)
+        after: TensorDictBase = row["next"]  # type: ignore[assignment]
+        self._state = after.select(*OBSERVED)
         if self._kind == "play":
             self._pursue(row)
         return row
@@ -166,7 +168,7 @@ class _Episodes:
 
     def _pursue(self, row: TensorDictBase) -> None:
         """Judge the step by the pursued goal, and choose the next goals."""
-        after = row["next"]
+        after: TensorDictBase = row["next"]  # type: ignore[assignment]
         after["desired_goal"] = row["desired_goal"].clone()
         goals = after["achieved_goal"], after["desired_goal"]
         after["reward"] = self._env.compute_reward(*goals)

@@ -54,17 +54,16 @@ class LeRobotWriter:
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
         """Write an episode; the column ``seed`` repeats its seed."""
-        following = episode["next"]
         goals = torch.cat((episode["achieved_goal"], episode["desired_goal"]), -1)
         columns = {
             STATE: episode["observation"],
             GOALS: goals,
             PICTURE: episode["pixels"],
             "action": episode["action"],
-            "next.reward": following["reward"],
-            "next.success": following["success"],
-            "next.terminated": following["terminated"],
-            "next.done": following["done"],
+            "next.reward": episode["next", "reward"],
+            "next.success": episode["next", "success"],
+            "next.terminated": episode["next", "terminated"],
+            "next.done": episode["next", "done"],
             "seed": torch.full((len(episode), 1), seed),
         }
         for step in range(len(episode)):
@@ -139,7 +138,8 @@ def read(path: Path) -> TensorDict:
     }
     for key, values in observed.items():
         data[key], data["next", key] = values[:-1], values[1:]
-    transitions = TensorDict(data, [len(kept)])[kept]
+    transitions: TensorDict
+    transitions = TensorDict(data, [len(kept)])[kept]  # type: ignore[assignment]
     numbers = transitions["collector", "traj_ids"]
     last = numbers != numbers.roll(-1)
     last[-1] = True

@@ -39,7 +39,7 @@ class TensorWriter:
 
 
 def disturb(
-    expert: TensorDictModule, env: torch_panda.RobotTaskEnv, noise_eps: float
+    expert: TensorDictModuleBase, env: torch_panda.RobotTaskEnv, noise_eps: float
 ) -> TensorDictModuleBase:
     """Add Gaussian noise to the actions of an expert.
 
@@ -56,13 +56,15 @@ def disturb(
     noise = AdditiveGaussianModule(
         env.action_spec, sigma_init=noise_eps, sigma_end=noise_eps
     )
-    return TensorDictSequential(expert, keep, noise)
+    # The overloads of TensorDictSequential lack modules as arguments.
+    return TensorDictSequential(expert, keep, noise)  # type: ignore[call-overload]
 
 
 def play(
     env: torch_panda.RobotTaskEnv,
     expert: TensorDictModuleBase,
-    exploration: ExplorationType = ExplorationType.RANDOM,
+    # torchrl makes the members of this enum strings.
+    exploration: ExplorationType = ExplorationType.RANDOM,  # type: ignore[assignment]
 ) -> list[TensorDictBase]:
     """Play one new episode in every environment.
 

@@ -162,7 +162,8 @@ class RobotTaskEnv(EnvBase):
         self._observe_state = observe_state
         specs = Specs(episodes, device, observe_state=observe_state)
         self.observation_spec, self.action_spec = specs.observation, specs.action
-        self.reward_spec, self.done_spec = specs.reward, specs.done
+        self.reward_spec = specs.reward
+        self.done_spec = specs.done  # type: ignore[misc]  # it has a setter
         # EnvBase closes a forgotten environment only if this is its own attribute.
         self.is_closed = False
 
@@ -515,7 +516,7 @@ class RobotTaskEnv(EnvBase):
         return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     @property
-    def _supports_set_state(self) -> bool:
+    def _supports_set_state(self) -> bool:  # type: ignore[override]  # a constant there
         """Whether a reset of this environment may start from a state.
 
         `SerialEnv` and `ParallelEnv` ask this once for each worker. The answer is no

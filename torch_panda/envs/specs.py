@@ -42,7 +42,7 @@ class Specs:
         self.action = Bounded(
             low=-1.0,
             high=1.0,
-            shape=(*self._batch, robot.action_dim),
+            shape=torch.Size((*self._batch, robot.action_dim)),
             device=device,
             dtype=torch.float32,
         )
@@ -54,15 +54,16 @@ class Specs:
         )
 
     def _numbers(self, size: int) -> Unbounded:
-        shape = (*self._batch, size)
+        shape = torch.Size((*self._batch, size))
         return Unbounded(shape, device=self._device, dtype=torch.float32)
 
     def _flag(self) -> Binary:
-        return Binary(shape=(*self._batch, 1), device=self._device, dtype=torch.bool)
+        shape = torch.Size((*self._batch, 1))
+        return Binary(shape=shape, device=self._device, dtype=torch.bool)
 
     def _entry(self, entry: Entry) -> TensorSpec:
         """Spec of an entry of a sensor or of `Task.extra_observation`."""
-        shape, dtype = (*self._batch, *entry.shape), entry.dtype
+        shape, dtype = torch.Size((*self._batch, *entry.shape)), entry.dtype
         if dtype == torch.bool:
             return Binary(shape=shape, device=self._device, dtype=dtype)
         if entry.high is None:

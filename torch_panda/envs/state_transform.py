@@ -1,5 +1,6 @@
 """A transform that carries the state of the environments through torchrl."""
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform, TransformedEnv
@@ -24,16 +25,20 @@ class StateTransform(Transform):
     exact state has: their number of actions varies.
     """
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the state to what is observed."""
+        assert isinstance(observation_spec, Composite)
         observation_spec[STATE_KEY] = self._state_spec()
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Add the state to the entries that a reset passes on."""
+        assert isinstance(input_spec, Composite)
         if input_spec["full_state_spec"] is None:
+            # `device` is annotated as what its setter accepts.
             input_spec["full_state_spec"] = Composite(
-                shape=input_spec.shape, device=input_spec.device
+                shape=input_spec.shape,
+                device=input_spec.device,  # type: ignore[arg-type]
             )
         input_spec["full_state_spec", STATE_KEY] = self._state_spec()
         return input_spec
@@ -64,6 +69,6 @@ class StateTransform(Transform):
         env = self._env()
         spec = Composite(shape=env.batch_size, device=env.device)
         for key, entry in env.episodes.state_entries().items():
-            shape = (*env.batch_size, *entry.shape)
+            shape = torch.Size((*env.batch_size, *entry.shape))
             spec[key] = Unbounded(shape, dtype=entry.dtype, device=env.device)
         return spec

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from functools import partial
 
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -63,5 +64,5 @@ def make_expert(env_id: str) -> TensorDictModule:
         # The environment clips what is beyond; who imitates it must see what it does.
         return expert(*observed).clamp(-1.0, 1.0)
 
-    keys = ["observation", "achieved_goal", "desired_goal"]
+    keys: list[NestedKey] = ["observation", "achieved_goal", "desired_goal"]
     return TensorDictModule(act, keys, ["action"])

@@ -47,7 +47,7 @@ def strike_at_random(seed: int) -> Tensor:
             )
             action = torch.where(struck, 0.0, action)
             struck = struck | strikes
-            td = env.step(td.set("action", action))["next"]
+            td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
     puck = td["achieved_goal"]
     slid = (puck - start)[:, :2]
     along = (slid * aim).sum(1, keepdim=True)

@@ -3,7 +3,7 @@
 from typing import Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -17,7 +17,7 @@ BUFFER_SIZE = 1_000_000  # transitions of one's own, as in the panda-gym paper
 SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
 MOVED = 0.01  # [m], or of a quaternion's component
 POSITION = 3  # numbers of an object's part of a goal
-STORED_KEYS = [
+STORED_KEYS: list[NestedKey] = [
     "observation",
     "desired_goal",
     "action",
@@ -105,4 +105,5 @@ def select_episodes(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase
     if keep_unmoved == 1:
         return data
     lucky = torch.rand(len(data)) < keep_unmoved
-    return data[moved(data) | lucky.to(data.device)]
+    rows = moved(data) | lucky.to(data.device)
+    return data[rows]  # type: ignore[return-value]  # a TensorDict

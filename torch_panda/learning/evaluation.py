@@ -105,8 +105,7 @@ def evaluate_in(
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         while sum(len(part.success) for part in parts) < episodes:
             rollout = env.rollout(steps, policy, break_when_any_done=False)
-            following = rollout["next"]
-            success, done = following["success"], following["done"]
+            success, done = rollout["next", "success"], rollout["next", "done"]
             # A -v3 episode ends at its first success; what follows is another one.
             first_done = done.cumsum(1).cumsum(1) == 1
             lived = done.cumsum(1) - done.long() == 0
@@ -115,7 +114,7 @@ def evaluate_in(
                     success=(success & first_done).any(1).squeeze(-1),
                     ever=(success & lived).any(1).squeeze(-1),
                     at_start=rollout["success"][:, 0].squeeze(-1),
-                    returns=(following["reward"] * lived).sum(1).squeeze(-1),
+                    returns=(rollout["next", "reward"] * lived).sum(1).squeeze(-1),
                     lengths=lived.sum(1).squeeze(-1),
                 )
             )

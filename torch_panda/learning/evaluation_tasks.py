@@ -38,7 +38,6 @@ def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
         distance = env.task.distance(start["achieved_goal"], start["desired_goal"])
         states = env.get_state()
     order = torch.argsort(distance.squeeze(-1), stable=True)
-    return {
-        name: states[order[round(quantile * (NUM_STARTS - 1))]].clone()
-        for name, quantile in QUANTILES.items()
-    }
+    chosen = {name: order[round(q * (NUM_STARTS - 1))] for name, q in QUANTILES.items()}
+    # An index into a TensorDict gives a TensorDict.
+    return {name: states[i].clone() for name, i in chosen.items()}  # type: ignore[misc]

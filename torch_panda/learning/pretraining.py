@@ -11,7 +11,7 @@ from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint
 
 def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:
     """A buffer that holds these transitions with their own goals."""
-    storage = LazyTensorStorage(len(demos), device=demos.device)
+    storage = LazyTensorStorage(len(demos), device=demos.device or "cpu")
     buffer = TensorDictReplayBuffer(storage=storage)
     buffer.extend(demos)
     return buffer

@@ -85,7 +85,7 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 there = is_held(hand, width, item) & (norm(goal - item) < 0.02)
                 there = there | waits
                 action = torch.where(waits, torch.tensor(OPEN_HAND), action)
-            td = env.step(td.set("action", action))["next"]
+            td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
         state = env.get_state().select(*PHYSICAL).set("placed", placed)
     speed = state["object_velocity"].abs().flatten(1).amax(1, keepdim=True)
     return state[(there & (speed < 0.1)).squeeze(1)]
@@ -107,6 +107,7 @@ class StartFrom(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        assert self.parent is not None
         env = self.parent.base_env
         chosen = torch.rand(*env.batch_size, 1) < self.ratio
         requested = tensordict.get("_reset", None)
@@ -114,8 +115,11 @@ class StartFrom(Transform):
             chosen &= requested.cpu()
         if not chosen.any():
             return tensordict_reset
-        state = self.states[torch.randint(len(self.states), env.batch_size)].clone()
-        placed = state.pop("placed").squeeze(-1)
+        drawn = torch.randint(len(self.states), env.batch_size)
+        state: TensorDict
+        state = self.states[drawn].clone()  # type: ignore[assignment]  # a TensorDict
+        placed: torch.Tensor = state.pop("placed")
+        placed = placed.squeeze(-1)
         if placed.any():  # the first object is where the episode's goal has it
             goal = tensordict_reset["desired_goal"].to(state["object_pose"])
             rest = goal.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goal), 4)

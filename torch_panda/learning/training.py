@@ -101,7 +101,8 @@ class Run:
             frames_per_batch=iteration,
             total_frames=-1,
             reset_at_each_iter=True,
-            exploration_type=ExplorationType.RANDOM,
+            # torchrl makes the members of this enum strings.
+            exploration_type=ExplorationType.RANDOM,  # type: ignore[arg-type]
             auto_register_policy_transforms=True,
         )
         self.curve = Curve(args.env_id, self.agent, out, device=args.device)

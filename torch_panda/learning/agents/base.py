@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -16,7 +16,7 @@ from torch_panda.learning.normalizer import Normalizer
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
-STATE_KEYS = ["observation", "desired_goal"]
+STATE_KEYS: list[NestedKey] = ["observation", "desired_goal"]
 LEARNING_RATE = 1e-3  # the panda-gym paper, for actor and critic
 TAU = 0.05  # how far a target network moves towards its network (Polyak 0.95)
 
@@ -68,8 +68,13 @@ class Agent(nn.Module, ABC):
         last: list[TensorDictModuleBase] = []
         if self.hp.fine_fingers:
             last = [TensorDictModule(from_fine, ["action"], ["action"])]
-        self.policy = TensorDictSequential(normalize, actor, *last)
-        self.explore = TensorDictSequential(normalize, actor, *noise, *last)
+        # The overloads of TensorDictSequential lack modules as arguments.
+        self.policy = TensorDictSequential(  # type: ignore[call-overload]
+            normalize, actor, *last
+        )
+        self.explore = TensorDictSequential(  # type: ignore[call-overload]
+            normalize, actor, *noise, *last
+        )
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
     def update(
@@ -129,7 +134,7 @@ class Agent(nn.Module, ABC):
         """
         rows = self._prepare(Transitions.from_tensordict(demos))
         states = dict(zip(STATE_KEYS, (rows.observation, rows.goal), strict=True))
-        normalize, actor = self.policy.module[:2]
+        normalize, actor = self.policy.module[:2]  # type: ignore[index]  # a ModuleList
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = normalize(demos.empty().update(states))
             loss = nn.functional.l1_loss(actor(td)["action"], rows.action)

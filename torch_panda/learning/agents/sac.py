@@ -1,7 +1,9 @@
 """Soft actor-critic (arXiv 1801.01290), over torchrl's loss."""
 
+from typing import Any
+
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate
@@ -52,9 +54,9 @@ class SAC(Agent):
 
     def make_loss(
         self,
-        actor: TensorDictModuleBase,
-        critic: TensorDictModuleBase,
-        **options: object,
+        actor: ProbabilisticActor,
+        critic: TensorDictModule,
+        **options: Any,  # noqa: ANN401 (options of the loss)
     ) -> LossModule:
         """The losses of actor and critics."""
         return SACLoss(actor, critic, loss_function="l2", **options)

@@ -1,6 +1,9 @@
 """Truncated quantile critics (arXiv 2005.04269), over torchrl's loss."""
 
-from tensordict.nn import TensorDictModuleBase
+from typing import Any
+
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, TQCLoss
 
 from torch_panda.learning.agents.sac import SAC
@@ -16,9 +19,9 @@ class TQC(SAC):
 
     def make_loss(
         self,
-        actor: TensorDictModuleBase,
-        critic: TensorDictModuleBase,
-        **options: object,
+        actor: ProbabilisticActor,
+        critic: TensorDictModule,
+        **options: Any,  # noqa: ANN401 (options of the loss)
     ) -> LossModule:
         """The losses of actor and critics."""
         dropped = DROPPED if self.hp.double_q else 0
