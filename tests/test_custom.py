@@ -1,4 +1,4 @@
-"""A user's own task and a user's own robot, as the README shows them."""
+"""A task and a robot that a user defines."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Whatever is given: it works, or one of the documented exceptions says what is wrong.
+"""Any argument either works or raises one of the documented exceptions.
 
 For longer: ``FUZZ_EXAMPLES=5000 pytest tests/test_fuzz.py``.
 """
@@ -69,7 +69,7 @@ def _cast(values, shape, dtype):
 
 
 def plausible(shape):
-    """Tensors that may be accepted: right shape, and finite, however extreme."""
+    """Tensors that may be accepted: of the right shape and finite, also extreme."""
     values = st.one_of(st.floats(-2, 2), st.floats(-1e6, 1e6), st.just(5e-324))
     size = int(np.prod(shape))
     return st.lists(values, min_size=size, max_size=size).map(
@@ -78,7 +78,7 @@ def plausible(shape):
 
 
 def near(shape):
-    """The right shape most of the time, else one like it."""
+    """The right shape most of the time, otherwise a similar one."""
     return st.one_of(
         st.just(shape), st.just(shape), st.just(shape[:-1]), st.just((*shape, 1))
     )

@@ -1,4 +1,4 @@
-"""The tables for who comes from elsewhere: both columns of each row are run."""
+"""Runs both columns of the tables for users of panda-gym and Fetch."""
 
 import functools
 import re
@@ -20,9 +20,9 @@ A, D = np.float32([0.1, 0.0, 0.02]), np.float32([0.0, 0.1, 0.02])
 
 def rows(title):
     section = GUIDE.read_text().split(f"## {title}")[1].split("\n## ")[0]
-    found = re.findall(r"^\| `(.+?)` \| `(.+?)` \|$", section, re.MULTILINE)
-    assert len(found) >= 7
-    return found
+    cells = re.findall(r"^\| `(.+?)` \| `(.+?)` \|$", section, re.MULTILINE)
+    assert len(cells) >= 7
+    return cells
 
 
 def run(code, env, make):
@@ -40,15 +40,15 @@ def run(code, env, make):
 
 
 def check_alike(theirs, ours, *, is_fetch):
-    """Interfaces of environments; values of what is computed."""
+    """Compare the interfaces of two environments, or the values of two results."""
     if isinstance(theirs, VecEnv | gymnasium.Env):
-        results = [play(env, 2) for env in (theirs, ours)]
+        results = [observe_types(env, 2) for env in (theirs, ours)]
         for env in (theirs, ours):
             env.close()
         first, second = results
-        if is_fetch:  # other sizes, by its own robot; success as a number
+        if is_fetch:  # another robot has other sizes, and success is a number
             first, second = (
-                {key: kind for key, (kind, _) in result.items()} for result in results
+                {key: dtype for key, (dtype, _) in result.items()} for result in results
             )
             assert (first.pop("is_success"), second.pop("is_success")) == ("f", "b")
         assert first == second
@@ -58,8 +58,8 @@ def check_alike(theirs, ours, *, is_fetch):
         np.testing.assert_allclose(np.ravel(theirs), np.ravel(ours), atol=1e-6)
 
 
-def play(env, steps):
-    """What a reset and a step give: name to type and shape."""
+def observe_types(env, steps):
+    """Types and shapes of the results of a reset and a step, by name."""
     start = env.reset()
     observation = start if isinstance(env, VecEnv) else start[0]
     result = {key: described(value) for key, value in observation.items()}
@@ -77,7 +77,7 @@ def play(env, steps):
 
 
 def described(value):
-    """Kind of number, and shape."""
+    """Kind of the dtype, and shape."""
     array = np.asarray(value)
     return array.dtype.kind, array.shape
 
@@ -91,12 +91,12 @@ def test_from_panda_gym(theirs, ours):
     options = {"render_mode": "rgb_array"}
     env = gymnasium.make("torch_panda/PandaPush-v3", **options)
     reference = make()
-    for each in (env, reference):
-        each.reset(seed=0)
+    for environment in (env, reference):
+        environment.reset(seed=0)
     results = [run(theirs, reference, make), run(ours, env, make)]
     check_alike(*results, is_fetch=False)
-    for each in (env, reference):
-        each.close()
+    for environment in (env, reference):
+        environment.close()
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -111,12 +111,12 @@ def test_from_fetch(theirs, ours):
         return gymnasium.make("FetchPush-v4")
 
     env, reference = gymnasium.make("torch_panda/PandaPush-v1"), make()
-    for each in (env, reference):
-        each.reset(seed=0)
+    for environment in (env, reference):
+        environment.reset(seed=0)
     results = [run(theirs, reference, make), run(ours, env, make)]
     check_alike(*results, is_fetch=True)
-    for each in (env, reference):
-        each.close()
+    for environment in (env, reference):
+        environment.close()
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -133,7 +133,7 @@ def test_fetch_has_the_same_clock_and_scale():
 
 
 def test_an_exact_state_goes_on():
-    """As `restore_state` is meant to."""
+    """The episode continues, as `restore_state` is meant to do."""
     env = gymnasium.make("torch_panda/PandaPush-v3")
     env.reset(seed=0)
     action = np.float32([0.3, 0.2, -1.0])

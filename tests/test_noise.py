@@ -20,14 +20,14 @@ def make(*transforms):
 
 
 class Recorded(torch_panda.Reach):
-    """Observes the action that arrived."""
+    """Rewards the sum of the action that arrives, so that a test can see it."""
 
     def reward(self, simulation, action, achieved_goal, desired_goal):
         return action.sum(1, keepdim=True)
 
 
 def arrived(*transforms, actions, reset_after=None):
-    """Sums of the actions that arrived, (steps, N)."""
+    """Sums of the actions that arrive at the environment, (steps, N)."""
     base = torch_panda.RobotTaskEnv(
         robot=torch_panda.Panda(block_gripper=True), task=Recorded(), num_envs=N
     )
@@ -36,7 +36,7 @@ def arrived(*transforms, actions, reset_after=None):
         for step, action in enumerate(actions):
             td["action"] = action
             after = env.step(td)
-            assert torch.equal(after["action"], action)  # the policy's own is kept
+            assert torch.equal(after["action"], action)  # the policy's action is stored
             sums.append(after["next", "reward"].flatten())
             td = after["next"]
             if step == reset_after:
@@ -58,10 +58,10 @@ def test_actions_arrive_late():
         torch.testing.assert_close(sums[:, env], expected)
 
 
-def test_an_environment_that_begins_anew_waits_anew():
+def test_a_reset_restarts_the_delay_of_its_environment():
     sums = arrived(ActionDelay(2), actions=numbered(), reset_after=2)
-    begun = torch.tensor([0, 0, 1, 0, 0, 4]) * 0.03
-    torch.testing.assert_close(sums[:, 0], begun)
+    after_reset = torch.tensor([0, 0, 1, 0, 0, 4]) * 0.03
+    torch.testing.assert_close(sums[:, 0], after_reset)
     torch.testing.assert_close(sums[:, 1], torch.tensor([0, 0, 1, 2, 3, 4]) * 0.03)
 
 
@@ -79,15 +79,15 @@ def test_noise_of_observations():
         check_env_specs(noisy)
         for env in (plain, noisy):
             env.set_seed(0)
-        expected, found = plain.reset(), noisy.reset()
+        expected, actual = plain.reset(), noisy.reset()
         for _ in range(20):
-            for td in (expected, found):
+            for td in (expected, actual):
                 td["action"] = torch.zeros(N, 3)
-            expected, found = plain.step(expected)["next"], noisy.step(found)["next"]
-            error = found["observation"] - expected["observation"]
+            expected, actual = plain.step(expected)["next"], noisy.step(actual)["next"]
+            error = actual["observation"] - expected["observation"]
             assert error.all() and error.abs().max() < 0.06
-            assert torch.equal(found["achieved_goal"], expected["achieved_goal"])
-            assert torch.equal(found["reward"], expected["reward"])
+            assert torch.equal(actual["achieved_goal"], expected["achieved_goal"])
+            assert torch.equal(actual["reward"], expected["reward"])
 
 
 def test_rollouts_and_pickles():

@@ -25,8 +25,8 @@ ALL = Randomization(
 ID = "PandaPickAndPlace-v1"
 
 
-def play(env, steps=25, start=None):
-    """The hand goes for the cube and pushes it."""
+def push(env, steps=25, start=None):
+    """Move the hand to the cube and push it."""
     td, seen = env.reset() if start is None else start, []
     for _ in range(steps):
         action = torch.zeros(env.action_spec.shape)
@@ -58,10 +58,10 @@ def test_parameters_are_drawn_per_environment_and_episode(loop):
 
 def test_episodes_are_reproducible_and_states_exact(loop):
     with make() as env, make(num_threads=1) as other:
-        play(env)
+        push(env)
         env.set_seed(0)
-        first = play(env)
-        assert (play(other) == first).all()
+        first = push(env)
+        assert (push(other) == first).all()
         state = env.get_state(exact=True)
         after = env.rand_step(first[-1].exclude("reward", "action"))
         again = env.reset(state[[2, 2, 2]], set_state=True)
@@ -69,15 +69,15 @@ def test_episodes_are_reproducible_and_states_exact(loop):
         assert (env.step(again)["next"] == after["next"][[2, 2, 2]]).all()
 
 
-def test_without_it_nothing_changes():
-    """What is drawn beside it, too: goals and objects are those of before."""
+def test_without_randomization_nothing_changes():
+    """Goals and objects are drawn as without randomization."""
     with make(None) as plain, make() as varied, make(Randomization()) as empty:
         start, other = plain.reset(), varied.reset()
         for key in ("desired_goal", "achieved_goal"):
             assert torch.equal(start[key], other[key])
         assert not torch.equal(start["observation"], other["observation"])
         plain.set_seed(0)
-        assert (play(plain) == play(empty)).all()
+        assert (push(plain) == push(empty)).all()
         assert set(plain.get_state().keys()) == set(empty.get_state().keys())
 
 
@@ -86,7 +86,7 @@ def test_factors_of_one_change_nothing():
         **{name: (1.0, 1.0) for name in PARAMETERS[:4]}, gravity=(1, 1)
     )
     with make(None) as plain, make(ones) as same:
-        assert (play(plain) == play(same)).all()
+        assert (push(plain) == push(same)).all()
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
@@ -97,17 +97,17 @@ def test_every_parameter_changes_what_happens(name):
         env.reset()
         state = env.get_state()
         state["object_pose"][..., 2] += 0.1
-        return play(env, start=env.reset(state, set_state=True))
+        return push(env, start=env.reset(state, set_state=True))
 
     with make(Randomization(**{name: (factor, factor)})) as env, make(None) as plain:
-        expected, found = drop(plain), drop(env)
-    assert not torch.equal(found["observation"], expected["observation"])
+        expected, actual = drop(plain), drop(env)
+    assert not torch.equal(actual["observation"], expected["observation"])
     if name == "object_restitution":
-        height = found["achieved_goal"][8:, :, 2].amax(0)
+        height = actual["achieved_goal"][8:, :, 2].amax(0)
         assert (height > expected["achieved_goal"][8:, :, 2].amax(0) + 0.005).any()
 
 
-def test_mass_is_changed_and_can_be_given():
+def test_masses_change_and_a_state_can_set_them():
     with make(Randomization(object_mass=(0.5, 2.0))) as env:
         env.reset()
         client = env.episodes.simulation.clients[1]
@@ -120,8 +120,8 @@ def test_mass_is_changed_and_can_be_given():
         assert client.mass(cube) == 0.5
         env.reset()
         assert client.mass(cube) != 0.5
-        given = torch.full((3, 1), 1.5)
-        env.reset(TensorDict({"physics_parameters": given}, [3]), set_state=True)
+        factors = torch.full((3, 1), 1.5)
+        env.reset(TensorDict({"physics_parameters": factors}, [3]), set_state=True)
         assert client.mass(cube) == 3.0
 
 
@@ -161,7 +161,7 @@ def test_joint_positions_start_around_neutral():
 
 
 @pytest.mark.parametrize("env_id", ["PandaReach-v1", "PandaStack-v3"])
-def test_any_task_takes_it(env_id):
+def test_every_task_can_be_randomized(env_id):
     with torch_panda.make(env_id, randomize=ALL) as env:
         assert env.reset()["physics_parameters"].shape == (len(PARAMETERS),)
 
@@ -184,14 +184,14 @@ def test_bad_ranges(options):
 
 @pytest.mark.slow
 def test_a_reset_costs_at_most_a_third_more(capsys):
-    """CPU time of the fastest resets, with and without in turn."""
+    """CPU time of the fastest resets, with and without randomization in turn."""
     options = {"num_envs": 1, "num_threads": 1}
     with make(**options) as env, make(None, **options) as plain:
         seconds = {plain: [], env: []}
-        for each in (plain, env) * 300:
+        for timed in (plain, env) * 300:
             start = time.process_time()
-            each.episodes.reset()
-            seconds[each].append(time.process_time() - start)
+            timed.episodes.reset()
+            seconds[timed].append(time.process_time() - start)
     ratio = min(seconds[env]) / min(seconds[plain])
     with capsys.disabled():
         print(f"a randomised reset takes {ratio:.2f} times a plain one")

@@ -1,4 +1,4 @@
-"""Endurance: nothing crashes, grows, or is left behind.
+"""Long runs do not crash, leak memory, or leave threads and files behind.
 
 A short version runs with all tests; on demand, for hours, the real one:
 ``pytest -m soak -s tests/test_soak.py``, scaled by ``SOAK_STEPS`` and ``SOAK_CYCLES``.
@@ -35,7 +35,7 @@ IDS = (
 
 
 def memory():
-    """Memory of this process that is its own [MB]."""
+    """Memory that this process shares with no other [MB]."""
     with open("/proc/self/status") as status:
         (line,) = (line for line in status if line.startswith("RssAnon"))
     return int(line.split()[1]) / 1024
@@ -68,7 +68,7 @@ def random_state(env, rng):
 
 
 def random_step(env, td, rng):
-    """A step, and often a reset of some environments: to a state, or as they like."""
+    """A step, and often a reset of some environments, to a state or a new episode."""
     scale = rng.choice([0.3, 1.0, 1e30], p=[0.3, 0.6, 0.1])
     shape = env.action_spec.shape
     action = rng.uniform(-1, 1, shape) * scale

@@ -1,4 +1,4 @@
-"""What spawned workers build: batched environments that report on their threads."""
+"""Environments for spawned workers, which report their numbers of threads."""
 
 import functools
 
@@ -8,11 +8,11 @@ from torchrl.envs import Transform, TransformedEnv
 
 import torch_panda
 
-NUM_ENVS = 2  # of each worker
+NUM_ENVS = 2  # per worker
 
 
 class ReportThreads(Transform):
-    """Adds how many threads step the environments, and how many torch has."""
+    """Adds the number of threads that step the environments, and that of torch."""
 
     def _report(self, tensordict):
         stepping = self.parent.base_env.num_threads

@@ -1,4 +1,4 @@
-"""Records episodes of panda-gym 1.1.0, against which -v1 is tested.
+"""Records the episodes of panda-gym 1.1.0 that the tests compare -v1 with.
 
     pip download --no-deps panda-gym==1.1.0
     unzip panda_gym-1.1.0-py3-none-any.whl -d FOLDER
@@ -27,7 +27,7 @@ class _Box:
 
 
 def stub_gym():
-    """What panda-gym 1.1.0 imports from gym."""
+    """The part of gym that panda-gym 1.1.0 imports."""
 
     def module(name, **content):
         sys.modules[name] = ModuleType(name)
@@ -59,7 +59,7 @@ def choose_action(task, observation, item, rng):
     ee, width = observation[:3], observation[6]
     offset = observation[7 + 12 * item :][:3] - ee
     near = np.abs(offset).max() < 0.015
-    if near and width < 0.045:  # held: carry it about, and let go at times
+    if near and width < 0.045:  # grasped: carry it around, and let go at times
         grip = 1.0 if rng.random() < 0.05 else -1.0
         return np.append(noise[:3] * 0.5 + (0.0, 0.0, 0.5), grip)
     over = np.linalg.norm(offset[:2]) > 0.012
@@ -68,7 +68,7 @@ def choose_action(task, observation, item, rng):
 
 
 def record(task, make, seed):
-    """One episode of a fresh environment, as arrays."""
+    """One episode of a new environment, as arrays."""
     env = make()
     env.seed(seed)
     observed = env.reset()

@@ -1,4 +1,4 @@
-"""What an environment is made of: each mistake is one clear error."""
+"""A mistake in a robot, a task, a scene or a state raises one clear error."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ def make(task, robot=None, **options):
     return RobotTaskEnv(robot=robot or Panda(block_gripper=True), task=task, **options)
 
 
-# ---- kinds -------------------------------------------------------------------
+# ---- robot, task, sensors ------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def make(task, robot=None, **options):
         (Panda(), None, "task must be an instance of Task, got None"),
     ],
 )
-def test_robot_and_task(robot, task, message):
+def test_robot_and_task_have_the_right_type(robot, task, message):
     with pytest.raises(TypeError, match=message):
         RobotTaskEnv(robot=robot, task=task)
 
@@ -102,7 +102,7 @@ def test_pictures_show_the_scene_of_the_simulation():
 
 
 class Markers(Reach):
-    """Two markers, unless a test says otherwise, for one position."""
+    """Two markers by default, but a goal of one position."""
 
     count = 2
 
@@ -158,7 +158,7 @@ def task_with(name, function):
         ),
     ],
 )
-def test_functions_of_a_task(name, function, error, message):
+def test_a_function_of_a_task_returns_a_wrong_tensor(name, function, error, message):
     with pytest.raises(error, match=message):
         make(task_with(name, function), num_envs=2)
 
@@ -167,13 +167,13 @@ def test_functions_of_a_task(name, function, error, message):
     "key",
     ["joint_position", "physics_seed", "actions", "success", "next", "_reset", "_step"],
 )
-def test_names_that_mean_something_else(key):
+def test_reserved_names_are_refused(key):
     task = task_with("extra_observation", lambda s, sim: {key: sim.joint_position})
     with pytest.raises(ValueError, match=rf"\['{key}'\] are the environment's own"):
         make(task)
 
 
-def test_names_of_observations_are_text():
+def test_keys_of_observations_are_strings():
     task = task_with("extra_observation", lambda s, sim: {("a", "b"): sim.ee_position})
     with pytest.raises(ValueError, match=r"must be text, got \('a', 'b'\)"):
         make(task)
@@ -222,7 +222,7 @@ def env():
         yield env
 
 
-def test_a_state_is_started_from_without_being_told(env):
+def test_a_reset_starts_from_a_state_without_set_state(env):
     state = env.get_state()
     expected = env.reset(state, set_state=True)
     env.reset()
@@ -239,7 +239,7 @@ def test_set_state_false_starts_an_episode(env):
     assert not env.get_state()["step_count"].any()
 
 
-def test_what_was_observed_is_no_state(env):
+def test_observations_are_not_taken_for_a_state(env):
     td = env.rollout(3)[:, -1]["next"].exclude("reward")
     td["step_count"] = torch.full((2, 1), 3)  # of torchrl's StepCounter
     goal = td["desired_goal"].clone()
@@ -248,7 +248,7 @@ def test_what_was_observed_is_no_state(env):
     assert not env.get_state()["step_count"].any()
 
 
-def test_a_state_among_observations_needs_a_word(env):
+def test_a_state_beside_observations_needs_set_state(env):
     td = env.reset(env.get_state(), set_state=True)
     assert "object_pose" in td
     with pytest.raises(ValueError, match="say set_state=True"):
@@ -287,7 +287,7 @@ def test_an_empty_task():
 
 
 def task_that_fails(name, function, step):
-    """A Reach whose function returns other numbers from a step on."""
+    """A Reach one of whose functions returns wrong numbers after some steps."""
     calls = {"n": 0}
 
     def broken(self, *args):

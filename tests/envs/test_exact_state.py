@@ -1,4 +1,4 @@
-"""An exact state: episodes go on from it bit for bit."""
+"""After a reset to an exact state, episodes continue bit for bit."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def actions_of(env_id, observation, rngs, size):
     return torch.from_numpy(np.stack(actions))
 
 
-def play(env, td, env_id, rngs, steps):
+def act(env, td, env_id, rngs, steps):
     size = env.action_spec.shape[-1]
     for _ in range(steps):
         action = actions_of(env_id, td["observation"], rngs, size)
@@ -39,19 +39,19 @@ def follow(env, td, actions):
     ["PandaPush-v1", "PandaSlideJoints-v3", "PandaPickAndPlace-v1", "PandaStack-v3"],
 )
 def test_goes_on_bit_for_bit(env_id):
-    """Through hard contacts, from different times in different environments."""
+    """With hard contacts, and different numbers of steps per environment."""
     rngs = [np.random.default_rng(k) for k in range(NUM_ENVS)]
     with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=2, seed=1) as env:
-        td = play(env, env.reset(), env_id, rngs, 12)
+        td = act(env, env.reset(), env_id, rngs, 12)
         half = torch.tensor([[True], [False]] * (NUM_ENVS // 2))
-        td = play(env, env.reset(td.set("_reset", half)), env_id, rngs, 9)
+        td = act(env, env.reset(td.set("_reset", half)), env_id, rngs, 9)
         state = env.get_state(exact=True)
         assert state["num_actions"].flatten().tolist() == [9, 21] * (NUM_ENVS // 2)
         generator = torch.Generator().manual_seed(0)
         shape = (20, *env.action_spec.shape)
         actions = torch.randn(shape, generator=generator).clamp(-1, 1)
         expected = follow(env, td.clone(), actions)
-        play(env, env.reset(), env_id, rngs, 5)
+        act(env, env.reset(), env_id, rngs, 5)
         again = env.reset(state, set_state=True)
         for key in ("observation", "achieved_goal", "desired_goal", "success"):
             assert torch.equal(again[key], td[key]), key
@@ -72,8 +72,8 @@ def test_without_actions_and_unbatched():
         expected = env.step(first.clone().set("action", action))["next"]
         later = env.get_state(exact=True)
         again = env.reset(state, set_state=True)
-        found = env.step(again.set("action", action))["next"]
-        assert (found == expected).all()
+        actual = env.step(again.set("action", action))["next"]
+        assert (actual == expected).all()
         # Sensors say what they said, not that no time has passed.
         again = env.reset(later, set_state=True)
         assert torch.equal(again["joint_torque"], expected["joint_torque"])
@@ -106,9 +106,9 @@ def test_gymnasium_passes_it_on():
     state = env.torch_env.get_state(exact=True)
     expected = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
     env.reset(options={"state": {key: x.numpy() for key, x in state.items()}})
-    found = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
+    actual = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
     env.close()
-    np.testing.assert_array_equal(expected, found)
+    np.testing.assert_array_equal(expected, actual)
 
 
 @pytest.mark.parametrize(

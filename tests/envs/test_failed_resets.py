@@ -1,4 +1,4 @@
-"""After a reset that fails there is no episode, until another one does not."""
+"""After a reset that failed, its environments need another reset."""
 
 import pytest
 import torch
@@ -72,7 +72,7 @@ def make_driven():
 
 
 def fail_and_diverge(env):
-    """A step in which the first environment's motor fails, and the second diverges."""
+    """A step in which a motor of environment 0 fails and environment 1 diverges."""
     simulation = env.episodes.simulation
     scene = simulation.scene
     env.robot.broken = simulation.clients[0]
@@ -92,19 +92,19 @@ def test_a_reset_of_others_leaves_a_divergence_to_be_found():
 
 
 def test_divergence_beside_another_failure():
-    """The next reset cures what the error did not tell of."""
+    """The next reset rebuilds the client that the error did not name."""
     with make_driven() as env, make_driven() as fresh:
         env.reset(), fresh.reset()
         fail_and_diverge(env)
         actions = torch.ones(2, 3)
-        found = [
+        actual = [
             e.step(e.reset().set("action", actions))["next", "observation"]
             for e in (env, fresh)
         ]
-        assert torch.equal(*found)
+        assert torch.equal(*actual)
 
 
-def test_what_diverges_is_no_success_of_the_next_episode():
+def test_a_diverged_step_is_no_success_of_the_next_episode():
     options = {"seed": 0, "on_divergence": "reset"}
     solved = 0
     with torch_panda.make("PandaPush-v3", **options) as env:

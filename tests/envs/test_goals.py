@@ -34,7 +34,7 @@ def test_goal_indices_are_the_achieved_goal_of_every_id(env_id):
 
 
 class Undeclared(Push):
-    """Observes something else than its base class, and declares nothing anew."""
+    """Overrides `observation` without declaring ``goal_entries`` anew."""
 
     def observation(self, simulation):
         return super().observation(simulation).flip(1)
@@ -221,8 +221,8 @@ def test_tasks_without_entries_refuse_it():
         make(goal="pixels")
 
 
-class TwoPoints(Push):
-    """Its goal is one position, but it has two objects."""
+class TwoObjects(Push):
+    """Has two objects, but a goal of one position."""
 
     observation_dim = 24
     goal_entries = GoalEntries("task", (0, 1, 2))
@@ -245,8 +245,8 @@ class TwoPoints(Push):
 
 def test_a_task_of_another_form_says_where_its_objects_are():
     with (
-        RobotTaskEnv(robot=Panda(), task=TwoPoints(), goal="observation") as env,
-        pytest.raises(NotImplementedError, match=r"TwoPoints\.objects_at_goal"),
+        RobotTaskEnv(robot=Panda(), task=TwoObjects(), goal="observation") as env,
+        pytest.raises(NotImplementedError, match=r"TwoObjects\.objects_at_goal"),
     ):
         env.reset()
 

@@ -1,4 +1,4 @@
-"""Hard-contact episodes are the same whatever the client did before.
+"""Episodes with hard contacts do not depend on earlier episodes.
 
 The arm is sent at the objects, often out of range, and presses on the table: then the
 order in which Bullet solves contacts shows. `test_history_changes_nothing` covers every
@@ -18,7 +18,7 @@ STEPS = 60
 HISTORY = (41, 50, 57)
 
 
-def play(env, td, actions):
+def act(env, td, actions):
     observations = []
     for action in actions:
         td = env.step(td.set("action", action))["next"]
@@ -27,7 +27,7 @@ def play(env, td, actions):
 
 
 def count_differences(env_id, episodes):
-    """How many episodes other ones change, after one other episode or after three."""
+    """Number of episodes that differ after one, or after three, other episodes."""
     with torch_panda.make(env_id, num_envs=episodes, seed=1) as env:
         td, actions, first = env.reset(), [], []
         state = env.get_state()
@@ -42,10 +42,10 @@ def count_differences(env_id, episodes):
             actions.append(torch.from_numpy(np.stack(rows)))
             td = env.step(td.set("action", actions[-1]))["next"]
             first.append(td["observation"])
-        again = play(env, env.reset(state.clone(), set_state=True), actions)
+        again = act(env, env.reset(state.clone(), set_state=True), actions)
         for steps in HISTORY:
-            play(env, env.reset(), [a.roll(7, 0) for a in actions[:steps]])
-        later = play(env, env.reset(state.clone(), set_state=True), actions)
+            act(env, env.reset(), [a.roll(7, 0) for a in actions[:steps]])
+        later = act(env, env.reset(state.clone(), set_state=True), actions)
     first = torch.stack(first, dim=1)
     differ = (first != again) | (first != later)
     return int(differ.flatten(1).any(dim=1).sum())

@@ -1,4 +1,4 @@
-"""Copies, resumed runs, and what is left of an environment that is forgotten."""
+"""Pickles, resumed runs, and forgotten environments."""
 
 import gc
 import pickle
@@ -22,7 +22,7 @@ def no_collection():
 
 
 def test_a_rebound_environment_is_gone_at_once(no_collection):
-    """Without the garbage collector: there is no cycle of references."""
+    """Without the garbage collector, because no cycle of references exists."""
     env = torch_panda.make(
         "PandaPush-v1",
         num_envs=2,
@@ -41,7 +41,7 @@ def test_a_rebound_environment_is_gone_at_once(no_collection):
 
 
 class PushHarder(torch_panda.RobotTaskEnv):
-    """A subclass with arguments of its own."""
+    """A subclass with further arguments."""
 
     def __init__(self, friction, *, limit=7, **options):
         super().__init__(
@@ -139,8 +139,8 @@ def test_a_resumed_collector_goes_on():
     second.env.load_state_dict(first.env.state_dict())
     for collector in (first, second):
         collector.reset()
-    expected, found = next(iter(first)), next(iter(second))
-    assert torch.equal(goals(expected), goals(found))
+    expected, actual = next(iter(first)), next(iter(second))
+    assert torch.equal(goals(expected), goals(actual))
     first.shutdown()
     second.shutdown()
 
@@ -154,8 +154,8 @@ def test_batched_environments_are_resumed():
     first.reset()
     state = first.state_dict()
     second.load_state_dict(state)
-    expected, found = first.reset(), second.reset()
-    assert torch.equal(expected["desired_goal"], found["desired_goal"])
+    expected, actual = first.reset(), second.reset()
+    assert torch.equal(expected["desired_goal"], actual["desired_goal"])
     first.close()
     second.close()
 

@@ -22,7 +22,7 @@ def kill(process):
 
 
 def check_threads(data):
-    """Each worker has the stepping threads it was given, and one torch thread."""
+    """Each worker has the given number of stepping threads, and one torch thread."""
     assert (data["next", "threads"] == torch.tensor([2, 1])).all()
 
 
@@ -54,14 +54,14 @@ def test_parallel_env():
 
 
 @pytest.mark.parametrize(
-    "kind",
+    "collector_class",
     [MultiSyncCollector, pytest.param(MultiAsyncCollector, marks=pytest.mark.slow)],
 )
-def test_collectors(kind):
+def test_collectors(collector_class):
     frames = 2 * NUM_ENVS * STEPS
     expected = first_goals(seed=0, num_workers=2)
     assert len(expected) == 2 * NUM_ENVS
-    collector = kind(
+    collector = collector_class(
         [make_env, make_env],
         go_for_the_goal,
         frames_per_batch=frames,
@@ -85,7 +85,7 @@ def test_collectors(kind):
 
 
 def first_goals(seed, num_workers):
-    """What the workers of a seed draw first: here in one process, one by one."""
+    """The first goals of the workers under a seed, drawn in this process."""
     drawn = set()
     for _ in range(num_workers):
         collector = Collector(

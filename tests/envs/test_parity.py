@@ -26,7 +26,7 @@ KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
 def choose_action(env_id, observation, rng, size):
-    """Random, or towards the object and down to it; often out of range."""
+    """Random actions, or actions towards the object; often out of range."""
     action = rng.normal(size=size) * 1.5
     if "Joints" in env_id:
         # Bend down onto the table.
@@ -47,7 +47,7 @@ def had_contact(reference):
 
 
 def make_v1(task, **options):
-    """The -v1 id; Slide, of which the paper has other goals, with those of 1.1.0."""
+    """The -v1 environment; Slide with the goals of 1.1.0, which are not the paper's."""
     if task != "Slide":
         return torch_panda.make(f"Panda{task}-v1", **options)
     return torch_panda.RobotTaskEnv(
@@ -102,7 +102,7 @@ def test_v1_equals_panda_gym_1_1_0(task):
 
 
 def dense_reward(reference):
-    """What panda-gym's id with dense rewards would give now."""
+    """The reward of panda-gym's id with dense rewards in the present state."""
     task = reference.task
     before, task.reward_type = task.reward_type, "dense"
     reward = task.compute_reward(task.get_achieved_goal(), task.get_goal(), {})

@@ -1,4 +1,4 @@
-"""The environment's contract beyond single ids."""
+"""The contract of `RobotTaskEnv` that does not depend on the id."""
 
 import gc
 import io
@@ -19,7 +19,7 @@ from torch_panda.bullet.solver import activate
 
 
 def push_towards(td, generator):
-    """Actions that go for the object: contact-rich."""
+    """Actions towards the object, so that contacts are frequent."""
     towards = (td["achieved_goal"] - td["observation"][..., :3]) * 20
     noise = torch.randn(towards.shape, generator=generator) * 0.3
     return towards + noise
@@ -86,7 +86,7 @@ def test_only_environments_that_exist_are_seeded(env, index):
         env.set_env_seed(index, 0)
 
 
-def test_across_processes():
+def test_episodes_are_the_same_in_every_process():
     code = (
         "import torch, torch_panda; torch.manual_seed(0);"
         "env = torch_panda.make('PandaPush-v1', num_envs=2, seed=3);"
@@ -116,10 +116,10 @@ def test_a_pickle_keeps_the_last_seed(env):
         assert torch.equal(env.reset()["desired_goal"], copy.reset()["desired_goal"])
 
 
-@pytest.mark.parametrize("kind", [np.int64, torch.tensor])
-def test_a_state_dict_holds_plain_numbers(kind):
+@pytest.mark.parametrize("integer_type", [np.int64, torch.tensor])
+def test_a_state_dict_holds_plain_numbers(integer_type):
     file = io.BytesIO()
-    with torch_panda.make("PandaReach-v1", seed=kind(5)) as env:
+    with torch_panda.make("PandaReach-v1", seed=integer_type(5)) as env:
         torch.save(env.state_dict(), file)
         file.seek(0)
         env.load_state_dict(torch.load(file, weights_only=True))
@@ -139,10 +139,10 @@ def test_default_dtype_and_device_change_nothing():
     expected = observe()
     torch.set_default_dtype(torch.float64)
     try:
-        found = observe()
+        actual = observe()
     finally:
         torch.set_default_dtype(torch.float32)
-    for before, after in zip(expected, found, strict=True):
+    for before, after in zip(expected, actual, strict=True):
         for key in set(before.keys()):
             assert before[key].dtype == after[key].dtype, key
             assert torch.equal(before[key], after[key]), key
@@ -162,7 +162,7 @@ def test_default_seeds_differ():
 # ---- resets and states -------------------------------------------------------
 
 
-def test_nothing_but_a_reset_comes_first(env):
+def test_the_first_call_must_be_a_reset(env):
     action = TensorDict({"action": torch.zeros(3, 3)}, batch_size=[3])
     with pytest.raises(torch_panda.BulletError, match="never reset"):
         env.step(action)
@@ -208,7 +208,7 @@ def test_partial_step_leaves_the_others_alone(env):
 
 @pytest.mark.parametrize("num_envs", [None, 3])
 def test_a_step_is_torchrls_step(num_envs):
-    """Also where it leaves out torchrl's checks of what `_step` returns."""
+    """Also where it skips torchrl's checks of the result of `_step`."""
     steps = []
     for step in (torch_panda.RobotTaskEnv.step, EnvBase.step):
         with torch_panda.make("PandaPush-v1", num_envs=num_envs, seed=0) as env:
@@ -220,11 +220,11 @@ def test_a_step_is_torchrls_step(num_envs):
             steps.append((stepped, again))
     for ours, theirs in zip(*steps, strict=True):
         assert ours.batch_size == theirs.batch_size
-        found, expected = ours["next"], theirs["next"]
-        assert set(found.keys()) == set(expected.keys())
+        actual, expected = ours["next"], theirs["next"]
+        assert set(actual.keys()) == set(expected.keys())
         for key, value in expected.items():
-            assert found[key].dtype == value.dtype
-            assert torch.equal(found[key], value)
+            assert actual[key].dtype == value.dtype
+            assert torch.equal(actual[key], value)
 
 
 def test_a_rollout_is_torchrls_rollout(env):
@@ -261,10 +261,10 @@ def test_state_round_trip_keeps_float64(env):
 
 def test_partial_state_leaves_the_rest_neutral_or_sampled(env):
     pose = torch.tensor([0.1, 0.0, 0.02, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    given = TensorDict({"object_pose": pose.expand(3, 1, 7)}, batch_size=[3])
-    td = env.reset(given, set_state=True)
+    partial_state = TensorDict({"object_pose": pose.expand(3, 1, 7)}, batch_size=[3])
+    td = env.reset(partial_state, set_state=True)
     state = env.get_state()
-    assert torch.equal(state["object_pose"], given["object_pose"])
+    assert torch.equal(state["object_pose"], partial_state["object_pose"])
     neutral = torch.tensor(env.robot.neutral_joint_position, dtype=torch.float64)
     assert torch.equal(state["joint_position"], neutral.expand(3, 9))
     assert not state["object_velocity"].any()

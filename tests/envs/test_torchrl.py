@@ -1,4 +1,4 @@
-"""torchrl's own transforms, batched environments and collectors, as they stand."""
+"""torchrl's own transforms, batched environments and collectors work."""
 
 import functools
 
@@ -146,14 +146,14 @@ def test_a_state_transform_wraps_one_environment():
 
 
 def test_workers_of_one_seed_repeat_each_other():
-    """So each worker needs a seed of its own, as the docstring of ``seed`` says."""
+    """Each worker needs its own seed, as the docstring of ``seed`` says."""
     goals = [make_env(seed=seed).reset()["desired_goal"] for seed in (0, 0, 1)]
     assert torch.equal(goals[0], goals[1])
     assert not torch.isin(goals[2], goals[0]).any()
 
 
 def test_batched_environments():
-    """In one process; `test_multi_process` compares it with a ParallelEnv."""
+    """A SerialEnv. `test_multi_process` compares it with a ParallelEnv."""
     env = SerialEnv(2, make_env)
     env.set_seed(0)
     rollout = env.rollout(5)
@@ -176,7 +176,7 @@ def test_collector():
 
 
 def test_multi_process_collector():
-    """The asynchronous one; `test_multi_process` has the other."""
+    """The asynchronous collector. `test_multi_process` tests the synchronous one."""
     collector = MultiAsyncCollector(
         [make_env, make_env],
         RandomPolicy(make_env().action_spec),

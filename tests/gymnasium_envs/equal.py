@@ -1,4 +1,4 @@
-"""Exact comparison of what Gymnasium's environments return."""
+"""Compares the returned values of Gymnasium environments exactly."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""One environment: Gymnasium's contract, and the torch environment's episodes."""
+"""`GoalEnv` keeps Gymnasium's contract and has the episodes of `RobotTaskEnv`."""
 
 import gymnasium
 import numpy as np
@@ -200,14 +200,14 @@ def test_step_agrees_with_the_goal_functions(env):
 
 def test_own_task():
     task = torch_panda.Reach(distance_threshold=0.2)
-    own = torch_panda.RobotTaskEnv(
+    torch_env = torch_panda.RobotTaskEnv(
         robot=torch_panda.Panda(block_gripper=True), task=task, max_episode_steps=4
     )
-    env = GoalEnv(own)
+    env = GoalEnv(torch_env)
     env.reset(seed=0)
     assert [env.step(np.zeros(3))[3] for _ in range(4)] == [False] * 3 + [True]
     env.close()
-    assert own.is_closed
+    assert torch_env.is_closed
     with (
         torch_panda.make("PandaReach-v1", num_envs=2) as batched,
         pytest.raises(ValueError, match=r"must be \[\], got \[2\]"),

@@ -1,4 +1,4 @@
-"""The vector environment gives what SyncVectorEnv gives."""
+"""`GoalVectorEnv` returns the same values as SyncVectorEnv."""
 
 import gc
 import itertools
@@ -22,7 +22,7 @@ CASES = [("PandaReach-v3", None), ("PandaPushDense-v1", 7)]
 
 
 def make_pair(env_id, mode, limit):
-    """Our vector environment, and Gymnasium's over single environments."""
+    """`GoalVectorEnv`, and SyncVectorEnv over single environments."""
     env_id = f"torch_panda/{env_id}"
     limits = {} if limit is None else {"max_episode_steps": limit}
     ours = gymnasium.make_vec(
@@ -37,7 +37,7 @@ def make_pair(env_id, mode, limit):
 
 
 def act(observation, rng):
-    """Go for the goal, each environment at its own speed."""
+    """Move towards the goal, with another speed in each environment."""
     towards = observation["desired_goal"] - observation["achieved_goal"]
     noise = rng.uniform(-0.3, 0.3, towards.shape)
     speed = np.array([[8.0], [3.0], [5.0]])

@@ -1,4 +1,4 @@
-"""Render modes, and panda-gym's names for the camera."""
+"""Render modes, and the camera arguments of panda-gym."""
 
 import gymnasium
 import numpy as np
@@ -23,9 +23,9 @@ VIEW = {
 
 @pytest.mark.parametrize("mode", ["human", "ansi", "depth"])
 def test_unknown_modes(mode):
-    for kind in (GoalEnv, GoalVectorEnv):
+    for env_class in (GoalEnv, GoalVectorEnv):
         with pytest.raises(ValueError, match=r"render_mode must be None or one of"):
-            kind("PandaReach-v1", render_mode=mode)
+            env_class("PandaReach-v1", render_mode=mode)
     with pytest.raises(ValueError, match="render_mode must be None or one of"):
         gymnasium.make_vec("torch_panda/PandaReach-v1", num_envs=2, render_mode=mode)
 
@@ -33,8 +33,8 @@ def test_unknown_modes(mode):
 @pytest.mark.parametrize("substeps", [20, 10])
 def test_videos_are_as_fast_as_the_simulation(substeps):
     physics = torch_panda.PhysicsParams(n_substeps=substeps)
-    for kind in (GoalEnv, GoalVectorEnv, SB3VecEnv):
-        env = kind("PandaReach-v1", physics=physics, render_mode="rgb_array")
+    for env_class in (GoalEnv, GoalVectorEnv, SB3VecEnv):
+        env = env_class("PandaReach-v1", physics=physics, render_mode="rgb_array")
         env.close()
         assert env.metadata["render_fps"] == 500 / substeps
         assert env.metadata["render_modes"] == ["rgb_array"]
@@ -42,7 +42,7 @@ def test_videos_are_as_fast_as_the_simulation(substeps):
 
 
 def test_the_view_of_panda_gym():
-    """Pixels outside of the translucent target are panda-gym's."""
+    """Outside the translucent target, the pixels equal panda-gym's."""
     ours = gymnasium.make("torch_panda/PandaReach-v3", render_mode="rgb_array", **VIEW)
     theirs = gymnasium.make(
         "PandaReach-v3", render_mode="rgb_array", renderer="Tiny", **VIEW

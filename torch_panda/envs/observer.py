@@ -156,12 +156,12 @@ class EpisodeObserver:
 
     def _ends(self, success: Tensor, step_count: Tensor) -> Observed:
         """``terminated``, ``truncated`` and ``done``, (n, 1) bool."""
-        has_stepped = step_count > 0  # a start does not end an episode
         terminated = torch.zeros_like(success)
         if self._terminate_on_success:
-            terminated = success & has_stepped
+            terminated = success & (step_count > 0)  # a start does not end an episode
         if self._has_failure:
-            terminated = terminated | self._task.failure(self._simulation) & has_stepped
+            failure = self._task.failure(self._simulation)
+            terminated = terminated | failure & (step_count > 0)
         truncated = step_count >= self._max_episode_steps
         return {
             "terminated": terminated,

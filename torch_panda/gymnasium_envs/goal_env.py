@@ -125,8 +125,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _info(observed: Observed) -> dict[str, Any]:
-    # An array of shape (), as in panda-gym: torchrl's readers of infos need a dtype, and
-    # Gymnasium's vector environments join arrays, but not numpy's scalars.
+    # An array of shape (), as in panda-gym. torchrl's readers of infos need a dtype,
+    # and Gymnasium's vector environments join arrays, but not numpy's scalars.
     return {"is_success": np.array(observed["success"].item())}
 
 
