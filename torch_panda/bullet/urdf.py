@@ -33,11 +33,11 @@ _SCRATCH_LOCK = threading.Lock()
 
 
 class Tool(NamedTuple):
-    """A massless link that a robot's URDF lacks: the point between its fingers, say.
+    """A massless link to add to a URDF, for example the point between two fingers.
 
     Attributes:
-        link: the name of the link that it is fixed to.
-        position: in the frame of that link [m].
+        link: Name of the link to which the tool is fixed.
+        position: Position in the frame of that link [m].
     """
 
     link: str
@@ -45,10 +45,13 @@ class Tool(NamedTuple):
 
 
 def find_urdf(path: str | Path) -> str:
-    """A URDF file by its path, or by its place among those pybullet ships.
+    """Absolute path of a URDF file.
+
+    Args:
+        path: Path of the file, or its path among the files that pybullet ships.
 
     Raises:
-        FileNotFoundError: there is no such file in either place.
+        FileNotFoundError: the file is in neither place.
     """
     spec = importlib.util.find_spec("pybullet_data")
     assert spec is not None and spec.origin is not None  # part of pybullet's wheel
@@ -214,9 +217,9 @@ def _scratch() -> tempfile.TemporaryDirectory[str]:
 
 
 def make_scratch_folder() -> Path:
-    """A new folder, for URDFs and what they need, that lives until the process ends."""
-    # Without it each of several threads would make a directory, of which the cache
-    # keeps one: the others are removed at once.
+    """A new folder for URDFs and meshes, which is deleted when the process ends."""
+    # Without the lock, several threads could make a directory each. The cache would
+    # keep one of them, and Python would delete the others at once.
     with _SCRATCH_LOCK:
         return Path(tempfile.mkdtemp(dir=_scratch().name))
 

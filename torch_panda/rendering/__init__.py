@@ -1,4 +1,4 @@
-"""Pictures of environments: cameras, renderers, and a window."""
+"""Pictures of environments: cameras, renderers and a window."""
 
 from torch_panda.rendering.camera import Camera, HandCamera
 from torch_panda.rendering.egl import RendererName, check_renderer

@@ -1,4 +1,4 @@
-"""A camera, and the distances that it sees."""
+"""Cameras: where they are and what they see."""
 
 import dataclasses
 import operator
@@ -10,27 +10,27 @@ import numpy.typing as npt
 
 from torch_panda.rotations import rotate_vector
 
-# The depth of a pixel in which nothing is seen, up to rounding.
+# Depth of the background, up to rounding.
 _BACKGROUND_DEPTH = np.float32(1 - 1e-6)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; the defaults are panda-gym's.
+    """A pinhole camera. The defaults are panda-gym's.
 
     Attributes:
-        target: the point it looks at, world frame [m].
-        distance: from there [m].
-        yaw: its direction, about the world's z axis [degrees].
-        pitch: above the horizon, so a negative one looks down [degrees].
-        roll: about the line of sight [degrees].
-        fov: vertical angle of view [degrees].
-        width: of the image [pixels].
-        height: of the image [pixels].
-        near: nothing closer along the line of sight is seen [m].
-        far: nor anything farther [m].
-        shadows: whether bodies cast shadows. Bullet's software renderer then draws the
-            scene twice: without them a picture takes half the time.
+        target: Point at which the camera looks, world frame [m].
+        distance: Distance of the camera from the target [m].
+        yaw: Direction of the view about the world's z axis [degrees].
+        pitch: Elevation of the view; negative looks down [degrees].
+        roll: Rotation about the line of sight [degrees].
+        fov: Vertical angle of view [degrees].
+        width: Width of the image [pixels].
+        height: Height of the image [pixels].
+        near: Minimum distance along the line of sight of anything visible [m].
+        far: Maximum distance along the line of sight of anything visible [m].
+        shadows: Whether bodies cast shadows. Bullet's software renderer draws the scene
+            twice for them, so a picture without shadows takes half the time.
 
     Raises:
         ValueError: a size, a distance or an angle is out of range.
@@ -65,20 +65,22 @@ class Camera:
 
 @dataclass(frozen=True)
 class HandCamera(Camera):
-    """A camera that moves with the end-effector, in whose frame it is described.
+    """A camera that moves with the end-effector.
 
-    The Panda's frame lies between its fingertips, with z pointing out of the hand and y
-    from finger to finger; the defaults look past both fingers.
+    Its position and direction are given in the frame of the end-effector. The Panda's
+    frame lies between its fingertips, with z pointing out of the hand and y from finger
+    to finger. By default the camera looks past both fingers.
 
     Attributes:
-        eye: where it is [m].
-        target: the point it looks at [m].
-        up: the direction that is up in the picture.
-        distance: from eye to target, whatever is given; ``yaw``, ``pitch`` and ``roll``
-            are not used.
+        eye: Position of the camera [m].
+        target: Point at which the camera looks [m].
+        up: Direction that is up in the picture.
+        distance: Distance from eye to target, computed from them. ``yaw``, ``pitch``
+            and ``roll`` are not used.
 
     Raises:
-        ValueError: up is the line of sight; or as for `Camera`.
+        ValueError: ``up`` is parallel to the line of sight, or an argument of `Camera`
+            is out of range.
     """
 
     eye: tuple[float, float, float] = (0.08, 0.0, -0.12)
@@ -92,8 +94,8 @@ class HandCamera(Camera):
         sight = np.subtract(self.target, self.eye)
         if np.linalg.norm(np.cross(sight, self.up)) < 1e-6:
             raise ValueError(
-                f"up must not be the line of sight, got {self.up}, from {self.eye} to "
-                f"{self.target}"
+                f"up must not be parallel to the line of sight, got up {self.up}, eye "
+                f"{self.eye}, target {self.target}"
             )
         object.__setattr__(self, "distance", float(np.linalg.norm(sight)))
         super().__post_init__()
@@ -104,7 +106,7 @@ class HandCamera(Camera):
         """Eye, target and up in the world frame.
 
         Args:
-            hand: (7,), position [m] and quaternion xyzw of the end-effector.
+            hand: Pose of the end-effector (7,): position [m] and quaternion xyzw.
         """
         position, rotation = hand[:3], hand[3:]
         eye, target = (
@@ -118,10 +120,14 @@ class HandCamera(Camera):
 
 
 def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """The same view in another size: (height, width), or both in one; None: as is.
+    """The same view in another size.
+
+    Args:
+        camera: The camera.
+        size: Height and width, or one number for both [pixels]; None keeps the size.
 
     Raises:
-        ValueError: it is no such size.
+        ValueError: the size is neither an integer nor a pair of integers.
     """
     if size is None:
         return camera
@@ -137,9 +143,9 @@ def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
 def to_metres(
     depth: npt.NDArray[np.float32], camera: Camera
 ) -> npt.NDArray[np.float32]:
-    """Distance along the line of sight [m] of an `Image`'s depth.
+    """Convert the depth of an `Image` to distances along the line of sight [m].
 
-    The inverse of OpenGL's perspective projection.
+    This is the inverse of OpenGL's perspective projection.
     """
     near, far = np.float32(camera.near), np.float32(camera.far)
     metres = near * far / (far - (far - near) * depth)

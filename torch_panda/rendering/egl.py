@@ -1,4 +1,4 @@
-"""The renderers, and whether they work here."""
+"""Names of the renderers, and tests whether they work on this machine."""
 
 import functools
 import subprocess
@@ -9,8 +9,8 @@ from typing import Literal, get_args
 RendererName = Literal["tiny", "egl"]
 RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
 
-# Draws a box before nothing, and tells whether both are seen. With pybullet itself: it
-# is imported much faster than torch.
+# Draws a box before the background and checks that the picture has both. It uses
+# pybullet, which is imported much faster than torch.
 _EGL_PROBE = """
 import importlib.util, numpy, pybullet as p
 p.connect(p.DIRECT)
@@ -25,10 +25,10 @@ assert numpy.std(rgba) > 1 and numpy.std(depth) > 0, "the image is blank"
 
 
 def check_renderer(renderer: str) -> None:
-    """Make sure that a renderer works here.
+    """Make sure that a renderer works on this machine.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: there is no renderer of this name.
         RuntimeError: EGL does not work on this machine.
     """
     if renderer not in RENDERERS:
@@ -39,19 +39,18 @@ def check_renderer(renderer: str) -> None:
 
 @functools.cache
 def _check_egl() -> None:
-    """In a process of its own: where EGL fails, Bullet ends the process."""
-    if complaint := probe(_EGL_PROBE):
+    # In another process, because Bullet ends the process if EGL fails.
+    if reason := probe(_EGL_PROBE):
         raise RuntimeError(
-            f"renderer='egl' does not work on this machine, use 'tiny' "
-            f"(EGL said: {complaint})"
+            f"renderer='egl' does not work on this machine: use 'tiny' ({reason})"
         )
 
 
 def probe(code: str) -> str | None:
-    """Run Python code in a process of its own, which it may end.
+    """Run Python code in another process.
 
     Returns:
-        its last words if it failed.
+        The last line of its output if it failed, otherwise None.
     """
     process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True

@@ -1,4 +1,4 @@
-"""Pictures, and what is laid over them."""
+"""Pictures of several environments, and blending of layers."""
 
 from dataclasses import dataclass
 
@@ -47,13 +47,13 @@ def blend(
     where: npt.NDArray[np.bool_],
     opacity: npt.NDArray[np.float32],
 ) -> None:
-    """Lay something translucent over pixels, in place.
+    """Blend a translucent layer over a picture, in place.
 
     Args:
-        pixels: (height, width, 3), what lies behind.
-        overlay: (height, width, 3), what lies in front.
-        where: (height, width), where something does.
-        opacity: of what does, as many values as ``where`` is true.
+        pixels: Picture (height, width, 3), which is changed.
+        overlay: Translucent layer in front of it (height, width, 3).
+        where: Mask of the pixels that the layer covers (height, width).
+        opacity: Opacities of the covered pixels, in row-major order.
     """
     opacity = opacity[:, None]
     mixed = (1 - opacity) * pixels[where] + opacity * overlay[where]

@@ -1,7 +1,7 @@
-"""Decimated meshes for small pictures.
+"""Coarse meshes for small pictures.
 
-The Panda's meshes have 100,000 triangles, and Bullet's software renderer spends 95 %
-of a picture of 64 x 64 pixels on triangles that are smaller than a pixel.
+The Panda's meshes have 100,000 triangles. In a picture of 64 x 64 pixels, Bullet's
+software renderer spends 95 % of the time on triangles that are smaller than a pixel.
 """
 
 import functools
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from torch_panda.bullet.urdf import find_mesh, make_scratch_folder, parse_urdf
 
-# Texture coordinates that differ by less belong to one colour.
+# Texture coordinates in the same cell of this size count as the same colour.
 _TEXTURE_CELL = 0.1
 
 Floats = npt.NDArray[np.float64]
@@ -24,14 +24,16 @@ Integers = npt.NDArray[np.int64]
 
 @functools.cache
 def decimated_urdf(urdf: str, cell: float) -> Path:
-    """A URDF that looks like another one from afar.
+    """Write a copy of a URDF with coarse visual meshes and no collision shapes.
 
-    Its visual meshes in Wavefront's format (.obj) have one vertex in a cube of edge
-    length ``cell`` [m]. It has no collision shapes.
+    In meshes of Wavefront's format (.obj), the vertices in a cube become one vertex.
 
     Args:
-        urdf: the original file.
-        cell: edge length of the cubes [m].
+        urdf: The original file.
+        cell: Edge length of the cubes [m].
+
+    Returns:
+        Path of the new file.
     """
     folder = make_scratch_folder()
     source = Path(urdf).absolute()
@@ -52,7 +54,7 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
 
 
 def _coarse_obj(original: Path, folder: Path, cell: Floats) -> Path:
-    """Write the coarse version of an .obj file, and its texture, into a folder."""
+    """Write the coarse version of an .obj file and its texture into a folder."""
     vertices, coordinates, corners = _read_obj(original)
     positions, texture, faces = merge_vertices(vertices, coordinates, corners, cell)
     path = folder / f"{original.parent.name}_{original.name}"
@@ -78,14 +80,16 @@ def merge_vertices(
 ) -> tuple[Floats, Floats, Integers]:
     """Merge the vertices in each cube of a grid into their mean.
 
-    Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex
-    scenes", 1993. Vertices of different colours move to one point but stay apart.
+    The method is that of Rossignac and Borrel, "Multi-resolution 3D approximations for
+    rendering complex scenes", 1993. Vertices of different colours get the same position
+    but remain separate vertices.
 
     Args:
-        vertices: (n, 3) [m].
-        coordinates: (m, 2), in the texture.
-        corners: (f, 3, 2), of the triangles: which vertex, which coordinate.
-        cell: (3,), edge lengths of the cubes [m].
+        vertices: Positions (n, 3) [m].
+        coordinates: Texture coordinates (m, 2).
+        corners: Corners of the triangles (f, 3, 2): index of the vertex, index of the
+            texture coordinate.
+        cell: Edge lengths of the cubes (3,) [m].
 
     Returns:
         Positions (k, 3), texture coordinates (k, 2) and triangles (g, 3).
@@ -95,12 +99,12 @@ def merge_vertices(
     sums = np.stack([np.bincount(cube, column) for column in vertices.T], axis=1)
     means: Floats = sums / np.bincount(cube)[:, None]
     color = np.floor(coordinates / _TEXTURE_CELL).astype(np.int64)
-    # A new vertex for each cube and colour; its texture coordinates are one corner's.
+    # A new vertex for each cube and colour, with the texture coordinates of one corner.
     flat = corners.reshape(-1, 2)
     keys = np.column_stack((cube[flat[:, 0]], color[flat[:, 1]]))
     keys, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1, 3)
-    # Triangles that shrank to a line or a point are gone, as are doubles.
+    # Remove duplicates, and triangles that shrank to a line or a point.
     in_cubes = keys[faces, 0]
     has_area = (in_cubes != np.roll(in_cubes, 1, axis=1)).all(axis=1)
     faces, in_cubes = faces[has_area], in_cubes[has_area]
@@ -112,7 +116,7 @@ def merge_vertices(
 
 
 def _normals(positions: Floats, faces: Integers) -> Floats:
-    """Normals of vertices: the mean of their triangles', by area."""
+    """Normals of vertices: means over their triangles, weighted by area."""
     a, b, c = positions[faces[:, 0]], positions[faces[:, 1]], positions[faces[:, 2]]
     normals = np.zeros_like(positions)
     for corner in range(3):
@@ -124,22 +128,22 @@ def _normals(positions: Floats, faces: Integers) -> Floats:
 def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
     """Vertices (n, 3), texture coordinates (m, 2), corners (f, 3, 2) of an .obj file.
 
-    Corners without a texture coordinate refer to the first one, which is (0, 0).
+    Corners without a texture coordinate refer to the first coordinate, (0, 0).
     """
     vertices: list[list[float]] = []
     coordinates = [[0.0, 0.0]]
     corners: list[list[tuple[int, int]]] = []
     for line in path.read_text().splitlines():
-        kind, _, rest = line.partition(" ")
-        if kind == "v":
+        keyword, _, rest = line.partition(" ")
+        if keyword == "v":
             vertices.append([float(x) for x in rest.split()[:3]])
-        elif kind == "vt":
+        elif keyword == "vt":
             coordinates.append([float(x) for x in rest.split()[:2]])
-        elif kind == "f":
+        elif keyword == "f":
             polygon = []
             for corner in rest.split():
                 vertex, coordinate = [*corner.split("/"), ""][:2]
-                # Numbers count from 1, or back from the last one so far.
+                # Indices count from 1, or backwards from the last element so far.
                 v, t = int(vertex), int(coordinate or 0)
                 v = v - 1 if v > 0 else v + len(vertices)
                 polygon.append((v, t if t >= 0 else t + len(coordinates)))
@@ -149,7 +153,7 @@ def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
 
 
 def _texture_of(path: Path) -> Path | None:
-    """The first texture of an .obj file's materials, the one that Bullet uses."""
+    """The first texture of an .obj file's materials, which Bullet uses."""
     for library in _values(path, "mtllib"):
         materials = path.with_name(library)
         if materials.is_file():

@@ -1,4 +1,4 @@
-"""Drawing many environments in parallel."""
+"""Renders many environments in parallel."""
 
 import math
 import sys
@@ -12,20 +12,21 @@ from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.env_renderer import EnvRenderer
 from torch_panda.rendering.frames import Frames
 
-# Meshes finer than this are drawn as they are [m].
+# Smallest size of cells to which meshes are coarsened [m].
 _FINEST_CELL = 0.004
 
 
 class VectorRenderer:
-    """Draws the environments of a simulation, each thread with a `EnvRenderer`.
+    """Draws the environments of a simulation, each thread with an `EnvRenderer`.
 
-    Nothing is built before something is drawn. In small pictures the robot's meshes
-    are merged to cells of half a pixel (see `mesh_cell`).
+    The first picture builds the renderers that it needs. In small pictures, the robot's
+    meshes are coarsened to cells of half a pixel (see `mesh_cell`).
 
     Args:
-        simulation: what is drawn, by its own threads.
-        renderer: "tiny": Bullet's software renderer; "egl": its OpenGL renderer, in
-            one thread of its own, because a context of OpenGL belongs to a thread.
+        simulation: The simulation whose environments are drawn, by its threads.
+        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer,
+            which runs in one thread of its own, because a context of OpenGL belongs to
+            a thread.
     """
 
     def __init__(
@@ -36,7 +37,7 @@ class VectorRenderer:
     ) -> None:
         self._simulation = simulation
         self._renderer: RendererName = renderer
-        # Idle ones by mesh cell; lists are popped and appended to under the GIL.
+        # Idle renderers by mesh cell. The GIL makes pop and append of lists atomic.
         self._idle: dict[float, list[EnvRenderer]] = {}
         self._gl_thread = WorkerPool(1) if renderer == "egl" else None
 
@@ -46,7 +47,7 @@ class VectorRenderer:
         """Draw environments into rows of ``frames``; see `EnvRenderer.draw`.
 
         Raises:
-            WorkerError: Bullet failed in one picture.
+            WorkerError: Bullet failed in at least one picture.
         """
         jobs = list(zip(envs, rows, strict=True))
         run = self._simulation.run if self._gl_thread is None else self._gl_thread.run
@@ -71,18 +72,21 @@ class VectorRenderer:
         return frames.pixels
 
     def close(self) -> None:
-        """Free all that was built. Closing again does nothing."""
+        """Free all renderers. Closing again does nothing."""
         renderers = [renderer for idle in self._idle.values() for renderer in idle]
         self._idle = {}
         if self._gl_thread is None:
             for renderer in renderers:
                 renderer.close()
-        elif not sys.is_finalizing():  # when Python ends, its threads already have
+        elif not sys.is_finalizing():  # then Python has ended its threads already
             self._gl_thread.run(lambda k: renderers[k].close(), range(len(renderers)))
             self._gl_thread.close()
 
     def _provide(self, cell: float, count: int) -> list[EnvRenderer]:
-        """At least so many, made one by one: Bullet's importer is not for threads."""
+        """The idle renderers of a cell size, after making them up to ``count``.
+
+        They are made one by one, because Bullet's importer is not thread-safe.
+        """
         renderers = self._idle.setdefault(cell, [])
 
         def make(_: int) -> None:
@@ -104,7 +108,10 @@ class VectorRenderer:
 
 
 def mesh_cell(camera: Camera) -> float:
-    """Half a pixel at a camera's target, in whole millimetres [m]; 0: all details."""
+    """Half the size of a pixel at a camera's target, rounded to millimetres [m].
+
+    It is 0, for all details, if that is finer than the meshes are worth coarsening.
+    """
     pixel = 2 * camera.distance * math.tan(math.radians(camera.fov) / 2) / camera.height
     cell = round(pixel / 2, 3)
     return cell if cell >= _FINEST_CELL else 0.0

@@ -1,4 +1,4 @@
-"""A scene in viser's scene tree, for browsers; needs the extra ``viewer``."""
+"""The bodies of a scene in viser's scene tree; needs the extra ``viewer``."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -16,7 +16,7 @@ from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase
 from torch_panda.bullet.shapes import LIGHT_GREY
 from torch_panda.rendering.mesh_decimation import decimated_urdf
 
-MESH_CELL = 0.003  # how coarse meshes are [m]
+MESH_CELL = 0.003  # size of the cells to which meshes are coarsened [m]
 YELLOW = (255, 190, 0)
 
 Floats = npt.NDArray[np.float64]
@@ -24,12 +24,12 @@ Joint = tuple[Any, Floats, SO3, Floats, bool]  # see WebBodies._add_urdf
 
 
 class WebBodies:
-    """The bodies of a client, drawn by a viser server.
+    """The bodies of a scene, drawn by a viser server.
 
     Args:
-        server: draws them.
-        client: that holds the scene; it is asked what was built, and left as it is.
-        scene: the body ids.
+        server: The server.
+        client: Client of the scene, from which blueprint and joints are read.
+        scene: Body ids of the scene.
     """
 
     def __init__(
@@ -67,13 +67,14 @@ class WebBodies:
         marker_pose: Floats,
         arrows: Floats,
     ) -> None:
-        """Show one environment.
+        """Show the bodies of one environment, and arrows.
 
         Args:
-            joint_position: (n_joints,) [rad] or [m].
-            object_pose: (n_objects, 7), position [m] and quaternion xyzw.
-            marker_pose: (n_markers, 7).
-            arrows: (n, 2, 3), their starts and ends, world frame [m].
+            joint_position: Positions of the robot's joints (n_joints,) [rad] or [m].
+            object_pose: Poses of the objects (n_objects, 7): position [m], quaternion
+                xyzw.
+            marker_pose: Poses of the markers (n_markers, 7).
+            arrows: Starts and ends of arrows (n, 2, 3), world frame [m].
         """
         for (node, origin, rotation, axis, slides), q in zip(
             self._joints, joint_position, strict=True
@@ -99,14 +100,16 @@ class WebBodies:
             visible=len(arrows) > 0,
         )
 
-    # ---- what is drawn -----------------------------------------------------------
+    # ---- building ----------------------------------------------------------------
 
     def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
-        """Add a body's links, each below its parent: the tree does the kinematics.
+        """Add a body's links, each as a child of its parent's node.
+
+        The scene tree then computes the kinematics.
 
         Returns:
-            By joint: the link's node, the joint's origin and rotation in the parent's
-            frame, its axis, and whether it slides.
+            For each movable joint by name: the link's node, the joint's origin and
+            rotation in the parent's frame, its axis, and whether it slides.
         """
         source = decimated_urdf(file, MESH_CELL)
         tree = ElementTree.parse(source)
@@ -120,7 +123,7 @@ class WebBodies:
         handles: dict[str, Joint] = {}
 
         def path(link: str) -> str:
-            """The link's node, which is added when first asked for."""
+            """Name of a link's node, which is added if it does not exist."""
             if link in names:
                 return names[link]
             joint = joints.get(link)
@@ -187,7 +190,7 @@ class WebBodies:
 
 
 def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
-    """A box in the colours in the middle of a texture's six squares; see `Visual`."""
+    """A box whose faces have the colours of a texture's six squares; see `Visual`."""
     mesh = trimesh.creation.box(extents=[2 * x for x in box.half_extents])
     mesh.unmerge_vertices()
     axis = np.abs(mesh.face_normals).argmax(axis=1)
@@ -206,25 +209,27 @@ def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
 
 
 def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | None:
-    """The shape of a visual of a URDF; None: its geometry is not one we know."""
-    if (kind := visual.find("geometry/*")) is None:
+    """The mesh of a visual of a URDF; None for an unknown geometry."""
+    if (geometry := visual.find("geometry/*")) is None:
         return None
-    match kind.tag:
+    match geometry.tag:
         case "mesh":
-            mesh = trimesh.load(urdf.parent / str(kind.get("filename")), force="mesh")
-            return mesh.apply_scale(_numbers(kind.get("scale"), (1, 1, 1)))
+            mesh = trimesh.load(
+                urdf.parent / str(geometry.get("filename")), force="mesh"
+            )
+            return mesh.apply_scale(_numbers(geometry.get("scale"), (1, 1, 1)))
         case "box":
-            return trimesh.creation.box(_numbers(kind.get("size"), (1, 1, 1)))
+            return trimesh.creation.box(_numbers(geometry.get("size"), (1, 1, 1)))
         case "sphere":
-            return trimesh.creation.icosphere(radius=float(kind.get("radius", 1)))
+            return trimesh.creation.icosphere(radius=float(geometry.get("radius", 1)))
         case "cylinder":
-            radius, length = (float(kind.get(x, 1)) for x in ("radius", "length"))
+            radius, length = (float(geometry.get(x, 1)) for x in ("radius", "length"))
             return trimesh.creation.cylinder(radius, length)
     return None
 
 
 def _has_texture(mesh: trimesh.Trimesh) -> bool:
-    """Whether it has one of its own; trimesh's stand-in has 2 x 2 pixels."""
+    """Whether a mesh has a texture; trimesh's placeholder has 2 x 2 pixels."""
     if mesh.visual.kind != "texture":
         return False
     image = mesh.visual.material.image
@@ -232,7 +237,7 @@ def _has_texture(mesh: trimesh.Trimesh) -> bool:
 
 
 def _origin(element: ElementTree.Element) -> tuple[Floats, SO3]:
-    """Where a joint or a visual is in its link's frame."""
+    """Position [m] and rotation of a joint or a visual in its link's frame."""
     origin = element.find("origin")
     attributes = {} if origin is None else origin.attrib
     position = _numbers(attributes.get("xyz"), (0, 0, 0))
@@ -244,6 +249,6 @@ def _numbers(text: str | None, default: tuple[float, ...]) -> Floats:
 
 
 def _place(node: Any, pose: Floats) -> None:  # noqa: ANN401 (viser's handles)
-    """Put a node at a pose, (7,): position [m] and quaternion xyzw."""
+    """Move a node to a pose (7,): position [m] and quaternion xyzw."""
     node.position = pose[:3]
     node.wxyz = pose[[6, 3, 4, 5]]

@@ -1,4 +1,4 @@
-"""A viewer in the browser: what was seen of each episode, live and in retrospect.
+"""A viewer in the browser that shows episodes live and lets one go back.
 
 This module needs the extra ``viewer``.
 """
@@ -22,13 +22,13 @@ from torch_panda.rendering.web_access import (
 )
 from torch_panda.rendering.web_bodies import WebBodies
 
-POSITION = 3  # numbers of an object's part of a goal
-ARROW_LENGTH = 0.005  # of a contact's force [m/N]
+POSITION = 3  # numbers per object in a goal of positions
+ARROW_LENGTH = 0.005  # length of an arrow per contact force [m/N]
 LONGEST_ARROW = 0.12  # [m]
 
 
 class Frame(NamedTuple):
-    """An environment at one step; see `WebBodies.show`."""
+    """The state of an environment at one step; see `WebBodies.show`."""
 
     joint_position: npt.NDArray[np.float64]
     object_pose: npt.NDArray[np.float64]
@@ -41,15 +41,16 @@ class WebViewer:
     """Serves a page that shows one environment of a simulation.
 
     See `RobotTaskEnv.open_viewer`. Call `update` after each reset and step, in the
-    thread that steps: it is what the page then shows and what its slider goes back to.
+    thread that steps. The page then shows the new state, and its slider goes back to
+    earlier ones.
 
     Args:
-        simulation: whose state is shown.
-        observe: gives ``step_count``, ``success`` (num_envs, 1), ``achieved_goal`` and
-            ``desired_goal`` (num_envs, goal_dim).
-        max_episode_steps: where the slider ends.
-        title: of the page.
-        camera: where the view starts.
+        simulation: The simulation whose state is shown.
+        observe: Function that returns ``step_count``, ``success`` (num_envs, 1),
+            ``achieved_goal`` and ``desired_goal`` (num_envs, goal_dim).
+        max_episode_steps: Maximum of the slider.
+        title: Title of the page.
+        camera: Camera with which the view starts.
         host: Address at which it serves.
         port: First port to try; the viewer takes the next free one.
         allowed_hosts: Names of this machine under which browsers may open the page,
@@ -71,7 +72,7 @@ class WebViewer:
         self._simulation, self._observe, self._title = simulation, observe, title
         self._episodes: list[list[Frame]] = [[] for _ in range(simulation.num_envs)]
         self._env = 0
-        # The page's controls act in threads of viser.
+        # Callbacks of the page's controls run in threads of viser.
         self._lock = threading.RLock()
         self._resumed = threading.Event()
         self._resumed.set()
@@ -106,13 +107,13 @@ class WebViewer:
 
     @property
     def paused(self) -> bool:
-        """Whether the page is held at a step."""
+        """Whether the page is paused at a step."""
         return not self._resumed.is_set()
 
     def update(self) -> None:
-        """Take all environments as they are now; show the chosen one unless paused.
+        """Record all environments and, unless paused, show the chosen one.
 
-        An environment at step 0 begins a new episode, and forgets the last one.
+        At step 0, an environment's recording starts anew.
         """
         simulation, now = self._simulation, self._observe()
         envs = range(simulation.num_envs)
@@ -141,11 +142,11 @@ class WebViewer:
                 self._draw()
 
     def wait(self, timeout: float | None = None) -> None:
-        """Return when the page is not, or no longer, paused, or after so long [s]."""
+        """Wait while the page is paused, at most ``timeout`` [s]."""
         self._resumed.wait(timeout)
 
     def write(self, note: str) -> None:
-        """Show a line of Markdown beside the scene, such as what policy acts."""
+        """Show a line of Markdown beside the scene, for example the policy's name."""
         self._note.content = note
 
     def close(self) -> None:
@@ -169,7 +170,7 @@ class WebViewer:
             self._draw()
 
     def _go_to(self, event: Any) -> None:  # noqa: ANN401 (viser's)
-        if event.client is not None:  # a person's, not `update`'s
+        if event.client is not None:  # a person moved the slider, not `update`
             self._pause.value = True
             self._draw()
 
@@ -201,20 +202,20 @@ def _clamped(index: int, count: int) -> int:
 def read_forces(
     client: PhysicsClient, simulation: VectorSimulation
 ) -> npt.NDArray[np.float64]:
-    """Points and forces on objects, and on the robot otherwise: (n, 2, 3)."""
+    """Contact points [m] and forces [N] on objects, or else on the robot (n, 2, 3)."""
     scene = simulation.scene
     rank = {body: 2 for body in scene.objects} | {scene.robot: 1}
-    found = []
+    forces = []
     for contact in client.contact_points():
         if rank.get(contact.body_a, 0) < rank.get(contact.body_b, 0):
             contact = contact.swapped()
         if contact.body_a in rank and contact.normal_force > 0:
-            found.append((contact.position_on_a, contact.force_on_a))
-    return np.array(found, dtype=float).reshape(-1, 2, POSITION)
+            forces.append((contact.position_on_a, contact.force_on_a))
+    return np.array(forces, dtype=float).reshape(-1, 2, POSITION)
 
 
 def arrows(forces: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """From where forces (n, 2, 3) act, along them: (n, 2, 3), start and end [m]."""
+    """Starts and ends of arrows [m] for points and forces, (n, 2, 3) each."""
     point, force = forces[:, 0], forces[:, 1]
     size = np.linalg.norm(force, axis=1, keepdims=True)
     length = np.minimum(ARROW_LENGTH * size, LONGEST_ARROW)
@@ -222,17 +223,17 @@ def arrows(forces: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def describe(step: int, state: dict[str, Tensor]) -> str:
-    """Step, success and distance in Markdown."""
+    """Step, success and distance from the goal, in Markdown."""
     lines = [f"step {step}", "**success**" if state["success"] else "no success yet"]
     difference = (state["achieved_goal"] - state["desired_goal"]).double()
-    if len(difference) % POSITION == 0:  # a position for each object
+    if len(difference) % POSITION == 0:  # a position per object
         distance = difference.reshape(-1, POSITION).norm(dim=1).max()
         lines.append(f"{100 * distance:.1f} cm from the goal")
     return "  \n".join(lines)
 
 
 def eye(camera: Camera) -> tuple[float, float, float]:
-    """Where a camera is, world frame [m]; see `Camera`."""
+    """Position of a camera, world frame [m]; see `Camera`."""
     yaw, pitch = np.radians(camera.yaw), np.radians(camera.pitch)
     x, y, z = camera.target
     flat = camera.distance * np.cos(pitch)

@@ -68,7 +68,7 @@ class Window:
         self.close()
 
     def _configure(self, camera: Camera) -> None:
-        """Leave only the view, seen from a camera."""
+        """Move the camera and hide the panels beside the view."""
         command = capi.window_init(self._connection.handle)
         capi.window_set_camera(
             command,
@@ -92,9 +92,9 @@ class Window:
 
 
 def _check_display() -> None:
-    """In a process of its own: where there is no display, Bullet ends the process."""
-    if complaint := probe(_PROBE):
+    # In another process, because Bullet ends the process if there is no display.
+    if reason := probe(_PROBE):
         raise BulletError(
-            f"Bullet could not open a window, which needs a display with OpenGL "
-            f"(it said: {complaint})"
+            f"Bullet could not open a window: it needs a display with OpenGL, which "
+            f"env.open_viewer() does not need ({reason})"
         )
