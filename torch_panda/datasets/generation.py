@@ -197,7 +197,7 @@ def sha256(data: TensorDictBase) -> str:
         64 hexadecimal digits. They do not depend on the order of the keys.
     """
     digest = hashlib.sha256()
-    leaves = {
+    leaves: dict[str, Tensor] = {
         ".".join(key if isinstance(key, tuple) else (key,)): value
         for key, value in data.items(include_nested=True, leaves_only=True)
     }

@@ -31,17 +31,18 @@ class Policy(TensorDictModuleBase):
         spaces: Sizes of observations, goals and actions.
     """
 
-    in_keys = ("observation", "desired_goal")
-    out_keys = ("action",)
-
     def __init__(
         self, module: TensorDictModuleBase, env_id: str, spaces: Spaces
     ) -> None:
         super().__init__()
+        self.in_keys = ["observation", "desired_goal"]
+        self.out_keys = ["action"]  # type: ignore[misc]  # it has a setter
         self.module, self.env_id, self.spaces = module, env_id, spaces
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    @dispatch  # also takes and returns tensors
+    def forward(  # type: ignore[override]
+        self, tensordict: TensorDictBase
+    ) -> TensorDictBase:
         """Write the action for every observation and goal.
 
         Raises:

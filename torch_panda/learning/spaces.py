@@ -60,7 +60,8 @@ class Spaces:
     def action_spec(self, *batch_size: int) -> TensorSpec:
         """The spec of actions in [-1, 1], on torch's default device."""
         device = torch.get_default_device()
-        return Bounded(-1.0, 1.0, (*batch_size, self.action_size), device=device)
+        shape = torch.Size((*batch_size, self.action_size))
+        return Bounded(-1.0, 1.0, shape, device=device)
 
 
 def read_spaces(env: RobotTaskEnv) -> Spaces:
