@@ -81,7 +81,7 @@ def test_a_registration_names_robot_task_and_version(env_id):
     ],
 )
 def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
-    message = rf"make: unknown argument '{option}'; {advice}"
+    message = rf"make got an unexpected keyword argument '{option}'; {advice}"
     with pytest.raises(TypeError, match=message):
         torch_panda.make("PandaPush-v1", **{option: value})
 
@@ -89,7 +89,7 @@ def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
 def test_options_of_task_and_robot_are_checked():
     with pytest.raises(
         TypeError,
-        match="task_options of PandaPush-v1: unknown argument 'threshold'; did you "
+        match="task_options of PandaPush-v1 got an unexpected keyword argument 'threshold'; did you "
         "mean 'distance_threshold'",
     ):
         torch_panda.make("PandaPush-v1", task_options={"threshold": 0.1})

@@ -1,4 +1,4 @@
-"""Rotations by quaternions, which are xyzw throughout the package."""
+"""Rotations as unit quaternions xyzw."""
 
 import math
 from collections.abc import Sequence
@@ -10,27 +10,40 @@ NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Rotate vectors by unit quaternions xyzw: (..., 4), (..., 3) -> (..., 3)."""
-    axis, vector = torch.broadcast_tensors(quaternion[..., :3], vector)
-    w, turn = quaternion[..., 3:], 2 * torch.linalg.cross(axis, vector)
-    return vector + w * turn + torch.linalg.cross(axis, turn)
+    """Rotate vectors, (..., 3), by quaternions, (..., 4).
+
+    With q = (u, w) the result is v + w t + u x t, where t = 2 u x v.
+    """
+    u, vector = torch.broadcast_tensors(quaternion[..., :3], vector)
+    w, t = quaternion[..., 3:], 2 * torch.linalg.cross(u, vector)
+    return vector + w * t + torch.linalg.cross(u, t)
 
 
 def rotation_vector_to_quaternion(vector: Tensor) -> Tensor:
-    """Rotations about a vector by its length [rad]: (..., 3) to xyzw (..., 4)."""
+    """Quaternions, (..., 4), of rotation vectors, (..., 3).
+
+    A rotation vector points along the axis, and its length is the angle [rad].
+    """
     angle = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
-    # sin(angle / 2) / angle, also where the angle is 0.
+    # sin(angle / 2) / angle, which sinc also defines at angle 0.
     factor = torch.sinc(angle / (2 * math.pi)) / 2
     return torch.cat((vector * factor, (angle / 2).cos()), dim=-1)
 
 
 def rotation_distance(first: Tensor, second: Tensor) -> Tensor:
-    """1 - <q, q'>^2 of unit quaternions, 0 to 1: (..., 4) each to (..., 1)."""
+    """Distance 1 - <q, q'>^2 between quaternions, (..., 4) each, from 0 to 1.
+
+    Returns:
+        (..., 1). It is the squared sine of half the angle between the rotations.
+    """
     return 1 - (first * second).sum(-1, keepdim=True).square()
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
-    """First after second, in the frame that the first turns: xyzw (..., 4) each."""
+    """Product of quaternions, (..., 4) each: the rotation second, and then first.
+
+    It is also the rotation first, and then second in the rotated frame.
+    """
     first, second = torch.broadcast_tensors(first, second)
     a, w = first[..., :3], first[..., 3:]
     b, v = second[..., :3], second[..., 3:]
@@ -39,7 +52,7 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotate_vector(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """Rotate one vector by one quaternion xyzw, without tensors: (3,)."""
+    """Rotate one vector by one quaternion; `rotate` without tensors."""
     x, y, z, w = quaternion
     a, b, c = vector
     p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)

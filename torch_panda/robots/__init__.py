@@ -1,4 +1,4 @@
-"""Robots: what they are made of, how an action moves them, what they observe."""
+"""Robots: their URDFs, the meaning of actions, and observations."""
 
 from torch_panda.bullet.urdf import Tool
 from torch_panda.robots.base import Robot

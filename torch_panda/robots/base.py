@@ -27,49 +27,53 @@ from torch_panda.rotations import (
     rotation_vector_to_quaternion,
 )
 
-# Lowest and highest x, y, z, world frame [m].
 Workspace = tuple[Sequence[float], Sequence[float]]
+"""Lowest and highest (x, y, z) of a box, world frame [m]."""
 _FAR = math.inf
 ABOVE_THE_TABLE: Workspace = ((-_FAR, -_FAR, 0.0), (_FAR, _FAR, _FAR))
 
 
 class Robot(Configured):
-    """A robot arm on a fixed base, described by a URDF, with or without a gripper.
+    """A robot arm on a fixed base, with or without a gripper, described by a URDF.
 
-    One description serves all clients of a simulation. An action has the arm's numbers,
-    and a last one of the gripper's, if there is one that is not blocked: by how much
-    the fingers open. Observations are the end-effector's position [m] and velocity
-    [m/s], and then the distance between the fingers [m].
+    One object describes the robot for all environments of a simulation. An action holds
+    the numbers of the arm, whose meaning is the control type. If there is a gripper
+    that is not blocked, the last number opens the fingers. The robot observes the
+    end-effector's position [m] and velocity [m/s] and, with a free gripper, the
+    distance between the fingers [m].
 
     Args:
-        urdf: a file, or its name among those that pybullet ships.
-        neutral_joint_position: where every movable joint starts [rad] or [m].
-        joint_forces: the most each movable joint's motor may exert [N m] or [N].
-        ee_link: index of the link whose centre of mass is the end-effector.
-        ee_orientation: quaternion xyzw that the end-effector keeps under the control
-            type "ee", world frame.
-        num_arm_joints: how many movable joints, the first ones, are the arm; None
-            means all but the gripper's. Further joints stay where they start.
-        control_type: what an action does: "ee" displaces the end-effector along x, y, z
-            of the world; "ee_pose" also turns it, by a rotation vector in its own
-            frame; "joints" displaces the arm's joints, "joint_velocity" is their
-            velocity and "joint_torque" their motors' torque, without compensation of
-            gravity.
-        action_scale: what an action of 1 is: 0.05 m or rad, 1.25 rad/s, or this part of
-            ``joint_forces``, all of it; None means these.
-        gripper: of the last joints; None: there is none.
-        block_gripper: keep the fingers where they start.
-        base_position: of the base, world frame [m].
-        base_orientation: of the base, quaternion xyzw.
-        workspace: the box in which actions send the end-effector, lowest and highest
-            (x, y, z), world frame [m]; by default all above the table.
-        tool: a link that the URDF lacks, which can be the end-effector.
-        wrist_joint: index of the joint on which the hand is mounted, for the sensor of
-            its force and torque; None means that there is none.
-        finger_links: indices of the fingers' links, for the sensor of their contacts.
+        urdf: Path of the URDF, or its name among the files that pybullet ships.
+        neutral_joint_position: Start position of each movable joint [rad] or [m].
+        joint_forces: Largest torque [N m] or force [N] of each movable joint's motor.
+        ee_link: Index of the link whose centre of mass is the end-effector.
+        ee_orientation: Orientation that the end-effector keeps under the control type
+            "ee", quaternion xyzw, world frame.
+        num_arm_joints: Number of movable joints that belong to the arm, which are the
+            first ones; None means all but those of the gripper. Further joints keep
+            their start positions.
+        control_type: Meaning of the arm's numbers. "ee": displacement of the
+            end-effector along x, y and z of the world. "ee_pose": this displacement and
+            a rotation vector in the end-effector's frame. "joints": displacement of
+            each joint. "joint_velocity": velocity of each joint. "joint_torque": torque
+            of each joint, without compensation of gravity.
+        action_scale: Displacement [m] or [rad], velocity [rad/s], or share of
+            ``joint_forces`` that an action of 1 stands for. None means 0.05 m, 0.05
+            rad, 1.25 rad/s, or the whole force.
+        gripper: The gripper, which has the last joints; None means no gripper.
+        block_gripper: Keep the fingers at their start positions.
+        base_position: Position of the base, world frame [m].
+        base_orientation: Orientation of the base, quaternion xyzw.
+        workspace: Lowest and highest (x, y, z) to which "ee" and "ee_pose" can send the
+            end-effector, world frame [m]. The default is the space above the table.
+        tool: A link that is added to the URDF, for example as the end-effector.
+        wrist_joint: Index of the joint that carries the hand, for the sensor
+            "wrist_force_torque"; None means that the robot cannot have this sensor.
+        finger_links: Indices of the links of the fingers, for the sensor
+            "finger_contact".
 
     Raises:
-        ValueError: an argument is out of range, or two do not fit together.
+        ValueError: An argument is out of range, or two arguments contradict each other.
     """
 
     def __init__(
@@ -99,7 +103,7 @@ class Robot(Configured):
             )
         if len(neutral_joint_position) != len(joint_forces):
             raise ValueError(
-                f"neutral_joint_position and joint_forces must name the same joints, "
+                f"neutral_joint_position and joint_forces must have the same length, "
                 f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
             )
         if not np.isfinite(neutral_joint_position).all():
@@ -135,8 +139,9 @@ class Robot(Configured):
             joint_forces
         ):
             raise ValueError(
-                f"a robot with a gripper must have {self.num_arm_joints} joints of the "
-                f"arm and {num_fingers} of the gripper, got {len(joint_forces)} in all"
+                f"a robot with this gripper must have {self.num_arm_joints} joints of "
+                f"the arm and {num_fingers} of the gripper, got {len(joint_forces)} "
+                f"joint_forces"
             )
         rest = self.neutral_joint_position[self.num_arm_joints :]
         self._rest = torch.tensor(rest, dtype=torch.float64, device="cpu")
@@ -149,8 +154,8 @@ class Robot(Configured):
         box = np.asarray(workspace, dtype=np.float64)
         if box.shape != (2, 3) or not (box[0] <= box[1]).all():
             raise ValueError(
-                f"workspace must be the lowest and the highest (x, y, z), got "
-                f"{workspace!r}"
+                f"workspace must be the lowest and the highest (x, y, z), such as "
+                f"((-0.2, -0.2, 0), (0.2, 0.2, 0.4)), got {workspace!r}"
             )
         self.workspace: Workspace = workspace
         self._lowest, self._highest = torch.from_numpy(box)
@@ -160,12 +165,12 @@ class Robot(Configured):
 
     @property
     def action_dim(self) -> int:
-        """Number of action entries."""
+        """Number of entries of an action."""
         return self._arm_action_dim + self.has_free_gripper
 
     @property
     def observation_dim(self) -> int:
-        """Number of entries of its part of the observation."""
+        """Number of entries of the robot's part of the observation."""
         return 6 + self.has_free_gripper
 
     @property
@@ -181,9 +186,9 @@ class Robot(Configured):
         """Load the robot into a client and return its body id.
 
         Raises:
-            FileNotFoundError: the URDF does not exist.
-            ValueError: the URDF has another number of movable joints, or lacks a link
-                or joint.
+            FileNotFoundError: The URDF does not exist.
+            ValueError: The URDF has another number of movable joints, or has no link or
+                joint with a given index.
         """
         body = client.load_urdf(
             self.urdf,
@@ -207,23 +212,23 @@ class Robot(Configured):
         ):
             for index in indices:
                 if not 0 <= index < len(joints):
-                    kind = "joint" if name == "wrist_joint" else "link"
+                    part = "joint" if name == "wrist_joint" else "link"
                     raise ValueError(
-                        f"{name} must be a {kind} of {self.urdf}, 0 to "
+                        f"{name} must be a {part} of {self.urdf}, 0 to "
                         f"{len(joints) - 1}, got {index}"
                     )
         return body
 
     def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
-        """What actions ask the motors for, as `control` reads it.
+        """Setpoints of the motors for actions.
 
         Args:
-            action: (num_envs, action_dim) float32 in [-1, 1].
-            simulation: whose robots are to act.
+            action: Clipped actions, (num_envs, action_dim) float32 in [-1, 1].
+            simulation: The environments.
 
         Returns:
-            (num_envs, k), float64: the arm's part, as `arm_setpoint`, and behind it the
-            positions of the other joints [rad] or [m].
+            (num_envs, k) float64: the values of `arm_setpoint`, and then the positions
+            of the other joints [rad] or [m].
         """
         if self.gripper is None or self.block_gripper:
             arm = self.arm_setpoint(action, simulation)
@@ -235,16 +240,17 @@ class Robot(Configured):
         return torch.cat((arm, others), dim=1)
 
     def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
-        """The part of `setpoint` that is the arm's, by the control type.
+        """Setpoints of the arm for its part of actions.
 
         Args:
-            action: (num_envs, k) float32 in [-1, 1], without the gripper's.
-            simulation: whose robots are to act.
+            action: Clipped actions without the gripper's entry, (num_envs, j) float32.
+            simulation: The environments.
 
         Returns:
-            "ee": (num_envs, 3), position [m]; "ee_pose": (num_envs, 7), position and
-            quaternion xyzw; else (num_envs, arm joints): positions [rad], velocities
-            [rad/s] or torques [N m].
+            For "ee" the position of the end-effector [m], (num_envs, 3). For "ee_pose"
+            its position and quaternion xyzw, (num_envs, 7). Otherwise the positions
+            [rad], velocities [rad/s] or torques [N m] of the arm's joints, (num_envs,
+            num_arm_joints).
         """
         displacement = action * self.action_scale
         match self.control_type:
@@ -257,33 +263,35 @@ class Robot(Configured):
                 return (
                     simulation.joint_position[:, : self.num_arm_joints] + displacement
                 )
-        shift = displacement if self.control_type == "ee" else displacement[:, :3]
-        # The end-effector must not be sent below the table.
-        position = (simulation.ee_position + shift).clamp(self._lowest, self._highest)
+        position = simulation.ee_position + displacement[:, :3]
+        position = position.clamp(self._lowest, self._highest)
         if self.control_type == "ee":
             return position
-        turn = rotation_vector_to_quaternion(displacement[:, 3:].double())
-        orientation = quaternion_product(simulation.ee_orientation, turn)
+        rotation = rotation_vector_to_quaternion(displacement[:, 3:].double())
+        orientation = quaternion_product(simulation.ee_orientation, rotation)
         return torch.cat((position, orientation), dim=1)
 
     def control(
         self, client: PhysicsClient, body: int, setpoint: npt.NDArray[np.float64]
     ) -> None:
-        """Set the motors of one client's robot, in the thread that steps the client.
+        """Set the motors of the robot in one client.
 
-        A robot that is driven otherwise than by `motor_control` overrides this; its
-        steps then go through Python.
+        It runs in the thread that steps the client. A subclass overrides it if
+        `motor_control` cannot describe its control. Its steps then go through Python.
 
         Args:
-            client: where the robot is ``body``.
-            body: its id.
-            setpoint: (k,), a row of what `setpoint` gives.
+            client: The client.
+            body: Body id of the robot.
+            setpoint: A row of the return value of `setpoint`, (k,).
         """
         self.motor_control(client, body, setpoint)
 
     @property
     def motor_control(self) -> MotorControl:
-        """What `control` does, as data; read once, when an environment is made."""
+        """Description of `control` for the compiled loop.
+
+        It is read once, when an environment is made.
+        """
         arm, forces = self.num_arm_joints, self.joint_forces
         if self.control_type == "ee":
             return MotorControl(forces, self.ee_link, self.ee_orientation, arm)
@@ -294,21 +302,25 @@ class Robot(Configured):
 
     @property
     def controller(self) -> Control:
-        """`control`, as data unless a subclass has its own."""
-        has_own = type(self).control is not Robot.control
-        return self.control if has_own else self.motor_control
+        """`motor_control`, or the `control` of a subclass that overrides it."""
+        overrides = type(self).control is not Robot.control
+        return self.control if overrides else self.motor_control
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, velocity and fingers' width: (num_envs, 6 or 7), float64."""
+        """Position and velocity of the end-effector, and the fingers' width.
+
+        Returns:
+            (num_envs, 6) float64, or (num_envs, 7) with a free gripper.
+        """
         if not self.has_free_gripper:
             return simulation.ee_state
         return torch.cat((simulation.ee_state, self.fingers_width(simulation)), dim=1)
 
     def fingers_width(self, simulation: VectorSimulation) -> Tensor:
-        """Distance between the fingers [m]: (num_envs, 1), float64.
+        """Distance between the fingers [m], (num_envs, 1) float64.
 
         Raises:
-            ValueError: there is no gripper.
+            ValueError: The robot has no gripper.
         """
         if self.gripper is None:
             raise ValueError(f"{type(self).__name__} has no gripper")

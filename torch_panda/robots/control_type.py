@@ -1,4 +1,4 @@
-"""What an action does."""
+"""Control types: the meanings of an action."""
 
 from typing import Literal
 
@@ -6,9 +6,8 @@ from torch_panda.bullet.control import ArmMode
 
 ControlType = Literal["ee", "ee_pose", "joints", "joint_velocity", "joint_torque"]
 
-# What an action of 1 is: the end-effector's or a joint's displacement [m] or [rad], or
-# a joint's velocity, so that it moves as far in a step of 40 ms [rad/s], or a part of
-# the force that its motor may exert.
+# Displacement [m] or [rad], velocity [rad/s], or share of the motor's largest force for
+# an action of 1. At 1.25 rad/s a joint moves 0.05 rad in a step of 40 ms.
 ACTION_SCALES: dict[ControlType, float] = {
     "ee": 0.05,
     "ee_pose": 0.05,

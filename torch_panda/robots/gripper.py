@@ -1,4 +1,4 @@
-"""Fingers that open and close together."""
+"""Grippers whose fingers open and close together."""
 
 from dataclasses import dataclass, field
 
@@ -8,18 +8,21 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Gripper:
-    """Fingers that open and close together, moved by a robot's last joints.
+    """A gripper whose fingers open and close together, moved by a robot's last joints.
 
     Attributes:
-        closed: positions of these joints where the fingers touch [rad] or [m].
-        opened: where they are as far apart as they go; a joint that stays is the same.
-        width: the distance between the fingers there [m].
-        scale: how much farther apart an action of 1 sends them [m].
-        followers: indices of the joints that a real gripper couples to the others,
-            which Bullet's simulation does not: they go where the others are.
+        closed: Positions of these joints when the fingers touch [rad] or [m].
+        opened: Positions of these joints when the fingers are fully open. A joint that
+            does not move has the same position in both.
+        width: Distance between the fully open fingers [m].
+        scale: Change of the distance for an action of 1 [m].
+        followers: Indices of joints that a real gripper couples mechanically to the
+            others. Bullet does not couple them, so their setpoint is the present
+            position of the others.
 
     Raises:
-        ValueError: no joint moves, or the numbers of joints differ.
+        ValueError: The lengths of ``closed`` and ``opened`` differ, no joint moves, all
+            joints follow, or ``width`` is not above 0.
     """
 
     closed: tuple[float, ...]
@@ -27,7 +30,8 @@ class Gripper:
     width: float
     scale: float = 0.2
     followers: tuple[int, ...] = ()
-    # The width is the joints times these, and an offset; and how far all move with it.
+    # The width is the joint positions times _weights, plus _offset. The joint positions
+    # are _closed plus the width times _per_width.
     _weights: Tensor = field(init=False, repr=False, compare=False)
     _offset: float = field(init=False, repr=False, compare=False)
     _per_width: Tensor = field(init=False, repr=False, compare=False)
@@ -39,7 +43,7 @@ class Gripper:
         opened = torch.tensor(self.opened, dtype=double, device="cpu")
         if closed.shape != opened.shape or not (closed != opened).any():
             raise ValueError(
-                f"closed and opened must be of the same joints, of which one moves, "
+                f"closed and opened must hold the same joints, of which one moves, "
                 f"got {self.closed} and {self.opened}"
             )
         if not self.width > 0:
@@ -48,7 +52,9 @@ class Gripper:
         leads = closed != opened
         leads[list(self.followers)] = False
         if not leads.any():
-            raise ValueError(f"not all joints can follow, got {self.followers}")
+            raise ValueError(
+                f"followers must leave out one joint that moves, got {self.followers}"
+            )
         weights = torch.where(leads, 1 / per_width, 0.0) / leads.sum()
         object.__setattr__(self, "_closed", closed)
         object.__setattr__(self, "_per_width", per_width)
@@ -61,23 +67,23 @@ class Gripper:
         return len(self.closed)
 
     def fingers_width(self, joints: Tensor) -> Tensor:
-        """Distance between the fingers [m]: (n, num_joints) -> (n, 1)."""
+        """Distance between the fingers [m], (n, 1), for joints (n, num_joints)."""
         return (joints * self._weights).sum(dim=1, keepdim=True) + self._offset
 
     def setpoint(self, action: Tensor, joints: Tensor) -> Tensor:
-        """Where an action sends the joints.
+        """Setpoints of the joints for actions.
 
         Args:
-            action: (n, 1) float32 in [-1, 1].
-            joints: (n, num_joints) float64, where they are.
+            action: Clipped actions, (n, 1) float32 in [-1, 1].
+            joints: Present positions of the joints, (n, num_joints) float64.
 
         Returns:
-            (n, num_joints), float64.
+            Positions of the joints, (n, num_joints) float64.
         """
-        # In float32 throughout: so panda-gym computes it under NumPy 2.
         width = self.fingers_width(joints)
-        wanted = width.float() + action * self.scale
-        setpoint = self._closed + wanted.double() * self._per_width
+        # The sum is float32, as in panda-gym under NumPy 2.
+        target = width.float() + action * self.scale
+        setpoint = self._closed + target.double() * self._per_width
         if self.followers:
             followers = list(self.followers)
             setpoint[:, followers] = (self._closed + width * self._per_width)[

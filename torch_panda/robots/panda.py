@@ -12,7 +12,7 @@ from torch_panda.rotations import NO_ROTATION
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 JOINT_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 EE_LINK = 11
-# The hand's mount, where the real arm carries a force and torque sensor.
+# The mount of the hand.
 WRIST_JOINT = 8
 FINGER_LINKS = (9, 10)
 GRIPPER = Gripper(closed=(0.0, 0.0), opened=(0.04, 0.04), width=0.08)
@@ -22,15 +22,19 @@ class Panda(Robot):
     """The Franka Emika Panda arm: 7 joints and two fingers.
 
     Args:
-        control_type: see `Robot`, also for the next five.
-        action_scale: what an action of 1 is.
-        block_gripper: keep the fingers where they start, by default closed.
-        base_position: of the base, world frame [m].
-        base_orientation: of the base, quaternion xyzw.
-        workspace: where the end-effector may be sent.
-        fingers_width: distance between the fingers at the start of an episode [m].
-        finger_friction: lateral friction of the fingers.
-        finger_spinning_friction: of the fingers; None leaves what the URDF has, 0.1.
+        control_type: Meaning of an action; see `Robot`.
+        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
+        block_gripper: Keep the fingers at their start positions, by default closed.
+        base_position: Position of the base, world frame [m].
+        base_orientation: Orientation of the base, quaternion xyzw.
+        workspace: Box in which actions can send the end-effector; see `Robot`.
+        fingers_width: Distance between the fingers at the start of an episode [m].
+        finger_friction: Lateral friction of the fingers.
+        finger_spinning_friction: Spinning friction of the fingers; None means the
+            URDF's 0.1.
+
+    Raises:
+        ValueError: An argument is out of range.
     """
 
     def __init__(
@@ -73,7 +77,7 @@ class Panda(Robot):
         self.finger_spinning_friction = finger_spinning_friction
 
     def build(self, client: PhysicsClient) -> int:
-        """Load the arm, and let its fingers grip."""
+        """Load the robot and set the friction of its fingers."""
         body = super().build(client)
         for link in FINGER_LINKS:
             client.set_friction(
