@@ -13,7 +13,7 @@ RADIUS = 0.03  # [m]
 
 
 class PushBall(Task):
-    """Push a ball of 0.5 kg to a point of the table."""
+    """Push a ball of 0.5 kg to a point on the table."""
 
     goal_dim = 3
     observation_dim = 12
@@ -51,7 +51,7 @@ def make_kuka(**arguments):
     )
 
 
-def test_own_task():
+def test_a_task_of_a_user_runs():
     task = PushBall(distance_threshold=0.03)
     with RobotTaskEnv(
         robot=Panda(block_gripper=True), task=task, num_envs=2, seed=0
@@ -65,7 +65,7 @@ def test_own_task():
         assert not td["done"].any()
         td = env.step(td.set("action", action))["next"]
         assert td["truncated"].all()
-        # The arm is sent at the balls and moves them.
+        # The arm has pushed the balls.
         assert ((td["achieved_goal"] - start).norm(dim=1) > 0.005).all()
 
 
@@ -77,7 +77,9 @@ def test_own_task():
         ("sample_objects", ((0.1, 0.1, RADIUS),)),
     ],
 )
-def test_what_a_task_draws_is_checked(monkeypatch, function, values):
+def test_draws_of_a_wrong_shape_or_not_finite_are_refused(
+    monkeypatch, function, values
+):
     monkeypatch.setattr(PushBall, function, lambda self, rng: values)
     with (
         RobotTaskEnv(robot=Panda(block_gripper=True), task=PushBall()) as env,
@@ -86,7 +88,7 @@ def test_what_a_task_draws_is_checked(monkeypatch, function, values):
         env.reset()
 
 
-def test_own_robot_reaches():
+def test_a_robot_of_a_user_reaches():
     with RobotTaskEnv(robot=make_kuka(), task=Reach(), num_envs=4, seed=0) as env:
         check_env_specs(env)
         assert env.action_spec.shape == (4, 3)
@@ -97,7 +99,7 @@ def test_own_robot_reaches():
         assert td["success"].all()
 
 
-def test_own_robot_with_joint_control():
+def test_a_robot_of_a_user_moves_the_joint_of_an_action():
     robot = make_kuka(control_type="joints")
     with RobotTaskEnv(robot=robot, task=Reach(), seed=0) as env:
         assert env.action_spec.shape == (7,)
@@ -118,7 +120,7 @@ def test_own_robot_with_joint_control():
         {"finger_links": (3, 99)},
     ],
 )
-def test_links_and_joints_are_those_of_the_urdf(options):
+def test_links_and_joints_that_the_urdf_lacks_are_refused(options):
     (name,) = options
     with pytest.raises(ValueError, match=f"{name} must be a .* 0 to 6, got"):
         RobotTaskEnv(robot=make_kuka(**options), task=Reach())
@@ -135,18 +137,14 @@ def test_links_and_joints_are_those_of_the_urdf(options):
         {"neutral_joint_position": (float("nan"),) * 7},
     ],
 )
-def test_numbers_out_of_range(options):
+def test_numbers_out_of_range_are_refused(options):
     (name,) = options
     with pytest.raises(ValueError, match=f"{name} must be"):
         make_kuka(**options)
 
 
-def test_wrong_joint_count_is_named():
+def test_a_wrong_number_of_joint_forces_is_refused():
     robot = make_kuka()
     robot.joint_forces = robot.joint_forces[:-1]
-    try:
+    with pytest.raises(ValueError, match="7 movable joints"):
         RobotTaskEnv(robot=robot, task=Reach())
-    except ValueError as error:
-        assert "7 movable joints" in str(error)
-    else:
-        raise AssertionError("a robot with a joint too few was accepted")

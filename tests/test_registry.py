@@ -89,8 +89,8 @@ def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
 def test_options_of_task_and_robot_are_checked():
     with pytest.raises(
         TypeError,
-        match="task_options of PandaPush-v1 got an unexpected keyword argument 'threshold'; did you "
-        "mean 'distance_threshold'",
+        match="task_options of PandaPush-v1 got an unexpected keyword argument "
+        "'threshold'; did you mean 'distance_threshold'",
     ):
         torch_panda.make("PandaPush-v1", task_options={"threshold": 0.1})
     with pytest.raises(TypeError, match="robot_options of PandaPush-v1 must be a map"):

@@ -1,4 +1,4 @@
-"""A user's robot with a gripper, by public names only."""
+"""A user's robot with a gripper, written with public names only."""
 
 import pytest
 import torch
@@ -72,7 +72,7 @@ def file(tmp_path):
 
 
 @pytest.mark.parametrize("control_type", ["ee", "ee_pose", "joints", "joint_velocity"])
-def test_it_moves(file, control_type):
+def test_a_gantry_moves_under_each_control_type(file, control_type):
     robot = make_gantry(file, control_type=control_type, block_gripper=True)
     with RobotTaskEnv(robot=robot, task=Reach(), num_envs=2, seed=0) as env:
         check_env_specs(env)
@@ -86,7 +86,7 @@ def test_it_moves(file, control_type):
         assert (moved[:, 0] > 0.05).all() and (moved[:, 1:].abs() < 0.01).all()
 
 
-def test_it_reaches(file):
+def test_a_gantry_reaches(file):
     robot = make_gantry(file, block_gripper=True)
     with RobotTaskEnv(robot=robot, task=Reach(), num_envs=4, seed=0) as env:
         td = env.reset()
@@ -97,7 +97,7 @@ def test_it_reaches(file):
 
 
 def pick_and_place(env, steps):
-    """Above the cube, down, close, to the goal."""
+    """Move above the cube, then down, close the gripper, and move to the goal."""
     td = env.reset()
     for step in range(steps):
         hand, cube = td["observation"][:, :3], td["achieved_goal"]
@@ -114,7 +114,7 @@ def pick_and_place(env, steps):
     return td
 
 
-def test_a_tool_weighs_nothing(file):
+def test_a_tool_has_no_mass(file):
     robot = make_gantry(file)
     with RobotTaskEnv(robot=robot, task=Reach()) as env:
         simulation = env.episodes.simulation
@@ -123,7 +123,7 @@ def test_a_tool_weighs_nothing(file):
         assert client.mass(body, robot.ee_link - 1) == 0.1
 
 
-def test_it_grasps(file):
+def test_a_gantry_grasps(file):
     robot, task = make_gantry(file), PickAndPlace()
     with RobotTaskEnv(
         robot=robot, task=task, num_envs=4, seed=0, max_episode_steps=70
@@ -149,7 +149,7 @@ def test_shipped_robots_reach(env_id):
         assert td["success"].all()
 
 
-def test_wrong_grippers_and_tools_are_named(file):
+def test_a_gripper_or_tool_that_does_not_fit_is_refused(file):
     with pytest.raises(ValueError, match="4 joints of the arm and 1 of the gripper"):
         Robot(
             urdf=file,

@@ -1,4 +1,4 @@
-"""A user's task with all hooks and a drawer, by public names only."""
+"""A user's task with all hooks and a drawer, written with public names only."""
 
 import gymnasium
 import pytest
@@ -30,7 +30,7 @@ DRAWER = """
 
 
 class Shove(Task):
-    """Shove a drawer, of a friction that nobody knows, to a position."""
+    """Shove a drawer to a position. Its friction differs between episodes."""
 
     goal_dim = 1
     observation_dim = 2
@@ -92,34 +92,34 @@ def shove(tmp_path):
     yield ID
 
 
-def forward(env, steps=12):
-    """Push along x; all that was observed."""
-    td, seen = env.reset(), []
+def push_forward(env, steps=12):
+    """Move the hand along x and return the outputs of all steps."""
+    td, outputs = env.reset(), []
     for _ in range(steps):
         action = torch.zeros(env.action_spec.shape)
         action[..., 0] = 1.0
         td = env.step(td.set("action", action))["next"]
-        seen.append(td.clone())
-    return torch.stack(seen)
+        outputs.append(td.clone())
+    return torch.stack(outputs)
 
 
-def test_the_drawer_is_state_goal_and_observation(loop):
+def test_a_joint_of_an_object_is_state_goal_and_observation(loop):
     with torch_panda.make(ID, num_envs=3, seed=0) as env:
         check_env_specs(env)
-        seen = forward(env)
+        seen = push_forward(env)
         assert env.max_episode_steps == 30
-        found = env.get_state()
-        assert found["object_joint_position"].shape == (3, 1)
+        state = env.get_state()
+        assert state["object_joint_position"].shape == (3, 1)
         assert torch.equal(
-            found["object_joint_position"].float(), seen[-1]["achieved_goal"]
+            state["object_joint_position"].float(), seen[-1]["achieved_goal"]
         )
-        assert (seen[-1]["achieved_goal"] > 0.02).all()  # it was shoved
-        assert len(found["object_pose"][:, 0, 1].unique()) == 3
-        # The friction of each is another one, so they are not shoved as far.
+        assert (seen[-1]["achieved_goal"] > 0.02).all()
+        assert len(state["object_pose"][:, 0, 1].unique()) == 3
+        # The drawers have different frictions, so they end at different speeds.
         assert len(seen[-1]["observation"][:, -2].unique()) == 3
 
 
-def test_hooks(loop):
+def test_the_hooks_of_a_task_are_called(loop):
     with torch_panda.make(ID, num_envs=2, seed=0) as env:
         td = env.reset()
         assert not td["terminated"].any()
@@ -138,18 +138,18 @@ def test_hooks(loop):
         assert not env.reset(td)["done"].any()
 
 
-def test_episodes_are_reproducible_and_states_exact(loop):
+def test_episodes_and_exact_states_repeat_bit_for_bit(loop):
     with (
         torch_panda.make(ID, num_envs=3, seed=5) as env,
         torch_panda.make(ID, num_envs=2, seed=5, num_threads=1) as other,
     ):
-        forward(env)  # which leaves friction and contacts behind
+        push_forward(env)  # leaves friction and contacts behind
         env.set_seed(5)
-        first = forward(env)
-        assert (forward(other) == first[:, :2]).all()
+        first = push_forward(env)
+        assert (push_forward(other) == first[:, :2]).all()
         state = env.get_state(exact=True)
         after = env.rand_step(first[-1].exclude("reward", "action"))
-        # One exact state in all environments: their friction comes with it.
+        # An exact state brings the friction of its episode.
         again = env.reset(state, set_state=True)
         again["action"] = after["action"]
         assert (env.step(again)["next"] == after["next"]).all()
@@ -160,7 +160,7 @@ def test_episodes_are_reproducible_and_states_exact(loop):
         assert (forked == after["next"][[1, 1, 1]]).all()
 
 
-def test_options():
+def test_options_reach_a_registered_task():
     with torch_panda.make(
         ID, task_options={"distance_threshold": 0.01}, robot_options={}
     ) as env:
@@ -173,7 +173,7 @@ def test_options():
         torch_panda.register("PandaPush-v1", robot=Panda, task=Shove)
 
 
-def test_gymnasium():
+def test_a_registered_task_in_gymnasium():
     with gymnasium.make(
         f"torch_panda/{ID}", task_options={"distance_threshold": 0.01}
     ) as env:
@@ -192,7 +192,7 @@ def test_gymnasium():
     vector.close()
 
 
-def test_stable_baselines3():
+def test_a_registered_task_in_stable_baselines3():
     from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
 
     env = SB3VecEnv(ID, num_envs=2, task_options={"force": 1.0})
@@ -201,17 +201,17 @@ def test_stable_baselines3():
     env.close()
 
 
-def test_the_drawer_is_drawn():
+def test_a_moved_drawer_changes_the_picture():
     with torch_panda.make(ID, seed=0) as env:
         env.reset()
         before = env.render(size=64)
-        forward(env)
+        push_forward(env)
         assert (env.render(size=64) != before).any()
         assert "object" in env.segmentation_ids
 
 
 class Buffered(Reach):
-    """A task that fills the same tensors at every step, and changes the action."""
+    """A task that writes into the same tensors at every step, and into the action."""
 
     def __init__(self, **options):
         super().__init__(**options)
@@ -225,7 +225,7 @@ class Buffered(Reach):
         return self.out.copy_(-self.distance(achieved_goal, desired_goal))
 
 
-def test_steps_do_not_share_what_a_task_uses_again():
+def test_outputs_do_not_share_tensors_that_a_task_reuses():
     with RobotTaskEnv(
         robot=Panda(block_gripper=True), task=Buffered(), num_envs=2, seed=0
     ) as env:

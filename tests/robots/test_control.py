@@ -1,4 +1,4 @@
-"""What actions do under each control type, through either loop."""
+"""Actions under each control type, with the compiled loop and with Python's."""
 
 import math
 from itertools import product
@@ -21,7 +21,7 @@ from torch_panda.rotations import (
 TYPES = get_args(ControlType)
 ID = "PandaPickAndPlace-v1"
 DIMS = {"ee": 3, "ee_pose": 6, "joints": 7, "joint_velocity": 7, "joint_torque": 7}
-SETTLED = 8  # steps
+SETTLED = 8  # steps until the arm moves steadily
 
 
 def make(env_id=ID, *, num_envs=1, **options):
@@ -29,7 +29,7 @@ def make(env_id=ID, *, num_envs=1, **options):
 
 
 def hold(env, action, steps=SETTLED):
-    """Repeat an action; simulation and last output."""
+    """Repeat an action, and return the simulation and the last output."""
     td = env.reset()
     for _ in range(steps):
         td = env.step(td.set("action", action.expand(env.action_spec.shape)))["next"]
@@ -43,7 +43,7 @@ def unit(size, index, value=1.0):
 
 
 @pytest.mark.parametrize("control_type", TYPES)
-def test_sizes(control_type):
+def test_the_control_type_determines_the_size_of_actions(control_type):
     with make(control_type=control_type) as env:
         check_env_specs(env)
         assert env.action_spec.shape == (1, DIMS[control_type] + 1)
@@ -52,7 +52,7 @@ def test_sizes(control_type):
 
 
 @pytest.mark.parametrize("control_type", TYPES)
-def test_both_loops_give_the_same(control_type, monkeypatch):
+def test_both_loops_agree_bit_for_bit(control_type, monkeypatch):
     if native.LIBRARY is None:
         pytest.skip("installed where there was no C compiler")
     rollouts = []
@@ -65,7 +65,7 @@ def test_both_loops_give_the_same(control_type, monkeypatch):
     assert (rollouts[0] == rollouts[1]).all()
 
 
-def test_velocity(loop):
+def test_a_joint_moves_at_the_velocity_of_the_action(loop):
     with make(control_type="joint_velocity") as env:
         simulation, _ = hold(env, unit(8, 3, 0.4))
         assert simulation.joint_velocity[0, 3] == pytest.approx(0.5, abs=0.02)
@@ -76,8 +76,7 @@ def test_velocity(loop):
         assert simulation.joint_velocity[0, 3] == pytest.approx(0.2, abs=0.02)
 
 
-def test_torque_is_what_the_joint_feels(loop):
-    """The arm falls without any; what pybullet does with the same torques."""
+def test_torques_move_the_arm_as_in_pybullet(loop):
     with make("PandaReach-v1", control_type="joint_torque", action_scale=0.1) as env:
         action = torch.tensor([0.3, -0.2, 0.1, 0.4, 0.0, -0.5, 0.2])
         simulation, _ = hold(env, action, steps=3)
@@ -125,7 +124,7 @@ def test_torque_is_what_the_joint_feels(loop):
     assert moved.abs().max() > 0.02
 
 
-def test_pose_displaces_along_the_world_and_turns_in_the_hand(loop):
+def test_ee_pose_moves_along_the_world_and_rotates_in_the_hand_frame(loop):
     start = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     with make(control_type="ee_pose") as env:
         simulation, td = hold(env, torch.zeros(7))
@@ -137,15 +136,15 @@ def test_pose_displaces_along_the_world_and_turns_in_the_hand(loop):
             simulation, td = hold(env, unit(7, 3 + axis, angle))
             assert (td["observation"][0, :3] - rest).norm() < 0.04
             vector = torch.zeros(1, 3, dtype=torch.float64)
-            # As fast as displacements, the hand lags behind what it is asked for.
+            # The hand lags behind its setpoint.
             vector[0, axis] = SETTLED * angle * 0.05
-            wanted = quaternion_product(start, rotation_vector_to_quaternion(vector))
-            cosine = (simulation.ee_orientation * wanted).sum().abs()
-            unturned = (start * wanted).sum().abs()
-            assert cosine.acos() < 0.6 * unturned.acos()
+            target = quaternion_product(start, rotation_vector_to_quaternion(vector))
+            cosine = (simulation.ee_orientation * target).sum().abs()
+            cosine_at_start = (start * target).sum().abs()
+            assert cosine.acos() < 0.6 * cosine_at_start.acos()
 
 
-def test_rotations_equal_pybullets():
+def test_rotations_agree_with_pybullet():
     torch.manual_seed(0)
     vectors = torch.randn(20, 3, dtype=torch.float64)
     turns = rotation_vector_to_quaternion(vectors)
@@ -163,11 +162,11 @@ def test_rotations_equal_pybullets():
         _, expected = pybullet.multiplyTransforms(
             (0, 0, 0), a.tolist(), (0, 0, 0), b.tolist()
         )
-        sign = math.copysign(1.0, found[3] * expected[3])  # q and -q are the same
+        sign = math.copysign(1.0, found[3] * expected[3])  # q and -q are one rotation
         assert (sign * found).tolist() == pytest.approx(expected, abs=1e-6)
 
 
-def test_action_scale():
+def test_a_smaller_action_scale_moves_the_hand_less():
     with make(action_scale=0.02) as slow, make() as plain:
         near = hold(slow, unit(4, 0), 4)[1]["observation"][0, 0]
         far = hold(plain, unit(4, 0), 4)[1]["observation"][0, 0]
@@ -175,7 +174,7 @@ def test_action_scale():
     assert 0 < near - start < 0.6 * (far - start)
 
 
-def test_workspace():
+def test_the_hand_stays_in_the_workspace():
     box = ((-0.1, -0.05, 0.15), (0.1, 0.05, 0.25))
     with make(workspace=box) as env:
         for action in product((-1.0, 1.0), repeat=3):
@@ -185,8 +184,7 @@ def test_workspace():
             assert (position > low - 0.02).all() and (position < high + 0.02).all()
 
 
-def test_base_pose():
-    """A robot that stands turned by 90 degrees does the same, turned."""
+def test_a_robot_on_a_turned_base_moves_in_the_turned_directions():
     half = math.sqrt(0.5)
     turned = {"base_position": (0.0, -0.6, 0.0), "base_orientation": (0, 0, half, half)}
     with make("PandaReach-v1", control_type="joints") as plain:
@@ -196,7 +194,8 @@ def test_base_pose():
     x, y, z = first["observation"][0, :3].tolist()
     found = second["observation"][0, :3].tolist()
     assert found == pytest.approx((-y, x, z), abs=1e-3)
-    with make("PandaReach-v1", **turned) as env:  # inverse kinematics know of it
+    # Inverse kinematics accounts for the pose of the base.
+    with make("PandaReach-v1", **turned) as env:
         td = env.reset()
         for _ in range(30):
             error = td["desired_goal"] - td["achieved_goal"]
@@ -214,19 +213,19 @@ def test_base_pose():
         ({"base_orientation": (0, 0, 0, 0)}, "base_orientation must be"),
     ],
 )
-def test_bad_options(options, message):
+def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Panda(**options)
 
 
-def test_bad_grippers():
+def test_grippers_that_cannot_move_are_refused():
     with pytest.raises(ValueError, match="of which one moves"):
         Gripper(closed=(0.0,), opened=(0.0,), width=0.1)
     with pytest.raises(ValueError, match="width must be above 0"):
         Gripper(closed=(0.0,), opened=(0.1,), width=0.0)
 
 
-def test_fingers_go_where_the_action_says():
+def test_fingers_open_as_wide_as_the_gripper_allows():
     with RobotTaskEnv(robot=Panda(), task=Reach(), num_envs=1) as env:
         simulation, td = hold(env, unit(4, 3))
         assert td["observation"][0, 6] == pytest.approx(0.08, abs=0.001)

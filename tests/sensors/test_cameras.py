@@ -1,4 +1,4 @@
-"""Learning from pixels: cameras as observations."""
+"""Cameras as sensors."""
 
 import pickle
 
@@ -35,7 +35,7 @@ def test_specs(num_envs):
         assert "observation" in td
 
 
-def test_what_is_not_asked_for_is_not_there():
+def test_only_requested_images_are_observed():
     with make(depth=False, segmentation=False, pixels_only=True) as env:
         check_env_specs(env)
         keys = set(env.reset().keys()) - {"done", "terminated", "truncated", "success"}
@@ -47,19 +47,19 @@ def test_what_is_not_asked_for_is_not_there():
         make(from_pixels=False, pixels_only=True)
 
 
-def test_pixels_are_what_render_shows():
+def test_pixels_equal_the_pictures_of_render():
     camera = Camera(distance=0.8, yaw=80)
     with make(num_envs=4, num_threads=2, camera=camera) as env:
         td = env.rollout(4)
         assert (
             env.render(camera=camera, size=SIZE) == td["next", "pixels"][:, -1]
         ).all()
-        # Later steps do not write into earlier ones.
+        # Later steps do not overwrite earlier pictures.
         assert not (td["next", "pixels"][:, 0] == td["next", "pixels"][:, -1]).all()
         assert (td["next", "pixels"][:, :-1] == td["pixels"][:, 1:]).all()
 
 
-def test_partial_resets_and_steps():
+def test_partial_resets_and_steps_leave_other_pictures_unchanged():
     with make() as env:
         td = env.reset()
         before = {key: td[key].clone() for key in ("pixels", "depth", "segmentation")}
@@ -83,7 +83,7 @@ def test_partial_resets_and_steps():
 
 
 def project(point, camera):
-    """Column, row and depth at which a camera sees a point, by its own geometry."""
+    """Column, row and depth of a point in a picture, from the camera's geometry."""
     yaw, pitch = torch.deg2rad(torch.tensor([camera.yaw, camera.pitch]).double())
     forward = torch.stack(
         (-yaw.sin() * pitch.cos(), yaw.cos() * pitch.cos(), pitch.sin())
@@ -98,14 +98,14 @@ def project(point, camera):
     return int(column), int(row), float(depth)
 
 
-def test_objects_are_seen_where_they_are():
+def test_segmentation_and_depth_show_objects_at_their_positions():
     camera = Camera(distance=0.7, yaw=120, pitch=-50, width=360, height=280)
     with make("PandaStack-v1", num_envs=2, camera=camera, render_size=None) as env:
         td = env.reset()
         ids = env.segmentation_ids
         assert set(ids) == {"nothing", "robot", "ground", "table", "object1", "object2"}
         assert set(td["segmentation"].unique().tolist()) <= set(ids.values())
-        found = 0
+        num_visible = 0
         for env_index in range(2):
             poses = env.get_state()["object_pose"][env_index]
             for name, position in zip(
@@ -113,16 +113,16 @@ def test_objects_are_seen_where_they_are():
             ):
                 column, row, depth = project(position, camera)
                 if td["segmentation"][env_index, row, column, 0] == ids[name]:
-                    found += 1
+                    num_visible += 1
                     seen = td["depth"][env_index, row, column, 0]
                     # A face is 2 to 3.5 cm before the centre; a pixel is 3 mm wide.
                     assert 0.017 < depth - seen < 0.038
-        assert found >= 3  # the arm or a cube may hide one
+        assert num_visible >= 3  # the arm or a cube may hide one
         assert (td["depth"] <= camera.far).all()
         assert (td["depth"][td["segmentation"] == ids["nothing"]] == camera.far).all()
 
 
-def test_targets_are_in_the_pixels_only():
+def test_markers_are_in_pixels_but_not_in_depth_and_segmentation():
     camera = Camera(distance=0.5, width=50, height=50)
     with make(num_envs=None, camera=camera, render_size=None) as env:
         td = env.reset()
@@ -134,7 +134,7 @@ def test_targets_are_in_the_pixels_only():
         assert (td["segmentation"] == other["segmentation"]).all()
 
 
-def test_same_episodes_as_without():
+def test_cameras_do_not_change_the_physics():
     rollouts = []
     for images in (IMAGES, {}):
         env = torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0, **images)
@@ -144,7 +144,7 @@ def test_same_episodes_as_without():
     assert (rollouts[0] == rollouts[1]).all()
 
 
-def test_pickle_keeps_the_options():
+def test_a_pickled_environment_keeps_its_cameras():
     with (
         make(sensors=("joint_torque",)) as env,
         pickle.loads(pickle.dumps(env)) as copy,
@@ -153,7 +153,7 @@ def test_pickle_keeps_the_options():
         assert (copy.reset()["pixels"] == env.reset()["pixels"]).all()
 
 
-def test_egl_where_it_works_and_a_clear_error_elsewhere():
+def test_egl_agrees_with_tiny_renderer_or_raises():
     camera = Camera(distance=1.2, pitch=-90, width=48, height=48)
     options = {"num_envs": 2, "camera": camera, "render_size": None}
     try:
@@ -164,19 +164,19 @@ def test_egl_where_it_works_and_a_clear_error_elsewhere():
     with env, make(**options) as tiny:
         ours, theirs = env.reset(), tiny.reset()
         ids = env.segmentation_ids
-        # Other lights and edges, but the same things in the same places.
+        # Lights and edges differ, but the same bodies are at the same places.
         same = ours["segmentation"] == theirs["segmentation"]
         assert same.float().mean() > 0.95
         for images in (ours, theirs):
             table = images["depth"][images["segmentation"] == ids["table"]]
             assert table.median() == pytest.approx(1.2, abs=1e-4)
         assert ours["pixels"].float().std() > 20
-        # A picture does not depend on what was drawn before, if anything was.
+        # A picture does not depend on earlier pictures.
         again = env.reset(env.get_state(), set_state=True)
         assert (again["pixels"] == ours["pixels"]).all()
 
 
-def test_no_blank_frames_without_egl(monkeypatch):
+def test_egl_that_does_not_work_raises(monkeypatch):
     egl._check_egl.cache_clear()
     monkeypatch.setattr(egl, "_EGL_PROBE", "raise SystemExit('no EGL device')")
     with pytest.raises(RuntimeError, match=r"use 'tiny'.*no EGL device"):
@@ -184,12 +184,12 @@ def test_no_blank_frames_without_egl(monkeypatch):
     egl._check_egl.cache_clear()
 
 
-def test_unknown_renderer():
+def test_an_unknown_renderer_is_refused():
     with pytest.raises(ValueError, match=r"renderer must be one of.*'gl'"):
         make(renderer="gl")
 
 
-def test_several_cameras_one_on_the_hand():
+def test_two_cameras_of_which_one_is_on_the_hand():
     front = CameraSensor(Camera(width=48, height=48))
     hand = CameraSensor(
         HandCamera(width=64, height=48), depth=True, segmentation=True, name="wrist"
@@ -204,7 +204,7 @@ def test_several_cameras_one_on_the_hand():
         assert td["wrist_depth"].shape == (2, 48, 64, 1)
         picture = env.render(camera=HandCamera(width=64, height=48))
         assert (picture == td["wrist_pixels"]).all()
-        # The hand goes above the cube, opens, and sees it in the middle.
+        # The open hand is above the cube, which is in the middle of the picture.
         ids = env.segmentation_ids
         for _ in range(20):
             above = td["achieved_goal"] + torch.tensor((0.0, 0.0, 0.1))
@@ -214,7 +214,7 @@ def test_several_cameras_one_on_the_hand():
         seen = td["wrist_segmentation"][..., 0]
         rows, columns = (seen[0] == ids["object"]).nonzero().double().T
         assert len(rows) > 20 and abs(columns.mean() - 31.5) < 6
-        assert (seen == ids["robot"]).any()  # its fingers
+        assert (seen == ids["robot"]).any()  # the fingers
         near = td["wrist_depth"][0, ..., 0][seen[0] == ids["object"]]
         assert 0.1 < near.min() < near.max() < 0.35
         before = td["wrist_pixels"].clone()
@@ -223,7 +223,7 @@ def test_several_cameras_one_on_the_hand():
         assert (td["wrist_pixels"] != before).any()
 
 
-def test_two_cameras_need_names():
+def test_two_cameras_without_names_are_refused():
     with pytest.raises(ValueError, match="two sensors observe"):
         torch_panda.make("PandaPush-v1", sensors=(CameraSensor(), CameraSensor()))
     with pytest.raises(ValueError, match="line of sight"):

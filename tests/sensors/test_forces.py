@@ -1,4 +1,4 @@
-"""Forces against Newton: press the table, lift a cube."""
+"""Force sensors against Newton's laws: press the table, lift a cube."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ ARM = 7  # joints
 
 
 def hand_to_world(env):
-    """Rotation of the hand's frame, where the wrist's wrench is given: (3, 3)."""
+    """Rotation matrix of the hand's frame, in which the wrist sensor measures."""
     simulation = env.episodes.simulation
     state = simulation.clients[0].state(simulation.scene.robot)
     *_, x, y, z, w = state.link_pose(HAND).tolist()
@@ -29,7 +29,7 @@ def hand_to_world(env):
     )
 
 
-def test_press_on_the_table():
+def test_forces_balance_when_the_hand_presses_the_table():
     with torch_panda.make("PandaPush-v1", seed=0, sensors=SENSORS) as env:
         td = env.reset()
         assert all((td[sensor] == 0).all() for sensor in SENSORS)
@@ -37,54 +37,55 @@ def test_press_on_the_table():
             td = env.step(td.set("action", torch.tensor([0.0, 0.0, -1.0])))["next"]
         on_hand = hand_to_world(env) @ td["wrist_force_torque"][:3]
         on_fingers = td["finger_contact"].sum(0)
-    # The table pushes up, both fingers alike, and the arm pushes the hand down.
+    # The table pushes both fingers up, and the arm pushes the hand down.
     assert (td["finger_contact"][:, 2] > 50).all()
     assert on_hand[2] < -100
-    # Arm, table and gravity balance; the hand still creeps over the table, and its
-    # acceleration accounts for up to 1 % of the forces.
+    # The forces of arm, table and gravity balance. The hand still creeps over the
+    # table, so its acceleration accounts for up to 1 % of them.
     weight = torch.tensor([0.0, 0.0, -HAND_MASS * G])
     residual = on_hand + on_fingers + weight
     assert residual.norm() < 0.01 * on_fingers.norm()
 
 
-def test_lift_a_cube():
+def test_forces_balance_when_the_hand_holds_a_cube():
     env = torch_panda.make(
         "PandaPickAndPlace-v1", seed=0, sensors=SENSORS, max_episode_steps=200
     )
     td = env.reset()
 
-    def go(target, grip, steps):
+    def move(target, grip, steps):
         nonlocal td
         for _ in range(steps):
             offset = target(td["observation"]) - td["observation"][:3]
             action = torch.cat(((offset * 8).clamp(-1, 1), torch.tensor([grip])))
             td = env.step(td.set("action", action))["next"]
 
-    go(lambda o: o[7:10] + torch.tensor([0.0, 0.0, 0.1]), 1.0, 12)
-    go(lambda o: o[7:10], 1.0, 30)
+    move(lambda o: o[7:10] + torch.tensor([0.0, 0.0, 0.1]), 1.0, 12)
+    move(lambda o: o[7:10], 1.0, 30)
     free = hand_to_world(env) @ td["wrist_force_torque"][:3]
-    go(lambda o: o[7:10], -1.0, 5)
+    move(lambda o: o[7:10], -1.0, 5)
     top = td["observation"][:3] + torch.tensor([0.0, 0.0, 0.15])
-    go(lambda o: top, -1.0, 45)
+    move(lambda o: top, -1.0, 45)
     loaded = hand_to_world(env) @ td["wrist_force_torque"][:3]
     contact, torque = td["finger_contact"], td["joint_torque"]
     assert td["observation"][9] > 0.15, "the cube must hang in the air"
     env.close()
-    # The cube pulls the fingers down with its weight, and nowhere else: at rest
-    # this holds to the cube's remaining acceleration, below 0.02 m/s^2.
+    # The only force of the cube on the fingers is its weight. The cube still
+    # accelerates by less than 0.02 m/s^2.
     cube = env.task.object_mass
     weight = torch.tensor([0.0, 0.0, -cube * G])
     torch.testing.assert_close(contact.sum(0), weight, atol=0.02, rtol=0)
-    # Each finger is pushed outwards as hard as its motor pushes inwards.
+    # The cube pushes each finger outwards as hard as its motor pushes inwards.
     assert contact[0, 1] * contact[1, 1] < 0
     torch.testing.assert_close(contact[:, 1].abs(), -torque[ARM:], rtol=0.01, atol=0)
-    # The wrist bears the hand, then hand and cube. The arm holds still to 0.1 m/s^2.
+    # The wrist bears the hand, and later the hand and the cube. The arm accelerates by
+    # less than 0.1 m/s^2.
     down = torch.tensor([0.0, 0.0, 1.0])
     for measured, mass in ((free, HAND_MASS), (loaded, HAND_MASS + cube)):
         torch.testing.assert_close(measured, mass * G * down, atol=0.1 * mass, rtol=0)
 
 
-def test_physics_is_the_same_with_sensors():
+def test_sensors_do_not_change_the_physics():
     rollouts = []
     for sensors in ((), SENSORS):
         env = torch_panda.make(
@@ -94,7 +95,7 @@ def test_physics_is_the_same_with_sensors():
         observations, touched = [], False
         generator = torch.Generator().manual_seed(0)
         for _ in range(50):
-            # Towards the cube and about, so that fingers, cube and table touch.
+            # Noise and a pull towards the cube make fingers, cube and table touch.
             noise = torch.rand(3, 4, generator=generator) * 2 - 1
             pull = (td["achieved_goal"] - td["observation"][:, :3]) * 10
             noise[:, :3] = noise[:, :3] * 0.5 + pull
@@ -124,7 +125,7 @@ def test_specs(num_envs):
         assert (td["joint_torque"][..., 1].abs() > 1).all()
 
 
-def test_partial_steps_and_resets():
+def test_a_partial_reset_leaves_other_environments_unchanged():
     with torch_panda.make("PandaPush-v1", num_envs=2, seed=0, sensors=SENSORS) as env:
         td = env.rollout(3)[:, -1]["next"]
         before = td["joint_torque"].clone()
@@ -134,12 +135,12 @@ def test_partial_steps_and_resets():
         assert (td["joint_torque"][1] == before[1]).all()
 
 
-def test_only_what_was_asked_for():
+def test_only_requested_sensors_are_observed():
     with torch_panda.make("PandaPush-v1", sensors=("finger_contact",)) as env:
         assert not {"joint_torque", "wrist_force_torque"} & set(env.reset().keys())
 
 
-def test_unknown_sensors_are_named():
+def test_sensors_that_a_robot_cannot_have_are_refused():
     with pytest.raises(ValueError, match=r"'finger_contact', 'joint_torque'.*smell"):
         torch_panda.make("PandaPush-v1", sensors=("smell",))
     with pytest.raises(ValueError, match=r"among \('joint_state', 'joint_torque'\)"):

@@ -1,4 +1,4 @@
-"""Rewards by hand."""
+"""Rewards, success and arguments of tasks."""
 
 import math
 import pickle
@@ -21,11 +21,11 @@ def test_rotate_equals_pybullet(roll, pitch, yaw):
     quaternion = pybullet.getQuaternionFromEuler((roll, pitch, yaw))
     vector = torch.tensor([[0.3, -0.2, 0.7], [-1.0, 2.0, 0.5]], dtype=torch.float64)
     matrix = torch.tensor(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-    found = rotate(torch.tensor(quaternion, dtype=torch.float64), vector)
-    torch.testing.assert_close(found, vector @ matrix.double().T, atol=1e-6, rtol=0)
+    rotated = rotate(torch.tensor(quaternion, dtype=torch.float64), vector)
+    torch.testing.assert_close(rotated, vector @ matrix.double().T, atol=1e-6, rtol=0)
 
 
-def test_rewards_by_hand():
+def test_rewards_and_success_of_push():
     goal = torch.zeros(2, 3)
     achieved = torch.tensor([[0.03, 0.0, 0.04], [0.03, 0.0, 0.039]])
     assert Push().is_success(achieved, goal).flatten().tolist() == [False, True]
@@ -33,7 +33,7 @@ def test_rewards_by_hand():
     torch.testing.assert_close(dense, torch.tensor([[-0.05]]))
 
 
-def test_stack_compares_each_cube_or_both():
+def test_stack_compares_each_cube_or_the_norm_of_both():
     goal = torch.zeros(6)
     achieved = torch.tensor([0.04, 0.0, 0.0, 0.0, 0.06, 0.0])
     assert not Stack().is_success(achieved, goal)
@@ -43,7 +43,7 @@ def test_stack_compares_each_cube_or_both():
     torch.testing.assert_close(dense, torch.tensor([-math.sqrt(0.0052)]))
 
 
-def test_flip_takes_opposite_quaternions_for_one_orientation():
+def test_opposite_quaternions_are_one_orientation_in_flip():
     quaternion = torch.tensor([0.5, 0.5, 0.5, 0.5])
     assert Flip().is_success(quaternion, -quaternion)
     other = torch.tensor([0.5, -0.5, 0.5, -0.5])
@@ -145,6 +145,6 @@ def test_reward_types_are_named():
 
 
 @pytest.mark.parametrize("threshold", [math.nan, -0.01, math.inf])
-def test_thresholds_that_are_none(threshold):
+def test_a_threshold_must_be_finite_and_not_negative(threshold):
     with pytest.raises(ValueError, match="distance_threshold must be finite"):
         Push(distance_threshold=threshold)

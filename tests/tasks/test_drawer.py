@@ -1,4 +1,4 @@
-"""Drawer: what it draws, and where its handle is."""
+"""Drawer: starts, goals and the friction of its slide."""
 
 import math
 
@@ -18,20 +18,20 @@ def test_sizes():
         assert env.max_episode_steps == 50
 
 
-def test_starts_are_apart_from_goals_and_in_reach_of_the_slide():
+def test_goals_are_within_the_slide_and_far_enough_from_the_start():
     task, rng = Drawer(), np.random.default_rng(0)
     for _ in range(200):
         start = task.sample_start(rng)
         ((x, y, *_),), (opening,) = start.object_pose, start.object_joint_position
-        wanted = x - 0.06 - start.goal[0]
+        goal_opening = x - 0.06 - start.goal[0]
         assert 0 <= opening <= 0.25
-        assert 0 <= wanted <= 0.25
-        assert abs(wanted - opening) >= 0.1
+        assert 0 <= goal_opening <= 0.25
+        assert abs(goal_opening - opening) >= 0.1
         assert start.goal[1:] == [y, 0.06]
 
 
-def test_the_goal_can_be_reached():
-    """An open drawer is where the goal is, wherever the cabinet stands and faces."""
+def test_a_drawer_opened_as_far_as_the_goal_asks_is_a_success():
+    """Also for a cabinet that is turned."""
     with torch_panda.make("PandaDrawer-v1", num_envs=4, seed=0) as env:
         td = env.reset()
         assert not td["success"].any()
@@ -41,7 +41,7 @@ def test_the_goal_can_be_reached():
         td = env.reset(state, set_state=True)
         torch.testing.assert_close(td["achieved_goal"], goal.float())
         assert td["success"].all()
-        # Turned by 90 degrees it opens along -y.
+        # A cabinet that is turned by 90 degrees opens along -y.
         turned = torch.tensor((0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)))
         state["object_pose"][:, 0, 3:] = turned
         state["object_joint_position"][:] = 0.1
@@ -51,8 +51,8 @@ def test_the_goal_can_be_reached():
         torch.testing.assert_close(place, expected, atol=1e-6, rtol=0)
 
 
-def test_friction_stops_it():
-    """As force over mass says: 5 N and 1 kg stop 0.5 m/s within 2.5 cm."""
+def test_friction_stops_the_drawer():
+    """A force of 5 N stops 1 kg at 0.5 m/s within 2.5 cm, as v^2 m / (2 F) says."""
     moved = []
     for force in (5.0, 2.5):
         options = {"drawer_friction": force}
@@ -70,6 +70,6 @@ def test_friction_stops_it():
     assert moved[1] == pytest.approx(0.05, rel=0.1)
 
 
-def test_impossible_options():
+def test_a_change_that_no_goal_can_have_is_refused():
     with pytest.raises(ValueError, match="min_change must be from 0"):
         Drawer(min_change=0.2)

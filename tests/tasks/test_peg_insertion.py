@@ -1,4 +1,4 @@
-"""PegInsertion: a peg in the hand, and a hole that is as wide as it says."""
+"""PegInsertion: the grasp, the width of the hole, and success."""
 
 import pytest
 import torch
@@ -9,20 +9,20 @@ from torch_panda import PegInsertion
 N = 3
 
 
-def rest(env, td, steps):
+def hold_still(env, td, steps):
     for _ in range(steps):
         td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
     return td
 
 
-def place(env, offset, height, steps=25):
-    """Where a peg is some steps after it was let go over the hole.
+def release_over_hole(env, offset, height, steps=25):
+    """Release the peg over the hole; the last output after some steps.
 
     Args:
-        env: of N environments.
-        offset: from the middle of the hole along x and y [m].
-        height: of the peg's lower end [m].
-        steps: that many.
+        env: An environment with batch size [N].
+        offset: Offset from the centre of the hole along x and y [m].
+        height: Height of the peg's lower end [m].
+        steps: Number of steps.
     """
     env.reset()
     state = env.get_state()
@@ -30,7 +30,7 @@ def place(env, offset, height, steps=25):
     peg = state["object_pose"][:, 0]
     peg[:, :2] = hole[:, :2] + torch.tensor(offset, dtype=torch.float64)
     peg[:, 2] = height + 0.04
-    return rest(env, env.reset(state, set_state=True), steps)
+    return hold_still(env, env.reset(state, set_state=True), steps)
 
 
 def test_sizes():
@@ -45,7 +45,7 @@ def test_the_hand_holds_the_peg():
     with torch_panda.make("PandaPegInsertion-v1", num_envs=N, seed=0) as env:
         td = env.reset()
         start = td["achieved_goal"]
-        end = rest(env, td, 49)["achieved_goal"]
+        end = hold_still(env, td, 49)["achieved_goal"]
         assert (end - start).norm(dim=1).max() < 0.002
         action = torch.tensor((0.1, -0.1, 0.1)).expand(N, 3)
         td = env.reset()
@@ -61,17 +61,17 @@ def test_the_hole_is_wider_by_the_play(clearance):
     with torch_panda.make(
         "PandaPegInsertion-v1", num_envs=N, seed=0, task_options=options
     ) as env:
-        inside = place(env, (0.4 * clearance, -0.4 * clearance), 0.052)
+        inside = release_over_hole(env, (0.4 * clearance, -0.4 * clearance), 0.052)
         assert (inside["achieved_goal"][:, 2] < 0.045).all()
-        on_top = place(env, (0.7 * clearance + 0.001, 0.0), 0.052)
+        on_top = release_over_hole(env, (0.7 * clearance + 0.001, 0.0), 0.052)
         assert (on_top["achieved_goal"][:, 2] > 0.045).all()
 
 
-def test_success_is_in_the_hole():
+def test_only_a_peg_in_the_hole_is_a_success():
     with torch_panda.make("PandaPegInsertion-v1", num_envs=N, seed=0) as env:
-        deep = place(env, (0.0, 0.0), 0.015, steps=0)
+        deep = release_over_hole(env, (0.0, 0.0), 0.015, steps=0)
         assert deep["success"].all()
-        # The goal is the end's place at 3 cm of the 5 cm.
+        # The goal is 3 cm below the top of the block, which is 5 cm high.
         goal = deep["desired_goal"]
         hole = deep["observation"][:, -3:]
         torch.testing.assert_close(goal, hole + torch.tensor((0.0, 0.0, 0.02)))
@@ -90,19 +90,19 @@ def test_success_is_in_the_hole():
         ({"depth": 0.005}, "depth must be from distance_threshold"),
     ],
 )
-def test_impossible_options(options, message):
+def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         PegInsertion(**options)
 
 
-def test_fingers_start_where_the_robot_says():
+def test_blocked_fingers_keep_the_width_of_the_robot():
     for width in (0.0, 0.03):
         robot_options = {"fingers_width": width}
         with torch_panda.make("PandaReach-v1", robot_options=robot_options) as env:
             td = env.reset()
             for _ in range(3):
-                found = env.get_state()["joint_position"][7:].sum().item()
-                assert found == pytest.approx(width, abs=1e-4)
+                fingers = env.get_state()["joint_position"][7:].sum().item()
+                assert fingers == pytest.approx(width, abs=1e-4)
                 td = env.step(td.set("action", torch.ones(3)))["next"]
     with pytest.raises(ValueError, match="fingers_width must be from 0"):
         torch_panda.Panda(fingers_width=0.1)
