@@ -160,9 +160,10 @@ class DataCheck:
         """Refuses entries that are affine functions of achieved and desired goal.
 
         An entry is suspect if the environment without its transforms does not have it
-        in the same shape. Its columns pass if the achieved goal alone or a column of
-        the environment's own entries reproduces them. More goals are needed than an
-        affine function has coefficients: a constant of an episode then fits none.
+        in the same shape. A column passes if the achieved goal alone reproduces it, or
+        if it belongs to a copy of one of the environment's own entries, which may
+        contain constants of an episode. More goals are needed than an affine function
+        has coefficients, so that other constants of an episode fit none.
 
         Returns:
             Whether the rows have enough different goals to tell.
@@ -182,15 +183,15 @@ class DataCheck:
         own: list[Tensor] = []
         suspects: dict[NestedKey, Tensor] = {}
         for key, entry in self._candidates(rows).items():
-            is_own = self.shapes is not None and self.shapes.get(key) == entry.shape[1:]
             columns = entry.reshape(len(entry), -1).double()
-            own += [*columns.unbind(1)] if is_own else []
-            suspects |= {} if is_own else {key: columns}
+            if self.shapes is not None and self.shapes.get(key) == entry.shape[1:]:
+                own.append(columns)
+            else:
+                suspects[key] = columns
         for key, columns in suspects.items():
             is_computed = _is_affine(columns, both) & ~_is_affine(columns, achieved)
             for column in is_computed.nonzero().flatten().tolist():
-                suspect = columns[:, column : column + 1]
-                if any(_is_affine(suspect, x[:, None]).all() for x in own):
+                if any(_is_in_copy(column, columns, entry) for entry in own):
                     continue
                 message = (
                     f"column {column} of {key!r} is an affine function of "
@@ -199,7 +200,8 @@ class DataCheck:
                 )
                 if self.shapes is not None:
                     raise ValueError(message)
-                self._warn(f"it seems that {message}", f"computed {key}")
+                hint = "; or make the transform with from_env, if the task observes it"
+                self._warn(f"it seems that {message}{hint}", f"computed {key}")
                 break
         return True
 
@@ -260,9 +262,33 @@ def _is_affine(columns: Tensor, inputs: Tensor) -> Tensor:
     u, s, _ = torch.linalg.svd(scaled, full_matrices=False)
     basis = u[:, s > 1e-6 * s.max().clamp(min=1e-12)]
     centred = columns - columns.mean(0)
-    error = (centred - basis @ (basis.T @ centred)).abs().amax(0)
-    # float32 has a relative precision of 6e-8.
-    return error <= 1e-5 * centred.std(0) + 1e-6 * columns.abs().amax(0)
+    return _is_small(centred - basis @ (basis.T @ centred), columns)
+
+
+def _is_in_copy(column: int, columns: Tensor, entry: Tensor) -> bool:
+    """Returns whether a column belongs to a copy, scaled and shifted, of an entry.
+
+    Args:
+        column: Number of the column.
+        columns: All columns of the suspect, (n, m).
+        entry: Columns of an entry of the environment, (n, k).
+    """
+    size = entry.shape[1]
+    entry = entry - entry.mean(0)
+    for start in range(max(0, column - size + 1), column + 1):
+        block = columns[:, start : start + size]
+        if block.shape == entry.shape:
+            centred = block - block.mean(0)
+            scale = (centred * entry).sum(0) / entry.square().sum(0).clamp(min=1e-12)
+            if _is_small(centred - scale * entry, block).all():
+                return True
+    return False
+
+
+def _is_small(error: Tensor, columns: Tensor) -> Tensor:
+    """Returns in which columns, (n, m), an error is one of float32: (m,)."""
+    precision = 1e-5 * columns.std(0) + 1e-6 * columns.abs().amax(0)
+    return error.abs().amax(0) <= precision
 
 
 def _cat(pool: TensorDictBase | None, rows: TensorDictBase) -> TensorDictBase:

@@ -198,9 +198,13 @@ def _check_layout(
         RuntimeError: it does not.
     """
     ndim, writer = buffer.storage.ndim, type(buffer.writer)
+    if is_padded and not ndim == data.ndim == 1:
+        raise RuntimeError(
+            f"data {list(data.shape)} for ndim={ndim} have padded rows "
+            "(split_trajs=True): extend a storage of ndim=1 with data.reshape(-1), or "
+            "do not split trajectories"
+        )
     fits = data.ndim in (ndim - 1, ndim) and buffer.dim_extend == ndim - 1
-    if is_padded:  # rows are dropped, so that the others must come out flat
-        fits = ndim == 1
     adds_many = method == "add" and data.shape[ndim - 1 :].numel() > 1
     if adds_many or not fits or not issubclass(writer, RoundRobinWriter):
         raise RuntimeError(

@@ -1,5 +1,6 @@
 """Pipelines as people build them: hindsight is right in them, or says why not."""
 
+import copy
 import functools
 import warnings
 
@@ -10,7 +11,6 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
-    MultiStep,
     ReplayBuffer,
     ReplayBufferEnsemble,
     SliceSampler,
@@ -19,12 +19,11 @@ from torchrl.data import (
     TensorStorage,
 )
 from torchrl.envs import (
-    CatTensors,
     Compose,
     DoubleToFloat,
-    ObservationNorm,
+    ExcludeTransform,
     ParallelEnv,
-    RewardScaling,
+    SelectTransform,
     SerialEnv,
     TransformedEnv,
 )
@@ -32,28 +31,10 @@ from torchrl.envs import (
 import torch_panda
 from tests.transforms import toy
 from tests.transforms.identifiable import Envs, check_batch, relabelled, reward_fn
+from tests.transforms.pipelines import buffer, collect, make
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 BOTH = pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
-
-
-def make(env_id="PandaPush-v1", num_envs=4):
-    return torch_panda.make(env_id, num_envs=num_envs, seed=0)
-
-
-def buffer(transform, **options):
-    ndim = options.pop("ndim", 1)
-    storage = LazyTensorStorage(1000, ndim=ndim)
-    return TensorDictReplayBuffer(
-        storage=storage, transform=transform, batch_size=64, **options
-    )
-
-
-def collect(env, steps=10, batches=3, **options):
-    count = env.batch_size.numel() * steps
-    return Collector(
-        env, frames_per_batch=count, total_frames=count * batches, **options
-    )
 
 
 # -- from_env -------------------------------------------------------------------------
@@ -161,135 +142,6 @@ def test_an_end_for_another_reason_stays(with_success):
     assert failed.any() and (success & ~failed).any()
 
 
-# -- what another goal would contradict -----------------------------------------------
-
-
-@BOTH
-@pytest.mark.parametrize("collector", [True, False])
-def test_copies_of_the_goal_are_refused(hindsight, collector):
-    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
-    env = TransformedEnv(make(), cat)
-    rb = buffer(hindsight.from_env(env))
-    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
-        for data in collect(env) if collector else [env.rollout(10)]:
-            if not collector:
-                data["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 10)
-            rb.extend(data.reshape(-1))
-
-
-def test_copies_that_are_less_precise_are_refused():
-    data = Envs(4, [5]).chunk(10).reshape(-1)
-    for key in ("desired_goal", "achieved_goal"):
-        for entry in (data, data["next"]):
-            entry[key] = entry[key].double() + torch.rand(40, 3, dtype=torch.float64)
-    data["next", "desired_goal"] = data["desired_goal"].clone()
-    data["policy_input"] = torch.cat([torch.rand(40, 4), data["desired_goal"]], 1)
-    goals = data["next", "achieved_goal"], data["desired_goal"]
-    data["next", "reward"] = reward_fn(*goals).float()
-    for dtype, shape in ((torch.float32, (40, 7)), (torch.float16, (40, 1, 7))):
-        seen = data.clone()
-        seen["policy_input"] = data["policy_input"].to(dtype).reshape(shape)
-        rb = buffer(HindsightRelabel(reward_fn))
-        with pytest.raises(ValueError, match=r"policy_input.*copy"):
-            rb.extend(seen)
-
-
-def test_copies_made_in_the_buffer_before_hindsight_are_refused():
-    env = make()
-    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
-    rb = buffer(Compose(cat, HindsightRelabel.from_env(env)))
-    rb.extend(next(iter(collect(env))).reshape(-1))
-    with pytest.raises(ValueError, match=r"policy_input.*copy"):
-        rb.sample()
-
-
-def test_concatenating_after_hindsight_has_the_new_goal():
-    env = make()
-    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
-    rb = buffer(Compose(HindsightRelabel.from_env(env, her_ratio=1.0), cat))
-    rb.extend(next(iter(collect(env))).reshape(-1))
-    batch = rb.sample()
-    goal = batch["desired_goal"]
-    pieces = batch["policy_input"].unfold(1, 3, 1)
-    assert (pieces == goal[:, None]).all(-1).any(1).all()
-
-
-def test_observations_that_hold_the_achieved_goal_are_no_copies():
-    """Even where every row is asked for what it has, or goals are constants."""
-    for kind in ("achieved", "zeros"):
-        data = Envs(4, [5]).chunk(10).reshape(-1)
-        goal = data["achieved_goal"] if kind == "achieved" else torch.zeros(40, 3)
-        data["desired_goal"] = goal.clone()
-        data["next", "desired_goal"] = goal.clone()
-        data["observation"] = torch.cat([torch.zeros(40, 4), data["achieved_goal"]], 1)
-        goals = data["next", "achieved_goal"], goal
-        data["next", "reward"] = reward_fn(*goals)
-        rb = buffer(HindsightRelabel(reward_fn))
-        rb.extend(data)
-        rb.sample()
-
-
-@BOTH
-@pytest.mark.parametrize("n_steps", [1, 3])
-def test_rewards_of_several_steps_are_refused(hindsight, n_steps):
-    env = make("PandaReach-v1")
-    rb = buffer(hindsight.from_env(env))
-    collector = collect(env, postproc=MultiStep(gamma=0.9, n_steps=n_steps))
-    if n_steps == 1:
-        for data in collector:
-            rb.extend(data.reshape(-1))
-        return
-    with pytest.raises(ValueError, match=r"several steps.*MultiStep.*slice"):
-        for data in collector:
-            rb.extend(data.reshape(-1))
-
-
-@BOTH
-@pytest.mark.parametrize(
-    "env_id", ["PandaPush-v1", "PandaPushDense-v1", "PandaReach-v1"]
-)
-@pytest.mark.parametrize("scaling", [(0.0, 10.0), (0.0, 0.1), (1.0, 2.0), (1.0, 1.0)])
-def test_scaled_rewards_are_refused(hindsight, env_id, scaling):
-    """Also those of which only successes tell, which are few at Reach."""
-    env = TransformedEnv(make(env_id, 8), RewardScaling(*scaling))
-    rb = buffer(hindsight.from_env(env))
-    with pytest.raises(ValueError, match=r"reward_fn's times.*RewardScaling.*after"):
-        for data in collect(env, 50, 30):
-            rb.extend(data.reshape(-1))
-
-
-def test_goals_normalised_in_the_environment_warn():
-    env = TransformedEnv(
-        make("PandaReach-v1", 8),
-        ObservationNorm(0.0, 5.0, in_keys=["achieved_goal", "desired_goal"]),
-    )
-    rb = buffer(HindsightRelabel(env.base_env.compute_reward))
-    with pytest.warns(UserWarning, match="reward_fn gives other rewards"):
-        for data in collect(env, 50, 8):
-            rb.extend(data.reshape(-1))
-
-
-@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaStackDense-v1"])
-def test_right_rewards_are_taken_in_silence(env_id):
-    env = make(env_id)
-    rb = buffer(HindsightRelabel.from_env(env))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="reward_fn gives other")
-        for data in collect(env):
-            rb.extend(data.reshape(-1))
-            rb.sample()
-
-
-def test_other_rewards_warn_once():
-    env = make("PandaPushDense-v1")
-    other = torch_panda.make("PandaPush-v1").compute_reward
-    rb = buffer(HindsightRelabel.from_env(env, reward_fn=other))
-    with pytest.warns(UserWarning, match="reward_fn gives other rewards") as caught:
-        for data in collect(env):
-            rb.extend(data.reshape(-1))
-    assert len([w for w in caught if "reward_fn gives" in str(w.message)]) == 1
-
-
 # -- buffers --------------------------------------------------------------------------
 
 
@@ -380,6 +232,77 @@ def test_a_transform_that_moves_to_another_buffer_goes_by_that_one():
     third = buffer(chain, writer=writer)
     with pytest.raises(RuntimeError, match="round-robin"):
         third.extend(envs.chunk(2).reshape(-1))
+
+
+@BOTH
+@pytest.mark.parametrize("share", ["object", "clone"])
+def test_a_second_buffer_is_refused(hindsight, share):
+    transform = hindsight(reward_fn)
+    first = buffer(transform)
+    envs = Envs(2, [4])
+    first.extend(envs.chunk(8).reshape(-1))
+    second = buffer(Compose(transform if share == "object" else transform.clone()))
+    with pytest.raises(RuntimeError, match="belongs to another replay buffer"):
+        second.extend(envs.chunk(8).reshape(-1))
+    first.extend(envs.chunk(8).reshape(-1))
+    check_batch(first.sample(), first.storage[:], "future")
+    assert relabelled(first.sample()).float().mean() > 0.6
+
+
+@BOTH
+def test_a_buffer_whose_predecessor_is_gone_starts_empty(hindsight):
+    transform, envs = hindsight(reward_fn, strategy="episode"), Envs(2, [7])
+    for number in range(3):
+        rb = buffer(Compose(transform))
+        # Episodes are unfinished, and the ids go on in the next buffer.
+        rb.extend(envs.chunk(10 + number).reshape(-1))
+        stored = rb.storage[:]
+        check_batch(rb.sample(), stored, "episode")
+        del rb
+
+
+def test_a_copied_buffer_goes_on_by_itself():
+    first, envs = buffer(HindsightRelabel(reward_fn)), Envs(2, [4, 9])
+    first.extend(envs.chunk(10).reshape(-1))
+    second, others = copy.deepcopy(first), copy.deepcopy(envs)
+    for rb, source in ((first, envs), (second, others)):
+        rb.extend(source.chunk(10).reshape(-1))
+        check_batch(rb.sample(), rb.storage[:], "future")
+
+
+SELECTED = ["desired_goal", "achieved_goal", "next", "collector"]
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        lambda: SelectTransform(*SELECTED),
+        lambda: ExcludeTransform("hindsight_serial"),
+        lambda: Compose(DoubleToFloat(), Compose(SelectTransform(*SELECTED))),
+    ],
+)
+def test_selecting_before_hindsight_is_named(before):
+    rb = buffer(Compose(before(), HindsightRelabel(reward_fn)))
+    rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
+    message = "(Select|Exclude)Transform comes before HindsightRelabel.*put it after"
+    with pytest.raises(KeyError, match=message):
+        rb.sample()
+
+
+def test_excluding_a_needed_entry_before_hindsight_is_named():
+    before = ExcludeTransform(("next", "achieved_goal"))
+    rb = buffer(Compose(before, HindsightRelabel(reward_fn)))
+    rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
+    with pytest.raises(KeyError, match=r"needs .*achieved_goal"):
+        rb.sample()
+
+
+def test_selecting_after_hindsight_works():
+    after = SelectTransform("desired_goal", "next")
+    rb = buffer(Compose(HindsightRelabel(reward_fn, her_ratio=1.0), after))
+    rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
+    batch = rb.sample()
+    assert relabelled(batch).all() and "action" not in batch
 
 
 def test_the_representation_names_the_options():

@@ -1,0 +1,25 @@
+"""Environments, buffers and collectors, as the tests of pipelines build them."""
+
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+import torch_panda
+
+
+def make(env_id="PandaPush-v1", num_envs=4):
+    return torch_panda.make(env_id, num_envs=num_envs, seed=0)
+
+
+def buffer(transform, **options):
+    ndim = options.pop("ndim", 1)
+    storage = LazyTensorStorage(1000, ndim=ndim)
+    return TensorDictReplayBuffer(
+        storage=storage, transform=transform, batch_size=64, **options
+    )
+
+
+def collect(env, steps=10, batches=3, **options):
+    count = env.batch_size.numel() * steps
+    return Collector(
+        env, frames_per_batch=count, total_frames=count * batches, **options
+    )

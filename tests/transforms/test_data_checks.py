@@ -1,0 +1,458 @@
+"""Data in which relabelled transitions would contradict themselves are refused."""
+
+import functools
+import warnings
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.collectors.utils import split_trajectories
+from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    ObservationNorm,
+    ParallelEnv,
+    RewardScaling,
+    SerialEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+    UnaryTransform,
+    VecNorm,
+    VecNormV2,
+)
+
+import torch_panda
+from tests.transforms import toy
+from tests.transforms.identifiable import (
+    Envs,
+    check_batch,
+    name_goals,
+    relabelled,
+    reward_fn,
+)
+from tests.transforms.pipelines import buffer, collect, make
+from torch_panda import Randomization
+from torch_panda.transforms import HindsightAugment, HindsightRelabel
+
+BOTH = pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
+STALE = r"{}.*after this transform"
+
+
+def store(env, transform, steps=6, batches=3):
+    """Stores what an environment yields, and samples once."""
+    rb = buffer(transform)
+    for data in collect(env, steps, batches):
+        rb.extend(data.reshape(-1))
+    rb.sample()
+
+
+def get_warnings(function):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        function()
+    return [str(warning.message) for warning in caught]
+
+
+# -- copies of the goal ---------------------------------------------------------------
+
+
+def cat(*keys, out="policy_input"):
+    return CatTensors(list(keys), out, del_keys=False)
+
+
+def cat_goal():
+    return cat("observation", "desired_goal")
+
+
+@BOTH
+@pytest.mark.parametrize("collector", [True, False])
+def test_copies_of_the_goal_are_refused(hindsight, collector):
+    env = TransformedEnv(make(), cat_goal())
+    rb = buffer(hindsight.from_env(env))
+    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
+        for data in collect(env) if collector else [env.rollout(10)]:
+            if not collector:
+                data["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 10)
+            rb.extend(data.reshape(-1))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+@pytest.mark.parametrize("shape", [(40, 7), (40, 1, 7)])
+def test_copies_that_are_less_precise_are_refused(dtype, shape):
+    data = Envs(4, [5]).chunk(10).reshape(-1)
+    for key in ("desired_goal", "achieved_goal", ("next", "achieved_goal")):
+        data[key] = data[key].double() + torch.rand(40, 3, dtype=torch.float64)
+    data["next", "desired_goal"] = data["desired_goal"].clone()
+    copy = torch.cat([torch.rand(40, 4), data["desired_goal"]], 1)
+    data["policy_input"] = copy.to(dtype).reshape(shape)
+    goals = data["next", "achieved_goal"], data["desired_goal"]
+    data["next", "reward"] = reward_fn(*goals).float()
+    with pytest.raises(ValueError, match=r"policy_input.*copy"):
+        buffer(HindsightRelabel(reward_fn)).extend(data)
+
+
+def test_copies_made_in_the_buffer_before_hindsight_are_refused():
+    env = make()
+    rb = buffer(Compose(cat_goal(), HindsightRelabel.from_env(env)))
+    rb.extend(next(iter(collect(env))).reshape(-1))
+    with pytest.raises(ValueError, match=r"policy_input.*copy"):
+        rb.sample()
+
+
+def test_concatenating_after_hindsight_has_the_new_goal():
+    env = make()
+    rb = buffer(Compose(HindsightRelabel.from_env(env, her_ratio=1.0), cat_goal()))
+    rb.extend(next(iter(collect(env))).reshape(-1))
+    batch = rb.sample()
+    pieces = batch["policy_input"].unfold(1, 3, 1)
+    assert (pieces == batch["desired_goal"][:, None]).all(-1).any(1).all()
+
+
+@pytest.mark.parametrize("goals", ["achieved", "zeros"])
+def test_observations_that_hold_the_achieved_goal_are_no_copies(goals):
+    """Even where every row is asked for what it has, or goals are constants."""
+    data = Envs(4, [5]).chunk(10).reshape(-1)
+    goal = data["achieved_goal"] if goals == "achieved" else torch.zeros(40, 3)
+    data["desired_goal"], data["next", "desired_goal"] = goal.clone(), goal.clone()
+    data["observation"] = torch.cat([torch.zeros(40, 4), data["achieved_goal"]], 1)
+    data["next", "reward"] = reward_fn(data["next", "achieved_goal"], goal)
+    rb = buffer(HindsightRelabel(reward_fn))
+    rb.extend(data)
+    rb.sample()
+
+
+# -- entries computed from the goal ---------------------------------------------------
+
+
+class GoalDifference(Transform):
+    """Adds `difference`, the desired minus the achieved goal."""
+
+    def __init__(self):
+        keys = ["desired_goal", "achieved_goal"]
+        super().__init__(in_keys=keys, out_keys=["difference"])
+
+    def _call(self, tensordict):
+        difference = tensordict["desired_goal"] - tensordict["achieved_goal"]
+        return tensordict.set("difference", difference)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, spec):
+        spec["difference"] = Unbounded(spec["desired_goal"].shape)
+        return spec
+
+
+def normalise(key, out):
+    return ObservationNorm(0.3, 2.0, in_keys=[key], out_keys=[out])
+
+
+def cut(goal):
+    return goal[..., :2]
+
+
+COMPUTED = {
+    "normalised": lambda: normalise("desired_goal", "normalised"),
+    "difference": GoalDifference,
+    "slice": lambda: UnaryTransform(["desired_goal"], ["slice"], fn=cut),
+    "policy_input": lambda: Compose(
+        normalise("desired_goal", "normalised"),
+        CatTensors(["observation", "normalised"], "policy_input"),
+    ),
+    "observation": lambda: Compose(
+        normalise("desired_goal", "normalised"),
+        CatTensors(["observation", "normalised"], "observation"),
+    ),
+}
+
+
+def make_short(env_id="PandaPush-v1", num_envs=4, **options):
+    return torch_panda.make(
+        env_id, num_envs=num_envs, seed=0, max_episode_steps=6, **options
+    )
+
+
+@pytest.mark.parametrize("key", COMPUTED)
+@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaPegInsertion-v1"])
+@pytest.mark.parametrize("bare", [True, False])
+def test_entries_computed_from_the_goal_are_refused(key, env_id, bare):
+    env = TransformedEnv(make_short(env_id), COMPUTED[key]())
+    transform = HindsightRelabel.from_env(make_short(env_id) if bare else env)
+    with pytest.raises(ValueError, match=STALE.format(key)):
+        store(env, transform)
+
+
+@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
+@pytest.mark.parametrize("steps", [6, 1])
+def test_goals_are_gathered_over_batches(hindsight, steps):
+    """One environment has one goal per batch."""
+    env = TransformedEnv(make_short(num_envs=1), COMPUTED["difference"]())
+    with pytest.raises(ValueError, match=STALE.format("difference")):
+        store(env, hindsight.from_env(env), steps, batches=60 // steps)
+
+
+def test_too_few_goals_pass():
+    """An affine function of goals fits any constant of so few episodes."""
+    env = TransformedEnv(make_short(), COMPUTED["difference"]())
+    store(env, HindsightRelabel.from_env(env), batches=1)
+
+
+def test_computed_in_the_buffer_before_hindsight_is_refused():
+    env = make_short()
+    chain = Compose(normalise("desired_goal", "normalised"))
+    chain.append(HindsightRelabel.from_env(env))
+    with pytest.raises(ValueError, match=STALE.format("normalised")):
+        store(env, chain)
+
+
+@pytest.mark.parametrize("key", COMPUTED)
+def test_without_an_environment_it_is_a_warning(key):
+    env = TransformedEnv(make_short(), COMPUTED[key]())
+    transform = HindsightRelabel(env.base_env.compute_reward)
+    messages = get_warnings(lambda: store(env, transform))
+    matches = [message for message in messages if "affine" in message]
+    assert len(matches) == (1 if key != "policy_input" else len(matches))
+    assert key in matches[0] and "after this transform" in matches[0]
+
+
+def randomized(env_id):
+    randomization = Randomization(object_mass=(0.5, 2), gravity=(0.9, 1), observe=True)
+    return make_short(env_id, randomize=randomization)
+
+
+PASSING = {
+    "physics parameters": lambda: randomized("PandaPush-v1"),
+    "constants in the observation": lambda: make_short("PandaPegInsertion-v1"),
+    "concatenated constants": lambda: TransformedEnv(
+        randomized("PandaPegInsertion-v1"),
+        Compose(
+            StepCounter(),
+            normalise("observation", "normalised"),
+            cat("physics_parameters", "normalised", "achieved_goal"),
+        ),
+    ),
+    "computed from the achieved goal": lambda: TransformedEnv(
+        make_short("PandaReach-v1"), normalise("achieved_goal", "normalised")
+    ),
+}
+
+
+@BOTH
+@pytest.mark.parametrize("case", PASSING)
+def test_what_is_not_computed_from_the_goal_passes(hindsight, case):
+    env = PASSING[case]()
+    transform = hindsight.from_env(env)
+    messages = get_warnings(lambda: store(env, transform, batches=8))
+    assert not [message for message in messages if "goal" in message]
+
+
+# -- goals that the environment normalises --------------------------------------------
+
+
+def norm(*keys):
+    return ObservationNorm(0.0, 5.0, in_keys=[*keys])
+
+
+NORMALISED = {
+    "both": lambda: norm("achieved_goal", "desired_goal"),
+    "achieved": lambda: Compose(norm("achieved_goal")),
+    "VecNorm": lambda: VecNorm(["desired_goal"]),
+    "VecNormV2": lambda: VecNormV2(["desired_goal"]),
+}
+
+
+def make_normalised():
+    return TransformedEnv(make("PandaReach-v1", 2), norm("desired_goal"))
+
+
+@BOTH
+@pytest.mark.parametrize("case", [*NORMALISED, "worker", "outside"])
+def test_from_env_refuses_normalised_goals(hindsight, case):
+    if case == "worker":
+        env = ParallelEnv(2, make_normalised)
+    elif case == "outside":
+        worker = functools.partial(make, "PandaReach-v1", 2)
+        env = TransformedEnv(SerialEnv(2, worker), norm("desired_goal"))
+    else:
+        env = TransformedEnv(make("PandaReach-v1"), NORMALISED[case]())
+    with pytest.raises(ValueError, match=r"normalises '.*goal'.*after this transform"):
+        hindsight.from_env(env)
+
+
+def test_normalised_observations_are_accepted():
+    HindsightRelabel.from_env(TransformedEnv(make(), norm("observation")))
+
+
+def test_the_warning_shows_a_row_that_differs():
+    env = TransformedEnv(
+        make("PandaReach-v1", 8), norm("achieved_goal", "desired_goal")
+    )
+    transform = HindsightRelabel(env.base_env.compute_reward)
+    with pytest.warns(UserWarning, match="-1 instead of -?0 for") as caught:
+        store(env, transform, 50, 8)
+    assert len([w for w in caught if "other rewards" in str(w.message)]) == 1
+
+
+# -- rewards --------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rewards_of_several_steps_are_refused(hindsight, n_steps):
+    env = make("PandaReach-v1")
+    rb = buffer(hindsight.from_env(env))
+    collector = collect(env, postproc=MultiStep(gamma=0.9, n_steps=n_steps))
+    if n_steps == 1:
+        for data in collector:
+            rb.extend(data.reshape(-1))
+        return
+    with pytest.raises(ValueError, match=r"several steps.*MultiStep.*slice"):
+        for data in collector:
+            rb.extend(data.reshape(-1))
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "env_id", ["PandaPush-v1", "PandaPushDense-v1", "PandaReach-v1"]
+)
+@pytest.mark.parametrize("scaling", [(0.0, 10.0), (0.0, 0.1), (1.0, 2.0), (1.0, 1.0)])
+def test_scaled_rewards_are_refused(hindsight, env_id, scaling):
+    """Also those of which only successes tell, which are few at Reach."""
+    env = TransformedEnv(make(env_id, 8), RewardScaling(*scaling))
+    with pytest.raises(ValueError, match=r"reward_fn's times.*RewardScaling.*after"):
+        store(env, hindsight.from_env(env), 50, 30)
+
+
+@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaStackDense-v1"])
+def test_right_rewards_are_taken_in_silence(env_id):
+    env = make(env_id)
+    messages = get_warnings(lambda: store(env, HindsightRelabel.from_env(env)))
+    assert not [message for message in messages if "reward_fn" in message]
+
+
+def test_other_rewards_warn_once():
+    env = make("PandaPushDense-v1")
+    other = torch_panda.make("PandaPush-v1").compute_reward
+    transform = HindsightRelabel.from_env(env, reward_fn=other)
+    messages = get_warnings(lambda: store(env, transform))
+    assert len([m for m in messages if "reward_fn gives other rewards" in m]) == 1
+
+
+# -- ends that are not the episode's --------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("at", [0, 9, 19])
+def test_ends_that_are_not_the_episodes_are_refused(hindsight, at):
+    """torchrl's GymEnv(num_envs=...) has zeros in `next` at the end of an episode."""
+    data = name_goals(Envs(2, [10]).chunk(10)).reshape(-1)
+    for key in ("achieved_goal", "desired_goal"):
+        data["next", key][at] = 0
+    data["next", "reward"][at] = 0
+    message = r"differ in 1 of 20 rows.*\[0, 0, 0\].*GymEnv\(num_envs=.*ParallelEnv"
+    with pytest.raises(ValueError, match=message):
+        buffer(hindsight(reward_fn)).extend(data)
+
+
+def test_the_ends_are_checked_in_every_batch_and_layout():
+    envs, rb = Envs(2, [5]), buffer(HindsightRelabel(reward_fn), ndim=2)
+    for _ in range(50):
+        rb.extend(envs.chunk(10))
+    data = envs.chunk(10)
+    data["next", "desired_goal"][1, 9] = 0
+    with pytest.raises(ValueError, match="differ in 1 of 20 rows"):
+        rb.extend(data)
+
+
+def test_existing_data_are_checked_for_their_ends():
+    data = Envs(2, [5]).chunk(10)
+    data["next", "desired_goal"][0, 4] = 0
+    with pytest.raises(ValueError, match="differ in 1 of 20 rows"):
+        HindsightRelabel(reward_fn).prepare(data)
+
+
+@BOTH
+def test_goals_may_change_from_row_to_row(hindsight):
+    data = Envs(2, [10]).chunk(20)
+    goal = -1 - torch.rand(2, 20, 3)
+    data["desired_goal"], data["next", "desired_goal"] = goal, goal.clone()
+    data["next", "reward"] = reward_fn(data["next", "achieved_goal"], goal)
+    rb = buffer(hindsight(reward_fn))
+    rb.extend(data.reshape(-1))
+    assert len(rb) >= 40
+
+
+def test_unknown_goals_may_be_nan():
+    data = Envs(2, [10]).chunk(20)
+    for place in (data, data["next"]):
+        place["desired_goal"][0] = torch.nan
+    data["next", "reward"].fill_(-1)  # no goal is reached
+    rb = buffer(HindsightRelabel(reward_fn))
+    rb.extend(data.reshape(-1))
+    assert len(rb) == 40
+
+
+# -- padding --------------------------------------------------------------------------
+
+
+def make_padded():
+    """Returns [trajectories, time] with padded rows, and its real rows."""
+    data = Envs(3, [4, 7, 9]).chunk(40)
+    padded = split_trajectories(data)
+    mask = padded["collector", "mask"]
+    assert not mask.all()
+    return padded, padded[mask]
+
+
+@pytest.mark.parametrize("strategy", ["future", "final", "random"])
+@pytest.mark.parametrize("prepared", [True, False])
+def test_padded_rows_are_dropped(strategy, prepared):
+    padded, real = make_padded()
+    transform = HindsightRelabel(reward_fn, strategy=strategy, her_ratio=1.0)
+    rb = buffer(transform)
+    rb.extend(transform.prepare(padded) if prepared else padded.reshape(-1))
+    stored = rb.storage[:]
+    achieved = ("next", "achieved_goal")
+    assert torch.equal(stored[achieved], real[achieved])
+    if not prepared:
+        check_batch(rb.sample(), stored, strategy)
+
+
+def test_padded_rows_are_not_augmented():
+    padded, real = make_padded()
+    rb = buffer(HindsightAugment(reward_fn, k=1, strategy="final"))
+    rb.extend(padded)
+    stored = rb.storage[:]
+    check_batch(stored, stored, "final")
+    kept = stored["next", "achieved_goal"][~relabelled(stored)].tolist()
+    assert all(row in real["next", "achieved_goal"].tolist() for row in kept)
+
+
+def test_padding_in_two_dimensions_is_refused():
+    rb = buffer(HindsightRelabel(reward_fn), ndim=2)
+    with pytest.raises(RuntimeError, match="padded"):
+        rb.extend(make_padded()[0])
+
+
+def test_a_mask_without_padding_changes_nothing():
+    data = Envs(3, [5]).chunk(10)
+    data["collector", "mask"] = torch.ones(3, 10, dtype=torch.bool)
+    rb = buffer(HindsightRelabel(reward_fn), ndim=2)
+    rb.extend(data)
+    assert len(rb) == 30
+
+
+def test_split_trajectories_of_a_collector():
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1000),
+        transform=HindsightRelabel(reward_fn, her_ratio=1.0),
+        batch_size=64,
+    )
+    for data in Collector(
+        toy.make_env, frames_per_batch=60, total_frames=240, split_trajs=True
+    ):
+        rb.extend(data.reshape(-1))
+        check_batch(rb.sample(), rb.storage[:], "future")
+    assert len(rb) == 240
