@@ -1,4 +1,4 @@
-"""Restoring a world: bodies are back, and Bullet has forgotten the rest."""
+"""Restoring the broad phase: bodies return, and the past has no effect."""
 
 import random
 
@@ -11,14 +11,14 @@ CUBE = (0.02, 0.02, 0.02)
 
 
 def poses(client):
-    """Base, joints and links of all bodies."""
-    found = []
+    """Poses of the bases, joints and links of all bodies."""
+    numbers = []
     for body in client.bodies:
         state = client.state(body)
-        found.append(state.base_pose.tolist())
-        found.append(state.joint_positions.tolist())
-        found.append(state.link_poses.tolist())
-    return found
+        numbers.append(state.base_pose.tolist())
+        numbers.append(state.joint_positions.tolist())
+        numbers.append(state.link_poses.tolist())
+    return numbers
 
 
 @pytest.fixture
@@ -42,25 +42,25 @@ def disturb(client, num_steps):
     client.step(num_steps)
 
 
-def test_bodies_are_where_they_were_built(client):
+def test_bodies_return_to_where_they_were_built(client):
     built = poses(client)
-    world = BroadPhase(client)
+    broad_phase = BroadPhase(client)
     disturb(client, 30)
     assert poses(client) != built
-    world.restore()
+    broad_phase.restore()
     assert poses(client) == built
 
 
-def test_contacts_are_forgotten(client):
-    world = BroadPhase(client)
+def test_contacts_disappear(client):
+    broad_phase = BroadPhase(client)
     client.step()
     assert client.contact_points()
-    world.restore()
+    broad_phase.restore()
     assert not client.contact_points()
 
 
-def test_links_touch_what_they_touched(client):
-    world = BroadPhase(client)
+def test_links_touch_the_same_links_as_before(client):
+    broad_phase = BroadPhase(client)
     client.step()
 
     def touching():
@@ -69,17 +69,17 @@ def test_links_touch_what_they_touched(client):
         }
 
     built = touching()
-    world.restore()
+    broad_phase.restore()
     client.step()
     assert touching() == built != set()
 
 
-def test_what_follows_does_not_depend_on_what_was(client):
-    world = BroadPhase(client)
+def test_the_future_does_not_depend_on_the_past(client):
+    broad_phase = BroadPhase(client)
     ends = []
     for num_steps in (0, 7, 40, 300):
         disturb(client, num_steps)
-        world.restore()
+        broad_phase.restore()
         contacts = []
         for _ in range(60):
             client.step()
@@ -88,7 +88,7 @@ def test_what_follows_does_not_depend_on_what_was(client):
     assert all(end == ends[0] for end in ends)
 
 
-def test_what_follows_is_what_follows_in_a_new_client():
+def test_the_future_equals_that_of_a_new_client():
     def build(client):
         client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
         client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
@@ -106,17 +106,17 @@ def test_what_follows_is_what_follows_in_a_new_client():
     with PhysicsClient() as new, PhysicsClient() as used:
         build(new)
         build(used)
-        world = BroadPhase(used)
+        broad_phase = BroadPhase(used)
         for num_steps in (0, 7, 40, 300):
             used.set_joint(used.bodies[0], 1, 1.2, 0.5)
             used.step(num_steps)
-        world.restore()
+        broad_phase.restore()
         assert sweep(used) == sweep(new)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_cubes_that_fly_apart_do_so_again(seed):
-    """Where Bullet looks for pairs that have parted is one more thing it remembers."""
+def test_cubes_that_fly_apart_repeat_their_flight(seed):
+    """The cursor in the list of pairs is a part of the state, too."""
     rng = random.Random(seed)
     starts = [(0.1 * (k % 4), 0.1 * (k // 4), 0.03) for k in range(12)]
     velocities = [
@@ -125,10 +125,10 @@ def test_cubes_that_fly_apart_do_so_again(seed):
     with PhysicsClient() as client:
         client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
         cubes = [client.create_box(CUBE, mass=1.0, position=start) for start in starts]
-        world = BroadPhase(client)
+        broad_phase = BroadPhase(client)
         ends = []
         for _ in range(8):
-            world.restore()
+            broad_phase.restore()
             for cube, start, velocity in zip(cubes, starts, velocities, strict=True):
                 client.set_base(cube, start, linear_velocity=velocity)
             client.step(200)

@@ -1,4 +1,4 @@
-"""The layer against the pybullet module itself: the same commands, equal numbers."""
+"""PhysicsClient equals the pybullet module: the same commands give the same numbers."""
 
 import numpy as np
 import pybullet
@@ -16,7 +16,7 @@ EE_LINK = 11
 
 @pytest.fixture
 def reference():
-    # Not pybullet's default client, which another test may have left connected.
+    # A client of its own: another test may have left pybullet's default client open.
     client = BulletClient(pybullet.DIRECT)
     client.setAdditionalSearchPath(pybullet_data.getDataPath())
     client.setTimeStep(1 / 500)
@@ -25,14 +25,14 @@ def reference():
     client.disconnect()
 
 
-def create(reference, client, kind, mass, position):
+def create(reference, client, shape, mass, position):
     shapes = {
         "box": (pybullet.GEOM_BOX, {"halfExtents": (0.02, 0.03, 0.04)}),
         "cylinder": (pybullet.GEOM_CYLINDER, {"radius": 0.03, "height": 0.05}),
         "sphere": (pybullet.GEOM_SPHERE, {"radius": 0.03}),
         "ground": (pybullet.GEOM_BOX, {"halfExtents": (1.0, 1.0, 0.1)}),
     }
-    geometry, arguments = shapes[kind]
+    geometry, arguments = shapes[shape]
     theirs = reference.createMultiBody(
         baseMass=mass,
         baseCollisionShapeIndex=reference.createCollisionShape(geometry, **arguments),
@@ -49,11 +49,11 @@ def create(reference, client, kind, mass, position):
     return ours
 
 
-@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
-def test_falling_bodies(reference, kind):
+@pytest.mark.parametrize("shape", ["box", "cylinder", "sphere"])
+def test_falling_bodies(reference, shape):
     with PhysicsClient() as client:
         ground = create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
-        body = create(reference, client, kind, 1.0, (0.01, 0.02, 0.2))
+        body = create(reference, client, shape, 1.0, (0.01, 0.02, 0.2))
         reference.changeDynamics(body, -1, lateralFriction=0.3, spinningFriction=0.01)
         client.set_friction(body, lateral=0.3, spinning=0.01)
         rotation = (0.1, 0.2, 0.3, float(np.sqrt(1 - 0.14)))
@@ -123,7 +123,7 @@ def test_arm_with_kinematics_and_motors(reference):
         assert reference.getContactPoints(arm, body), "the arm must touch the box"
 
 
-def test_closed_client_raises_and_closes_again():
+def test_a_closed_client_raises_and_may_be_closed_again():
     client = PhysicsClient()
     client.close()
     client.close()
@@ -174,7 +174,7 @@ def test_mass(reference):
     ("group", "mask", "falls"),
     [
         (*capi.FILTER_DYNAMIC, False),
-        (*capi.FILTER_STATIC, True),  # what cannot move does not touch the ground
+        (*capi.FILTER_STATIC, True),  # two fixed bodies do not touch
         (0, -1, False),
         (1, 0, False),
         (0, 0, True),
@@ -230,9 +230,9 @@ def test_contact_forces_carry_a_box():
             [c.force_on_a for c in client.contact_points(ground)], axis=0
         )
         friction = [np.linalg.norm(c.friction_force) for c in client.contact_points()]
-    # On the slope the weight is carried by normal and friction forces together.
+    # On the slope, normal and friction forces together carry the weight.
     assert sum(friction) > 0.5 * 2.0 * 9.81 * np.sin(0.1)
-    # Bullet's report of forces on a slope closes to 0.3 % of the weight.
+    # The forces that Bullet reports balance the weight to 0.3 %.
     np.testing.assert_allclose(on_box, (0, 0, 2.0 * 9.81), atol=0.1)
     np.testing.assert_allclose(on_ground, -on_box)
 

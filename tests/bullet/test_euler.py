@@ -1,4 +1,4 @@
-"""Euler angles in Python and in C, against pybullet."""
+"""Euler angles, in Python and in C, equal pybullet's."""
 
 import math
 from ctypes import c_double

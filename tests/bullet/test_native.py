@@ -43,7 +43,7 @@ def test_the_version_belongs_to_the_sources():
 
 
 @pytest.mark.skipif(native.LIBRARY is None, reason="there is no compiled loop")
-def test_the_library_says_its_version():
+def test_the_library_has_the_version_of_the_sources():
     assert native.LIBRARY.version == native.VERSION
 
 
@@ -63,7 +63,7 @@ def test_a_library_of_another_version_is_refused(unset, monkeypatch, variable):
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 def test_a_library_without_a_version_has_version_0(tmp_path):
-    """As if it were compiled from sources that are older than the version numbers."""
+    """Sources that are older than the version numbers have no function for it."""
     sources = [shutil.copy(FOLDER / name, tmp_path) for name in SOURCES]
     loop = tmp_path / "loop.c"
     loop.write_text(loop.read_text().replace("int loop_version", "static int version"))

@@ -1,4 +1,4 @@
-"""Physics parameters: what they promise, and what they refuse."""
+"""Physics parameters: their effect, and the values that are refused."""
 
 import pickle
 
@@ -41,45 +41,45 @@ def test_fast_moves_the_arm_as_exact_does():
     assert distance.max() < 5e-3  # [m]
 
 
-def test_the_named_preset_is_the_parameters():
+def test_a_preset_by_name_equals_its_parameters():
     assert torch.equal(rollout("fast"), rollout(FAST))
 
 
 def reach(physics, poses, offsets):
-    """Joints that inverse kinematics find for the hand at offsets, and what is left.
+    """Solutions of the inverse kinematics, and their mean distance from the target.
 
     Args:
-        physics: of the client.
-        poses: (n, 9), where the joints are [rad] and [m].
-        offsets: (n, 3), from there to the targets [m].
+        physics: Parameters of the client.
+        poses: Joint positions at the start (n, 9) [rad] and [m].
+        offsets: Offsets of the targets from the hand (n, 3) [m].
     """
-    found, left = np.zeros_like(poses), []
+    solutions, distances = np.zeros_like(poses), []
     with PhysicsClient(physics=physics) as client:
         arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
-        for pose, offset, joints in zip(poses, offsets, found, strict=True):
+        for pose, offset, joints in zip(poses, offsets, solutions, strict=True):
             client.set_joints(arm, JOINTS, pose, np.zeros(9))
             target = client.state(arm).link_poses[EE_LINK][:3] + offset
             client.inverse_kinematics(arm, EE_LINK, target, (1, 0, 0, 0), joints)
             client.set_joints(arm, JOINTS, joints, np.zeros(9))
             hand = client.state(arm).link_poses[EE_LINK][:3]
-            left.append(np.linalg.norm(hand - target))
-    return found, np.mean(left)
+            distances.append(np.linalg.norm(hand - target))
+    return solutions, np.mean(distances)
 
 
-def test_few_iterations_of_the_inverse_kinematics_go_as_far():
+def test_few_iterations_of_the_inverse_kinematics_reach_as_far():
     rng = np.random.default_rng(0)
     poses = np.tile(NEUTRAL, (200, 1))
     poses[:, :7] += rng.normal(0, 0.1, (200, 7))
     offsets = rng.uniform(-0.05, 0.05, (200, 3))
-    exact, exact_left = reach(EXACT, poses, offsets)
-    fast, fast_left = reach(FAST, poses, offsets)
+    exact, exact_distance = reach(EXACT, poses, offsets)
+    fast, fast_distance = reach(FAST, poses, offsets)
     assert np.abs(exact - fast).max(1).mean() < 3e-3  # [rad]
-    assert exact_left == pytest.approx(12.6e-3, abs=0.1e-3)  # [m], of 48 on average
-    assert fast_left == pytest.approx(exact_left, abs=0.1e-3)
+    assert exact_distance == pytest.approx(12.6e-3, abs=0.1e-3)  # [m], of 48 on average
+    assert fast_distance == pytest.approx(exact_distance, abs=0.1e-3)
 
 
 def fall(physics, seconds=0.2):
-    """Height that a body falls [m]."""
+    """Height by which a body falls [m]."""
     with PhysicsClient(physics=physics) as client:
         body = client.create_sphere(0.1, mass=1.0, position=(0.0, 0.0, 0.0))
         client.step(round(seconds / physics.timestep))
@@ -87,7 +87,7 @@ def fall(physics, seconds=0.2):
 
 
 def test_timestep_and_gravity_reach_bullet():
-    # Semi-implicit Euler falls g (t^2 + t dt) / 2, but for Bullet's damping.
+    # Semi-implicit Euler gives g (t^2 + t dt) / 2, without Bullet's damping.
     for physics in (PhysicsParams(), PhysicsParams(timestep=0.01, gravity=-2.0)):
         t, dt = 0.2, physics.timestep
         expected = -physics.gravity * (t * t + t * dt) / 2
@@ -133,7 +133,7 @@ def test_environments_are_pickled_with_their_physics():
         ({"ik_damping": 0.0}, "ik_damping must be positive and finite, got 0.0"),
     ],
 )
-def test_bad_parameters(arguments, message):
+def test_parameters_out_of_range_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         PhysicsParams(**arguments)
 
@@ -144,6 +144,6 @@ def test_substeps_are_whole_numbers():
 
 
 @pytest.mark.parametrize("physics", ["fastest", None, 3])
-def test_unknown_physics(physics):
+def test_an_unknown_preset_is_refused(physics):
     with pytest.raises(ValueError, match=r"one of \('exact', 'fast'\), got"):
         torch_panda.make("PandaReach-v1", physics=physics)

@@ -1,4 +1,4 @@
-"""The thread pool: all work done, errors named, interrupts clean, no thread left."""
+"""The thread pool does all work, names errors, survives Ctrl-C and ends its threads."""
 
 import signal
 import threading
@@ -21,7 +21,7 @@ def pool():
     assert not own_threads()
 
 
-def test_every_index_once_on_several_threads(pool):
+def test_every_index_is_worked_on_once_by_several_threads(pool):
     done, names = [], set()
 
     def work(index):
@@ -36,7 +36,7 @@ def test_every_index_once_on_several_threads(pool):
     assert len(names) == 3
 
 
-def test_slow_index_does_not_hold_back_the_others(pool):
+def test_a_slow_index_does_not_delay_the_others(pool):
     finished = []
 
     def work(index):
@@ -48,7 +48,7 @@ def test_slow_index_does_not_hold_back_the_others(pool):
     assert len(finished) == 30
 
 
-def test_error_names_the_index_and_the_rest_is_done(pool):
+def test_an_error_names_its_index_and_all_others_are_done(pool):
     done = []
 
     def work(index):
@@ -65,7 +65,7 @@ def test_error_names_the_index_and_the_rest_is_done(pool):
     assert done[-1] == 9
 
 
-def test_interrupt_waits_for_the_running_work(pool):
+def test_an_interrupt_waits_for_the_running_work(pool):
     done = []
 
     def work(index):
@@ -82,7 +82,7 @@ def test_interrupt_waits_for_the_running_work(pool):
     timer.join()
 
 
-def test_close_twice_and_use_again(pool):
+def test_a_pool_may_be_closed_twice_and_used_again(pool):
     pool.close()
     pool.close()
     done = []

@@ -1,4 +1,4 @@
-"""Threads change nothing: not their number, not load from elsewhere."""
+"""Results do not depend on the number of threads or on other load."""
 
 import threading
 
@@ -27,7 +27,7 @@ def trajectory(num_envs, num_threads, steps):
         return torch.stack(observations)
 
 
-def test_many_threads_equal_one():
+def test_many_threads_give_the_numbers_of_one():
     assert torch.equal(trajectory(40, 40, 12), trajectory(40, 1, 12))
 
 
@@ -48,7 +48,7 @@ def test_load_from_another_thread_changes_nothing():
     assert torch.equal(loaded, trajectory(8, 2, 20))
 
 
-def test_scenes_must_be_the_same():
+def test_clients_must_have_the_same_scene():
     bodies = []
 
     def build(client: PhysicsClient) -> Scene:

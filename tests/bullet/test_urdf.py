@@ -1,4 +1,4 @@
-"""Broken URDFs are refused before Bullet reads them: it crashes, or gives no reason."""
+"""Broken URDFs are refused before Bullet reads them and crashes, or gives no reason."""
 
 import pytest
 
@@ -71,7 +71,7 @@ BROKEN = {
         link("a", shape("<mesh filename='no.obj'/>")),
         "a <collision> of link 'a' has the mesh 'no.obj', which does not exist",
     ),
-    "a missing mesh that is only seen": (
+    "a missing visual mesh": (
         link("a", shape("<mesh filename='no.obj'/>", "visual")),
         "a <visual> of link 'a' has the mesh 'no.obj', which does not exist",
     ),

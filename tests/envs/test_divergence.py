@@ -1,4 +1,4 @@
-"""Physics that diverges is noticed, named, and left behind."""
+"""Physics that diverges is noticed and named, and its environment starts anew."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def env(request):
 
 
 def blow_up(env, index, body):
-    """Give a body a velocity whose square overflows, behind the environment's back."""
+    """Give a body a velocity whose square overflows, without the environment."""
     simulation = env.episodes.simulation
     client, scene = simulation.clients[index], simulation.scene
     if body == "object":
@@ -63,7 +63,7 @@ def test_divergence(env, body):
         assert state["step_count"].flatten().tolist() == [2, count, 2]
 
 
-def test_nothing_of_it_is_left(env):
+def test_later_episodes_do_not_depend_on_the_divergence(env):
     torch.manual_seed(0)
     env.reset()
     blow_up(env, 1, "object")
@@ -86,7 +86,7 @@ def test_nothing_of_it_is_left(env):
 
 @pytest.mark.parametrize("body", ["object", "robot"])
 def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
-    """Bullet itself runs into infinite numbers: a weight of 1e309 N is one.
+    """Bullet itself computes infinite numbers, because a weight of 1e309 N is one.
 
     All environments equal, bit for bit, those of a batch in which nothing diverged,
     except for the step that diverges.
@@ -117,12 +117,12 @@ def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
             if step == diverges:
                 assert ours["done"][1] and not ours["success"][1]
                 ours = env.reset(ours.set("_reset", only_1)).exclude("_reset")
-                for _ in range(2):  # the divergence has begun an episode, too
+                for _ in range(2):  # the divergence began an episode, too
                     theirs = other.reset(theirs.set("_reset", only_1))
                 theirs = theirs.exclude("_reset")
 
 
-def test_collection_goes_on():
+def test_a_rollout_continues():
     with make("reset") as env:
         start = env.reset()
         blow_up(env, 2, "object")

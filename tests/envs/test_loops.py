@@ -1,7 +1,7 @@
-"""The native loop and the ctypes loop: the same numbers, errors and manners.
+"""The native loop and the ctypes loop give the same numbers and errors.
 
-The other half is in the tests that use the fixture ``loop``: parity with panda-gym,
-histories, divergence.
+Further tests of both loops use the fixture ``loop``: parity with panda-gym, histories,
+divergence.
 """
 
 import multiprocessing
@@ -60,7 +60,7 @@ def make(env_id="PandaPush-v1", **options):
 
 
 def own_threads():
-    """Threads of this process, Python's or not."""
+    """Number of threads of this process, including threads of C."""
     return len(os.listdir("/proc/self/task"))
 
 
@@ -75,9 +75,9 @@ def detections(env):
     return [client.num_detections for client in env.episodes.simulation.clients]
 
 
-def play(env, steps=12, masks=False):
-    """All that is observed in two episodes; with masks, of some at a time."""
-    generator, seen = torch.Generator().manual_seed(0), []
+def observe_two_episodes(env, steps=12, masks=False):
+    """Observations and states; with masks, some environments step at a time."""
+    generator, observed = torch.Generator().manual_seed(0), []
     for _episode in range(2):
         td = env.reset()
         for _ in range(steps):
@@ -86,13 +86,13 @@ def play(env, steps=12, masks=False):
             if masks:
                 td["_step"] = torch.rand(N, 1, generator=generator) < 0.6
             td = env.step(td)["next"].exclude("_step")
-            seen.append(td)
+            observed.append(td)
             mask = torch.rand(N, 1, generator=generator) < 0.1
             if masks and mask.any():
                 td = env.reset(td.set("_reset", mask)).exclude("_reset")
-                seen.append(td)
-        seen.append(env.get_state())
-    return seen, detections(env)
+                observed.append(td)
+        observed.append(env.get_state())
+    return observed, detections(env)
 
 
 @needs_native
@@ -107,20 +107,20 @@ def play(env, steps=12, masks=False):
         ("PandaStack-v1", {}, True),
     ],
 )
-def test_both_give_the_same(monkeypatch, env_id, options, masks):
-    found = {}
+def test_both_loops_give_the_same_numbers(monkeypatch, env_id, options, masks):
+    results = {}
     for name in ("native", "ctypes"):
         monkeypatch.setenv(native.LOOP_VARIABLE, name)
         with make(env_id, **options) as env:
-            found[name] = play(env, masks=masks)
-    (ours, ours_detected), (theirs, theirs_detected) = found.values()
+            results[name] = observe_two_episodes(env, masks=masks)
+    (ours, ours_detected), (theirs, theirs_detected) = results.values()
     assert ours_detected == theirs_detected
     for one, other in zip(ours, theirs, strict=True):
         assert (one == other).all()
 
 
 @needs_native
-def test_more_threads_than_work():
+def test_as_many_threads_as_environments_give_the_same_numbers():
     def rollout(num_threads):
         with make(num_envs=5, num_threads=num_threads) as env:
             return env.rollout(10, lambda td: td.set("action", torch.ones(5, 3)))
@@ -130,13 +130,15 @@ def test_more_threads_than_work():
 
 
 @needs_native
-@pytest.mark.parametrize("n_substeps", [1, 7])  # less than a piece; no multiple of it
+@pytest.mark.parametrize(
+    "n_substeps", [1, 7]
+)  # fewer than a piece has; not a multiple of it
 def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
     def rollout(num_threads):
         physics = PhysicsParams(n_substeps=n_substeps)
         with make(num_envs=6, num_threads=num_threads, physics=physics) as env:
-            found = env.rollout(10, lambda td: td.set("action", torch.ones(6, 3)))
-            return found, detections(env)
+            steps = env.rollout(10, lambda td: td.set("action", torch.ones(6, 3)))
+            return steps, detections(env)
 
     (one, one_detected), (two, two_detected) = rollout(1), rollout(2)
     assert torch.equal(one["next", "observation"], two["next", "observation"])
@@ -145,14 +147,14 @@ def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
 
 @needs_native
 def test_an_arm_alone(monkeypatch):
-    """Where there is no second body, none makes a pair with the first."""
+    """The only body has no second one to make a pair of the broad phase."""
 
     def build(client):
         arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
         joints = [joint.index for joint in client.joints(arm) if joint.is_movable]
         return Scene(arm, tuple(joints), ee_link=11)
 
-    found = []
+    results = []
     for name in ("native", "ctypes"):
         monkeypatch.setenv(native.LOOP_VARIABLE, name)
         simulation = VectorSimulation(build, N)
@@ -161,16 +163,16 @@ def test_an_arm_alone(monkeypatch):
             simulation.joint_velocity[:] = 0.0
             simulation.reset(range(N))
             simulation.step(MotorControl((50.0,) * 9), np.zeros((N, 9)))
-        found.append((simulation.ee_position.clone(), simulation.ee_velocity.clone()))
+        results.append((simulation.ee_position.clone(), simulation.ee_velocity.clone()))
         simulation.close()
-    assert all(map(torch.equal, *found))
+    assert all(map(torch.equal, *results))
 
 
 # ---- errors --------------------------------------------------------------------------
 
 
 def break_client(env, index):
-    """Take the robot out of a client, so that Bullet refuses its commands."""
+    """Remove the robot from a client, so that Bullet refuses its commands."""
     simulation = env.episodes.simulation
     client = simulation.clients[index]
     handle = client.connection.handle
@@ -231,7 +233,7 @@ def test_a_reset_that_fails(env):
         assert caught.value.index == 2
         for _ in range(2):
             other.reset()
-        # The others have started, but no step is taken until all have.
+        # The others were reset, but steps are refused until all are.
         for key in ("joint_position", "object_pose", "ee_position"):
             ours = getattr(env.episodes.simulation, key)[:2]
             theirs = getattr(other.episodes.simulation, key)[:2]
@@ -252,7 +254,7 @@ def test_a_reset_whose_randomisation_fails(env):
     with pytest.raises(WorkerError, match="environment 1: ValueError: no"):
         simulation.reset(range(N), vary)
     step(env)
-    # The others have been reset.
+    # The others were reset.
     moved = simulation.joint_position[:, 0] > 0.05
     assert moved.tolist() == [True, False, True]
 
@@ -312,8 +314,8 @@ def test_a_forked_child_has_threads_of_its_own(env):
     receiver, sender = multiprocessing.Pipe(duplex=False)
 
     def observe():
-        seen = [step(env)["observation"].tolist() for _ in range(3)]
-        return [*seen, env.reset()["observation"].tolist()]
+        steps = [step(env)["observation"].tolist() for _ in range(3)]
+        return [*steps, env.reset()["observation"].tolist()]
 
     def child():
         sender.send(observe())
@@ -338,13 +340,13 @@ def test_no_thread_is_left(loop):
         env.rollout(3)
         assert own_threads() > before
     deadline = time.monotonic() + 10
-    while own_threads() > before:  # one that has been joined may still be listed
+    while own_threads() > before:  # a joined thread may still be listed
         assert time.monotonic() < deadline
 
 
 @needs_native
 def test_denormal_numbers_are_not_flushed_to_zero(monkeypatch):
-    """What torch does with them in the caller's thread says nothing of physics."""
+    """torch's setting for the caller's thread must not affect physics."""
     monkeypatch.setenv(native.LOOP_VARIABLE, "native")
     tiny = 1e-310  # [m/s]
     torch.set_flush_denormal(True)

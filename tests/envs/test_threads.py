@@ -1,4 +1,4 @@
-"""One thread at a time: an error for the others, and never a crash.
+"""One thread at a time: other threads get an error, and nothing crashes.
 
 Two threads in one Bullet client crash the interpreter, so the tests run in processes.
 """
@@ -66,7 +66,7 @@ for _ in range(50):
     try:
         env.rollout(20)
     except torch_panda.BulletError as error:
-        print(error, file=sys.stderr)  # or the collector's thread says it
+        print(error, file=sys.stderr)  # or the collector's thread prints it
         break
 sys.stderr.flush()
 print("fine", flush=True)
@@ -96,7 +96,7 @@ print("fine")
 
 
 def run(code):
-    """Run code in a process; what it has said to stderr."""
+    """Run code in another process and return its standard error."""
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
     )
@@ -118,7 +118,7 @@ def test_threads_may_build_environments_of_their_own_at_the_same_time():
 
 
 def test_threads_share_one_scratch_directory(monkeypatch):
-    """However long it takes to make it: what one has written there stays."""
+    """Even if making it takes long: no folder of a thread is deleted."""
 
     @functools.cache
     def make_slowly():
@@ -134,8 +134,8 @@ def test_threads_share_one_scratch_directory(monkeypatch):
 
 
 @pytest.mark.parametrize("call", ["step", "reset", "render", "get_state", "close"])
-def test_every_call_is_refused_while_another_thread_is_in_it(monkeypatch, call):
-    """The other thread waits inside of a step until it has been refused."""
+def test_every_call_is_refused_while_another_thread_is_inside(monkeypatch, call):
+    """The other thread waits inside a step until the call is refused."""
     is_in, may_leave = threading.Event(), threading.Event()
     with torch_panda.make("PandaReach-v1", num_envs=2, num_threads=1, seed=0) as env:
         td = env.reset().set("action", torch.zeros(2, 3))

@@ -40,7 +40,7 @@ def test_merged_vertices_stay_close_and_faces_keep_their_side(cell):
     a, b, c = positions[faces[:, 0]], positions[faces[:, 1]], positions[faces[:, 2]]
     outward = (np.cross(b - a, c - a) * (a + b + c)).sum(axis=1)
     assert (outward > 0).mean() > 0.98
-    # No triangle is there twice, whichever vertex it starts with.
+    # Nearly every triangle is unique, whichever vertex it starts with.
     assert len(np.unique(np.sort(faces, axis=1), axis=0)) >= 0.98 * len(faces)
 
 
@@ -83,7 +83,7 @@ def test_the_arm_looks_the_same_from_afar():
             images.append((image.rgb.astype(int), image.segmentation == arm))
     (fine, is_arm), (coarse, is_coarse_arm) = images
     assert is_arm.sum() > 200
-    # The outline moves by less than the half pixel to which vertices are merged.
+    # Vertices move by at most half a pixel, so the outline moves by less than that.
     inside = is_arm.copy()
     for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
         inside &= np.roll(is_arm, shift, axis)
@@ -93,7 +93,7 @@ def test_the_arm_looks_the_same_from_afar():
     assert np.abs(fine - coarse)[both].mean() < 10
 
 
-def test_coarse_files_are_made_once_and_small():
+def test_coarse_files_are_small_and_written_once():
     urdf = find_urdf("franka_panda/panda.urdf")
     path = decimated_urdf(urdf, 0.013)
     assert decimated_urdf(urdf, 0.013) == path

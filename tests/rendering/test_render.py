@@ -1,4 +1,4 @@
-"""Looking at environments: `RobotTaskEnv.render` and what torchrl makes of it."""
+"""Pictures of environments: `RobotTaskEnv.render`, and videos that torchrl records."""
 
 import imageio.v3 as imageio
 import numpy as np
@@ -23,7 +23,7 @@ CLOSE = Camera(target=(0.0, 0.0, 0.0), distance=0.5, width=60, height=40)
 
 
 def render_reference(reference):
-    """panda-gym's picture, and which of its pixels show a target."""
+    """panda-gym's picture, and a mask of the pixels that show a target."""
     client = reference.sim.physics_client
     view = client.computeViewMatrixFromYawPitchRoll((0, 0, 0), 1.4, 45, -30, 0, 2)
     projection = client.computeProjectionMatrixFOV(60, WIDTH / HEIGHT, 0.1, 100)
@@ -36,8 +36,8 @@ def render_reference(reference):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_as_panda_gym_draws(task):
-    """Every pixel but those of targets, which panda-gym draws opaque here."""
+def test_pictures_equal_those_of_panda_gym(task):
+    """Except for targets, which panda-gym draws opaque."""
     reference = make_reference(
         f"Panda{task}-v3", render_width=WIDTH, render_height=HEIGHT
     )
@@ -53,16 +53,16 @@ def test_as_panda_gym_draws(task):
     assert ours.shape == (HEIGHT, WIDTH, 3)
     difference = np.abs(ours.astype(int) - theirs.astype(int))
     differs = difference.max(axis=-1) > 0
-    if task == "Flip":  # its cube cannot be seen: panda-gym's wheel lacks the texture
+    if task == "Flip":  # panda-gym's wheel lacks the texture and draws no cube
         assert 0 < differs[~is_target].sum() < 600 * (HEIGHT / 480) ** 2
     else:
         assert not differs[~is_target].any()
         assert is_target.sum() > 12
-        # Translucent: between what panda-gym draws and what lies behind.
+        # Translucent targets differ from panda-gym's opaque ones.
         assert differs[is_target].mean() > 0.9
 
 
-def test_targets_are_seen_through():
+def test_targets_are_translucent():
     with torch_panda.make("PandaPush-v1", seed=0) as env:
         env.reset()
         camera = Camera(
@@ -84,7 +84,7 @@ def test_targets_are_seen_through():
 
 
 class HiddenURDF(torch_panda.Task):
-    """A goal in the air where a cube's URDF is built, and the cube elsewhere."""
+    """The goal is in the air, at the place where the cube's URDF is loaded."""
 
     goal_dim, observation_dim = 3, 0
     place = (0.0, 0.25, 0.2)
@@ -112,7 +112,7 @@ class HiddenURDF(torch_panda.Task):
 
 
 @pytest.mark.parametrize("marker_first", [True, False])
-def test_markers_are_seen_where_a_urdf_was_built(marker_first):
+def test_a_marker_is_visible_where_a_urdf_was_loaded(marker_first):
     task = HiddenURDF(marker_first=marker_first)
     with torch_panda.RobotTaskEnv(robot=torch_panda.Panda(), task=task) as env:
         env.reset()
@@ -124,7 +124,7 @@ def test_markers_are_seen_where_a_urdf_was_built(marker_first):
 
 
 class Housing(torch_panda.Sensor):
-    """A sensor that stands in the scene, and senses nothing."""
+    """A sensor that adds a box to the scene and observes nothing."""
 
     entries = {}  # noqa: RUF012 (as its own reading)
 
@@ -140,7 +140,7 @@ class Housing(torch_panda.Sensor):
     after_step = after_reset
 
 
-def test_what_a_sensor_builds_is_drawn_beside_markers():
+def test_bodies_of_a_sensor_are_drawn():
     pictures = []
     for sensors in ((), (Housing(),)):
         with torch_panda.make("PandaReach-v1", seed=0, sensors=sensors) as env:
@@ -156,7 +156,7 @@ def test_shadows_only_darken():
         without = env.render(camera=bright).int()
         shaded = env.render(size=(120, 180)).int()
     assert (shaded <= without).all()
-    darker = without - shaded  # everywhere by up to 2; here and there by 17
+    darker = without - shaded  # up to 2 everywhere, 17 in shadows
     assert 0.001 < (darker > 5).float().mean() < 0.1
 
 
@@ -174,7 +174,7 @@ def test_colors_of_the_stack(version, lower):
             assert color[channel] > 4 * color[channel - 1]
 
 
-def test_chosen_environments():
+def test_some_environments_can_be_drawn():
     with torch_panda.make("PandaPush-v1", num_envs=5, num_threads=2, seed=0) as env:
         with pytest.raises(ValueError, match="environment 0 that was reset"):
             env.render()
@@ -204,7 +204,7 @@ def test_pictures_do_not_depend_on_threads():
     assert (pictures[0] == pictures[1]).all()
 
 
-def test_nothing_is_built_before_something_is_drawn(monkeypatch):
+def test_the_first_picture_builds_the_renderers(monkeypatch):
     made = []
     constructor = VisualClient.__init__
 
@@ -217,7 +217,7 @@ def test_nothing_is_built_before_something_is_drawn(monkeypatch):
         env.rollout(3)
         assert not made
         env.render(1, camera=CLOSE)
-        assert len(made) == 2  # what is solid, and what is translucent
+        assert len(made) == 2  # solids and markers
         env.render(camera=CLOSE)
         env.render(camera=CLOSE, size=30)
         assert len(made) == 8
@@ -226,7 +226,7 @@ def test_nothing_is_built_before_something_is_drawn(monkeypatch):
     assert all(client.is_closed for client in made)
 
 
-def test_looking_changes_nothing():
+def test_drawing_does_not_change_the_simulation():
     rollouts = []
     for look in (False, True):
         with torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as env:
@@ -237,7 +237,7 @@ def test_looking_changes_nothing():
 
 
 class _VideoFile(Logger):
-    """Writes the videos of torchrl's recorder with ffmpeg."""
+    """A logger that writes the videos of torchrl's recorder with ffmpeg."""
 
     def __init__(self, folder):
         super().__init__("videos", folder)
@@ -271,7 +271,7 @@ def test_torchrl_records_videos(tmp_path, num_envs):
     frames = imageio.imread(tmp_path / "push.mp4")
     grid = (64, 96) if num_envs is None else (128, 192)
     assert frames.shape == (10, *grid, 3)  # the reset, and nine steps
-    # Lossy, but the same pictures.
+    # The codec is lossy.
     last = rollout["next", "pixels"][..., -1, :, :, :]
     last = last if num_envs is None else last[0]
     seen = frames[-1][:64, :96].astype(int)

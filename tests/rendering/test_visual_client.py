@@ -1,4 +1,4 @@
-"""Drawing against the pybullet module itself: the same scene, equal pictures."""
+"""Pictures of a visual client equal those of the pybullet module."""
 
 import numpy as np
 import pybullet
@@ -45,13 +45,13 @@ def build_reference(p):
         (p.GEOM_CYLINDER, {"radius": 0.1, "length": 0.3}, RED, (0.2, 0, 0.15)),
         (p.GEOM_SPHERE, {"radius": 0.15}, (0.1, 0.9, 0.1), (-0.1, 0.2, 0.15)),
     )
-    for kind, size, color, position in shapes:
-        shape = p.createVisualShape(kind, rgbaColor=(*color, 1), **size)
+    for geometry, size, color, position in shapes:
+        shape = p.createVisualShape(geometry, rgbaColor=(*color, 1), **size)
         p.createMultiBody(baseVisualShapeIndex=shape, basePosition=position)
 
 
 @pytest.mark.parametrize("shadow", [True, False])
-def test_as_pybullet_draws(shadow):
+def test_pictures_equal_those_of_pybullet(shadow):
     reference = pybullet.connect(pybullet.DIRECT)
     build_reference(pybullet)
     view = pybullet.computeViewMatrixFromYawPitchRoll(
@@ -119,7 +119,7 @@ def test_depth_in_metres():
     assert depth[0, 0] == camera.far
 
 
-def test_six_faces_differ():
+def test_the_six_faces_of_a_texture_differ():
     views = [(90, 0), (180, 0), (0, -90), (-90, 0), (0, 0), (0, 90)]
 
     def build_cube(client):
@@ -128,12 +128,12 @@ def test_six_faces_differ():
     with visual_client(build_cube) as client:
         colors = []
         for yaw, pitch in views:
-            # So narrow a view that a face fills the picture.
+            # The view is so narrow that a face fills the picture.
             camera = Camera(
                 distance=0.2, yaw=yaw, pitch=pitch, fov=11, width=48, height=48
             )
             square = client.draw(camera, shadow=False).rgb
-            # Shading changes brightness, so hues are compared.
+            # Compare hues, because shading changes the brightness.
             color = square.reshape(-1, 3).mean(axis=0)
             colors.append(color / np.linalg.norm(color))
     for a in range(6):

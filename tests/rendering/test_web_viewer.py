@@ -1,4 +1,4 @@
-"""The viewer in the browser: what its server holds is what the environments are."""
+"""The viewer in the browser: it shows the environments, to its own page only."""
 
 import socket
 from http.client import HTTPConnection
@@ -24,7 +24,7 @@ def env():
 
 
 def world_pose(nodes, name):
-    """Of a node of the scene tree: position, rotation (4 x 4)."""
+    """Transform of a node of the scene tree to the world frame (4, 4)."""
     pose = np.eye(4)
     while name:
         node = nodes[name]
@@ -40,12 +40,12 @@ def nodes_of(viewer):
 
 
 class Click:
-    """As if a person had moved a control."""
+    """The event of a control that a person moved."""
 
     client = "a browser"
 
 
-def test_the_page_shows_what_is(env):
+def test_the_page_shows_the_state(env):
     env.reset()
     bent = env.get_state()
     bent["joint_position"] += torch.linspace(0.1, 0.4, 9) * 0.5
@@ -54,7 +54,7 @@ def test_the_page_shows_what_is(env):
         viewer.update()
         nodes, simulation = nodes_of(viewer), env.episodes.simulation
         scene = simulation.scene
-        # Bullet's end-effector is between the fingers, a link without a shape.
+        # The end-effector is a link without a shape, between the fingers.
         ee = next(name for name in nodes if name.endswith("/panda_grasptarget"))
         np.testing.assert_allclose(
             world_pose(nodes, ee)[:3, 3], simulation.ee_position[0], atol=1e-6
@@ -90,7 +90,7 @@ def test_pause_goes_back_and_on(env):
         assert "step 2" in viewer._status.content
         objects = env.episodes.simulation.scene.objects
         cube = nodes_of(viewer)[f"/body{objects[0]}"]
-        # viser does not send what moves by less than some micrometres.
+        # viser does not send movements of a few micrometres.
         np.testing.assert_allclose(cube.position, shown[1][1], atol=1e-5)
         env.step(env.full_action_spec.rand())
         viewer.update()  # recorded, not shown
@@ -107,14 +107,14 @@ def test_pause_goes_back_and_on(env):
 
 
 def test_contacts_carry_the_cube():
-    """What the table exerts on the cube at rest is its weight."""
+    """The table carries the weight of the cube at rest."""
     with torch_panda.make("PandaPush-v3", seed=1) as env:
         env.reset()
         for _ in range(5):
             env.step(env.full_action_spec.zero())
         simulation = env.episodes.simulation
         forces = web_viewer.read_forces(simulation.clients[0], simulation)
-        near = abs(forces[:, 0, 2]) < 0.01  # not the hand's
+        near = abs(forces[:, 0, 2]) < 0.01  # contacts with the table
         assert forces[near, 1].sum(0) == pytest.approx((0, 0, 9.81), abs=0.2)
     long = web_viewer.arrows(
         np.array([[[0, 0, 0], [0, 0, 10]], [[0, 0, 0], [99, 0, 0]]])
@@ -134,11 +134,10 @@ def test_every_task_can_be_seen(task):
         viewer.close()
 
 
-def test_bad_calls_are_named(env, monkeypatch):
+def test_wrong_calls_raise_clear_errors(env, monkeypatch):
     with env.open_viewer(port=8765) as viewer:
         with pytest.raises(torch_panda.BulletError, match="never reset"):
             viewer.update()
-        # The page is at the address that it names.
         assert viewer.url.startswith("http://127.0.0.1:87")
     monkeypatch.setattr("torch_panda.envs.robot_task.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"pip install .* -e '\.\[viewer\]'"):
@@ -159,7 +158,7 @@ def viewer():
 
 
 def get(viewer, host):
-    """Status and text that the page's address answers to a request with this Host."""
+    """Status and text of the answer to a request with this header Host."""
     connection = HTTPConnection("127.0.0.1", viewer._server.get_port(), timeout=10)
     connection.putrequest("GET", "/", skip_host=True)
     for name in host if isinstance(host, tuple) else (host,):
@@ -203,7 +202,7 @@ def test_a_refusal_says_how_to_allow_a_name(viewer):
 
 
 def open_socket(viewer, origin, host="localhost:8765"):
-    """Connect as viser's page does, from a page of another origin."""
+    """Open a web socket as viser's page does, with these headers."""
     return connect(
         f"ws://{host}",
         sock=socket.create_connection(("127.0.0.1", viewer._server.get_port())),
@@ -251,7 +250,7 @@ def test_a_version_of_viser_that_cannot_be_checked_is_refused(env, monkeypatch):
 
 @pytest.mark.parametrize("chosen", [-100, -1, 2, 10**30])
 def test_indices_from_a_browser_never_raise(env, chosen):
-    """A client sends what it likes, whatever the limits of the page's sliders."""
+    """A client may send indices beyond the limits of the page's sliders."""
     env.reset()
     with env.open_viewer(port=8765) as viewer:
         viewer.update()

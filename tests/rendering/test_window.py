@@ -1,4 +1,4 @@
-"""The window of pybullet's GUI, with a client that has none in its place."""
+"""The window of pybullet's GUI, replaced by a client without a window."""
 
 import os
 

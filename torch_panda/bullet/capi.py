@@ -1,7 +1,7 @@
-"""Declarations of Bullet's C API, as the extension module of pybullet exports it.
+"""Declarations of Bullet's C API, which pybullet's extension module exports.
 
-Every line binds one function of ``PhysicsClientC_API.h`` (pybullet 3.2.7): name,
-result and arguments together. No logic lives here.
+Every statement binds one function of ``PhysicsClientC_API.h`` (pybullet 3.2.7) with its
+name, its result type and its argument types. This file has no logic.
 """
 
 import ctypes
@@ -44,7 +44,7 @@ CMD_PERFORM_COLLISION_DETECTION_COMPLETED = 112
 # enum eURDF_Flags
 URDF_IGNORE_VISUAL_SHAPES = 1 << 20
 
-# Collision group and mask that Bullet gives to links that move, and to fixed bases.
+# Collision group and mask that Bullet gives to links that can move, and to fixed bases.
 FILTER_DYNAMIC = (1, -1)
 FILTER_STATIC = (2, -1 ^ 2)
 
@@ -150,15 +150,15 @@ class CameraImage(ctypes.Structure):
 
 
 _client = _command = _status = c_void_p
-# Doubles are passed as a ctypes array or as an address, for instance of a tensor.
+# Doubles are passed as a ctypes array, or as an address, for example of a tensor.
 _doubles = _floats = c_void_p
 _address = POINTER(c_void_p)
 
-# Connection, and the one call that makes Bullet work.
+# Connection, and the submission of commands
 connect_direct = bind(_work, "b3ConnectPhysicsDirect", _client)
 disconnect = bind(_work, "b3DisconnectSharedMemory", None, _client)
 submit = bind(_work, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command)
-submit_quick = bind(  # for what takes Bullet a microsecond
+submit_quick = bind(  # for commands that take about a microsecond
     _cheap, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command
 )
 status_type = bind(_cheap, "b3GetStatusType", c_int, _status)
@@ -440,7 +440,7 @@ physics_set_joint_feedback = bind(
     _cheap, "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
 )
 
-# Visuals: shapes that are seen, and cameras that see them
+# Visual shapes and cameras
 visual_init = bind(_cheap, "b3CreateVisualShapeCommandInit", _command, _client)
 visual_add_box = bind(_cheap, "b3CreateVisualShapeAddBox", c_int, _command, _doubles)
 visual_add_sphere = bind(
