@@ -60,30 +60,68 @@ struct link {
 
 /* btCollisionObject */
 struct collision_object {
-    char pad0[408];
+    char pad0[360];
+    int has_anisotropic_friction;
+    char pad1[44];
     int flags;
-    char pad1[4];
+    char pad2[4];
     int companion_id;
+    char pad3[68];
+    int internal_type;
+};
+
+/* btMultiBodyLinkCollider, a btCollisionObject */
+struct link_collider {
+    struct collision_object base;
+    char pad0[132];
+    struct multi_body *body;
+    int link;
+};
+
+/* btManifoldPoint */
+struct contact_point {
+    struct vector3 local_a, local_b;
+    struct vector3 position_b, position_a, normal_b;
+    double distance, friction, rolling_friction, spinning_friction, restitution;
+    char pad0[24];
+    int flags;
+    double impulse, previous_rhs;
+    char pad1[64];
+    struct vector3 lateral_1, lateral_2;
+};
+
+/* btPersistentManifold */
+struct manifold {
+    char pad0[8];
+    struct contact_point points[4];
+    struct link_collider *body_a, *body_b;
+    int num_points;
+    double breaking_threshold, processing_threshold;
 };
 
 /* btMultiBody */
 struct multi_body {
     char pad0[8];
     struct collision_object *base_collider;
-    char pad1[304];
+    char pad1[8];
+    struct vector3 base_position;
+    char pad2[96];
+    double base_mass;
+    struct vector3 base_inertia;
+    char pad3[128];
     struct array links; /* of struct link */
-    char pad2[32];
+    char pad4[32];
     struct array delta_v; /* m_deltaV */
     struct array real_buffer;   /* velocities, then inverses of D at squared offsets */
     struct array vector_buffer; /* h, a struct spatial for each degree of freedom */
     struct array matrix_buffer; /* rotations from the parent, the base's first */
-    char pad3[385];
+    char pad5[385];
     char fixed_base;
-    char pad4[46];
+    char pad6[46];
     int companion_id;
-    char pad5[45];
+    char pad7[45];
     char pos_updated; /* __posUpdated */
-    char pad6[2];
+    char pad8[2];
     int num_dofs;
 };
 
@@ -136,6 +174,8 @@ struct solver {
     struct array multi_body_torsional_rows;
     struct array multi_body_spinning_rows;
     struct jacobian_data data;
+    struct constraint **constraints; /* m_tmpMultiBodyConstraints, of this group */
+    int num_constraints;
 };
 
 /* btContactSolverInfo */
@@ -144,16 +184,20 @@ struct solver_info {
     double time_step;
     char pad1[8];
     int num_iterations;
-    char pad2[20];
+    char pad2[12];
+    double relaxation; /* m_sor */
     double erp, erp2;
-    char pad3[48];
+    char pad3[24];
+    double cfm, friction_erp, friction_cfm;
     int split_impulse;
     double split_impulse_threshold;
-    char pad4[32];
+    char pad4[8];
+    double linear_slop;
+    char pad5[16];
     int mode;
-    char pad5[28];
-    double residual_threshold;
-    char pad6[12];
+    char pad6[28];
+    double residual_threshold, restitution_threshold;
+    char pad7[4];
     int report_analytics;
     int num_inner_iterations; /* m_numNonContactInnerIterations */
 };
@@ -189,11 +233,20 @@ struct limit {
 /* enum btMultibodyLink::eFeatherstoneJointType */
 enum { REVOLUTE = 0, PRISMATIC = 1, FIXED = 4 };
 
-/* btCollisionObject::CF_KINEMATIC_OBJECT */
-enum { KINEMATIC = 2 };
+/* enum btCollisionObject::CollisionFlags, and of CollisionObjectTypes */
+enum { STATIC = 1, KINEMATIC = 2, LINK_COLLIDER = 64 };
 
 /* enum btSolverMode */
-enum { TWO_FRICTION_DIRECTIONS = 16, NO_FRICTION_CONE = 2048 };
+enum {
+    TWO_FRICTION_DIRECTIONS = 16,
+    CACHED_FRICTION_DIRECTIONS = 32,
+    FIXED_FRICTION_DIRECTIONS = 64, /* independent of velocities */
+    NO_FRICTION_CONE = 2048,
+    ARTICULATED_WARMSTARTING = 4096,
+};
+
+/* enum btContactPointFlags */
+enum { LATERAL_FRICTION_INITIALIZED = 1 };
 
 #define AT(type, field, offset)                                                        \
     _Static_assert(offsetof(struct type, field) == (offset), #type "." #field)
@@ -214,9 +267,30 @@ AT(link, joint_feedback, 1104);
 AT(link, world_basis, 1112);
 AT(link, world_origin, 1208);
 SIZE(link, 1312);
+AT(collision_object, has_anisotropic_friction, 360);
 AT(collision_object, flags, 408);
 AT(collision_object, companion_id, 416);
+AT(collision_object, internal_type, 488);
+AT(link_collider, body, 624);
+AT(link_collider, link, 632);
+AT(contact_point, position_b, 64);
+AT(contact_point, distance, 160);
+AT(contact_point, restitution, 192);
+AT(contact_point, flags, 224);
+AT(contact_point, impulse, 232);
+AT(contact_point, previous_rhs, 240);
+AT(contact_point, lateral_1, 312);
+AT(contact_point, lateral_2, 344);
+SIZE(contact_point, 376);
+AT(manifold, points, 8);
+AT(manifold, body_a, 1512);
+AT(manifold, body_b, 1520);
+AT(manifold, num_points, 1528);
+AT(manifold, processing_threshold, 1544);
 AT(multi_body, base_collider, 8);
+AT(multi_body, base_position, 24);
+AT(multi_body, base_mass, 152);
+AT(multi_body, base_inertia, 160);
 AT(multi_body, links, 320);
 AT(multi_body, delta_v, 384);
 AT(multi_body, real_buffer, 416);
@@ -258,6 +332,8 @@ AT(solver, analytics.residual, 408);
 AT(solver, multi_body_joint_rows, 416);
 AT(solver, multi_body_spinning_rows, 544);
 AT(solver, data, 576);
+AT(solver, constraints, 784);
+AT(solver, num_constraints, 792);
 AT(constraint, body_a, 8);
 AT(constraint, link_a, 24);
 AT(constraint, num_rows, 36);
@@ -272,11 +348,17 @@ AT(limit, lower, 104);
 AT(limit, upper, 112);
 AT(solver_info, time_step, 24);
 AT(solver_info, num_iterations, 40);
+AT(solver_info, relaxation, 56);
 AT(solver_info, erp, 64);
+AT(solver_info, cfm, 104);
+AT(solver_info, friction_erp, 112);
+AT(solver_info, friction_cfm, 120);
+AT(solver_info, linear_slop, 152);
 AT(solver_info, split_impulse, 128);
 AT(solver_info, split_impulse_threshold, 136);
 AT(solver_info, mode, 176);
 AT(solver_info, residual_threshold, 208);
+AT(solver_info, restitution_threshold, 216);
 AT(solver_info, num_inner_iterations, 232);
 
 #undef AT

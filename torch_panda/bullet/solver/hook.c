@@ -13,7 +13,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { VERSION = 1 }; /* native.py refuses a library of another version */
+enum { VERSION = 2 }; /* native.py refuses a library of another version */
 
 /* The functions that are replaced, in the order of gate.py. */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, NUM_FUNCTIONS };
@@ -23,7 +23,7 @@ typedef double iterations_function(struct solver *, struct collision_object **, 
                                    void **, int, void **, int,
                                    const struct solver_info *, void *);
 /* btMultiBodyConstraintSolver::convertContacts */
-typedef void convert_function(struct solver *, void **, int,
+typedef void convert_function(struct solver *, struct manifold **, int,
                               const struct solver_info *);
 /* btMultiBodyConstraint::createConstraintRows */
 typedef void rows_function(void *, struct array *, struct jacobian_data *,
@@ -43,7 +43,9 @@ struct counts {
     int left;        /* groups that it left to Bullet's function */
     int created;     /* motors and limits whose rows it created */
     int not_created; /* those that it left to Bullet's function */
-    int joint_rows;  /* rows that it probed */
+    int converted;   /* manifolds whose rows it created */
+    int not_converted;
+    int joint_rows; /* rows that it probed */
     int contact_rows;
     int spinning_rows;
     const char *wrong; /* a field that is not laid out as declared */
@@ -90,12 +92,35 @@ static double iterations(struct solver *solver, struct collision_object **bodies
     return result;
 }
 
-/* While Bullet converts a group, rows of joints share the responses of their bodies. */
-static void convert(struct solver *solver, void **manifolds, int num_manifolds,
-                    const struct solver_info *info) {
+/*
+ * The rows of a group: those of contacts, then those of joints.
+ *
+ * A manifold that is not converted here is handed to Bullet's function alone, without
+ * the constraints of the group. Bullet's function then goes through the constraints;
+ * the rows of their joints share the responses of their bodies.
+ */
+static void convert(struct solver *solver, struct manifold **manifolds,
+                    int num_manifolds, const struct solver_info *info) {
+    convert_function *bullet_convert = (convert_function *)bullet[CONVERT];
+    if (mode == PROBE && counts.wrong == NULL)
+        counts.wrong =
+            probe_manifolds(solver, manifolds, num_manifolds, info, &expectation);
+    if (!is_active()) {
+        bullet_convert(solver, manifolds, num_manifolds, info);
+        return;
+    }
+    const int num_constraints = solver->num_constraints;
+    solver->num_constraints = 0;
+    for (int i = 0; i < num_manifolds; i++) {
+        const int converted = convert_manifold(solver, manifolds[i], info);
+        if (mode == SOLVE)
+            *(converted ? &counts.converted : &counts.not_converted) += 1;
+        if (!converted) bullet_convert(solver, manifolds + i, 1, info);
+    }
+    solver->num_constraints = num_constraints;
     struct responses *list = NULL;
-    if (is_active()) responses = &list;
-    ((convert_function *)bullet[CONVERT])(solver, manifolds, num_manifolds, info);
+    responses = &list;
+    bullet_convert(solver, manifolds, 0, info);
     responses = NULL;
     free_responses(list);
 }

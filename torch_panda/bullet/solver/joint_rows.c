@@ -35,11 +35,11 @@
  * makes room with it. So no memory of Bullet's is allocated or freed here.
  */
 #if defined(__x86_64__) && defined(__linux__)
+#include "rows.h"
 #include "solver.h"
 
 #include <math.h>
 #include <stdlib.h>
-#include <string.h>
 
 typedef double pair __attribute__((vector_size(16)));
 
@@ -163,16 +163,6 @@ static void solve_pair(const struct multi_body *body, int first,
     }
 }
 
-/* Adds up zeros, or an undefined number if one of the numbers is not finite. */
-static double finite_zero(const double *numbers, int count) {
-    pair sums = {0.0, 0.0};
-    int i = 0;
-    for (; i + 2 <= count; i += 2)
-        sums += (pair){numbers[i], numbers[i + 1]} * (pair){0.0, 0.0};
-    for (; i < count; i++) sums[0] += numbers[i] * 0.0;
-    return sums[0] + sums[1];
-}
-
 static int is_simple(const struct multi_body *body) {
     const int num_links = body->links.size, num_dofs = body->num_dofs;
     if (!body->fixed_base || num_dofs < 1 || num_links < num_dofs || num_links > 64 ||
@@ -268,10 +258,6 @@ static int is_simple_joint(const struct constraint *constraint, int num_rows) {
            (link->joint_type == REVOLUTE || link->joint_type == PRISMATIC);
 }
 
-static int has_room(const struct array *array, int count) {
-    return array->capacity - array->size >= count;
-}
-
 static int has_room_for(const struct array *rows, const struct jacobian_data *data,
                         const struct multi_body *body, int num_rows) {
     const int size = body->num_dofs + 6;
@@ -279,14 +265,6 @@ static int has_room_for(const struct array *rows, const struct jacobian_data *da
            has_room(rows, num_rows) && has_room(&data->jacobians, 2 * size * num_rows) &&
            has_room(&data->unit_impulses, 2 * size * num_rows) &&
            (body->companion_id >= 0 || has_room(&data->delta_velocities, size));
-}
-
-/* Appends zeros to an array of doubles. */
-static double *append(struct array *array, int count) {
-    double *end = (double *)array->data + array->size;
-    memset(end, 0, count * sizeof(double));
-    array->size += count;
-    return end;
 }
 
 /*
@@ -302,14 +280,10 @@ static double fill_row(struct constraint_row *row, struct jacobian_data *data,
     struct multi_body *body = constraint->body_a;
     const int num_dofs = body->num_dofs, size = num_dofs + 6;
     const int dof = ((const struct link *)body->links.data)[constraint->link_a].dof_offset;
-    if (body->companion_id < 0) {
-        body->companion_id = data->delta_velocities.size;
-        append(&data->delta_velocities, size);
-    }
     row->multi_body_a = row->multi_body_b = body;
     row->link_a = constraint->link_a;
     row->link_b = constraint->link_b;
-    row->delta_vel_a = row->delta_vel_b = body->companion_id;
+    row->delta_vel_a = row->delta_vel_b = velocity_index(body, data);
     row->jac_a = data->jacobians.size;
     row->jac_b = row->jac_a + size;
     const int part = sign > 0.0 ? 0 : size;
@@ -318,7 +292,7 @@ static double fill_row(struct constraint_row *row, struct jacobian_data *data,
     const double *column = columns + dof * num_dofs;
     for (int i = 0; i < num_dofs; i++) unit[i] = sign * column[i];
     const double d = sign * unit[dof];
-    row->jac_diag_inv = d > 2.2204460492503131e-16 ? 1.0 / d : 0.0; /* SIMD_EPSILON */
+    row->jac_diag_inv = d > EPSILON ? 1.0 / d : 0.0;
 
     const double velocity = 0.0 + ((const double *)body->real_buffer.data)[6 + dof] * sign;
     row->friction = 0.0;
@@ -383,10 +357,6 @@ static void set_axis(struct constraint_row *row, const struct constraint *constr
     row->contact_normal2 = is_revolute ? zero : opposite;
     row->relpos1_cross_normal = is_revolute ? axis : zero;
     row->relpos2_cross_normal = is_revolute ? opposite : zero;
-}
-
-static struct constraint_row *expand(struct array *rows) {
-    return (struct constraint_row *)rows->data + rows->size++;
 }
 
 int create_motor_rows(struct responses **responses, struct motor *motor,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 # Version of the C sources, as in hook.c: the library must have been compiled from
 # sources of this version.
-VERSION = 1
+VERSION = 2
 
 # ``enum mode``
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
@@ -44,6 +44,8 @@ class Expectation(Structure):
         ("residual_threshold", c_double),
         ("motor_impulse", c_double),
         ("friction", c_double),
+        ("restitution", c_double),
+        ("masses", c_double * 2),
         ("num_iterations", c_int),
         ("num_dofs", c_int),
         ("num_links", c_int),
@@ -61,6 +63,8 @@ class Counts(Structure):
         ("left", c_int),
         ("created", c_int),
         ("not_created", c_int),
+        ("converted", c_int),
+        ("not_converted", c_int),
         ("joint_rows", c_int),
         ("contact_rows", c_int),
         ("spinning_rows", c_int),

@@ -54,6 +54,99 @@ static const char *probe_row(const struct solver *solver,
     return NULL;
 }
 
+static int is_unit(const struct vector3 *a) {
+    return fabs(a->x * a->x + a->y * a->y + a->z * a->z - 1.0) < 1e-9;
+}
+
+static int is_same(const struct vector3 *a, const struct vector3 *b) {
+    return a->x == b->x && a->y == b->y && a->z == b->z;
+}
+
+/* A contact, and the first of its two rows of friction. */
+static const char *probe_point(const struct contact_point *point,
+                               const struct constraint_row *friction,
+                               const struct expectation *expected) {
+    CHECK("a row's m_originalContactPoint", point != NULL);
+    CHECK("btManifoldPoint.m_combinedFriction", point->friction == expected->friction);
+    CHECK("btManifoldPoint.m_combinedRestitution",
+          point->restitution == expected->restitution);
+    CHECK("btManifoldPoint.m_combinedRollingFriction", point->rolling_friction == 0.0);
+    CHECK("btManifoldPoint.m_combinedSpinningFriction", point->spinning_friction > 0.0);
+    CHECK("btManifoldPoint.m_contactPointFlags", point->flags == 0);
+    CHECK("btManifoldPoint.m_distance1", fabs(point->distance) < 0.1);
+    CHECK("btManifoldPoint.m_normalWorldOnB", is_unit(&point->normal_b));
+    const struct vector3 *a = &point->position_a, *b = &point->position_b;
+    const struct vector3 *normal = &point->normal_b;
+    const double gap = (a->x - b->x) * normal->x + (a->y - b->y) * normal->y +
+                       (a->z - b->z) * normal->z;
+    CHECK("btManifoldPoint.m_positionWorldOnA", fabs(gap - point->distance) < 1e-9);
+    CHECK("btManifoldPoint.m_lateralFrictionDir1",
+          is_same(&friction[0].contact_normal1, &point->lateral_1));
+    CHECK("btManifoldPoint.m_lateralFrictionDir2",
+          is_same(&friction[1].contact_normal1, &point->lateral_2));
+    return NULL;
+}
+
+/* A body without joints. */
+static const char *probe_base(const struct multi_body *body,
+                              const struct expectation *expected) {
+    if (body->num_dofs != 0) return NULL;
+    CHECK("btMultiBody.m_links", is_array(&body->links) && body->links.size == 0);
+    CHECK("btMultiBody.m_matrixBuf",
+          is_array(&body->matrix_buffer) && body->matrix_buffer.size == 1);
+    CHECK("btMultiBody.m_realBuf",
+          is_array(&body->real_buffer) && body->real_buffer.size >= 6);
+    const double mass = body->base_mass;
+    CHECK("btMultiBody.m_baseMass",
+          mass == 0.0 || mass == expected->masses[0] || mass == expected->masses[1]);
+    CHECK("btMultiBody.m_baseInertia",
+          mass == 0.0 ||
+              (body->base_inertia.x > 0.0 && body->base_inertia.x < 0.01 * mass));
+    CHECK("btMultiBody.m_fixedBase", body->fixed_base == (mass == 0.0));
+    const struct link_collider *collider =
+        (const struct link_collider *)body->base_collider;
+    CHECK("btMultiBodyLinkCollider", collider->body == body && collider->link == -1);
+    CHECK("btCollisionObject.m_collisionFlags",
+          !(collider->base.flags & STATIC) == (mass != 0.0));
+    return NULL;
+}
+
+const char *probe_manifolds(const struct solver *solver,
+                            struct manifold *const *manifolds, int num_manifolds,
+                            const struct solver_info *info,
+                            const struct expectation *expected) {
+    CHECK("m_timeStep", info->time_step == expected->time_step);
+    CHECK("m_sor", info->relaxation == 1.0);
+    CHECK("m_solverMode", info->mode == (4 | TWO_FRICTION_DIRECTIONS | 256));
+    CHECK("m_tmpNumMultiBodyConstraints",
+          solver->num_constraints >= 0 &&
+              solver->num_constraints <= 2 * expected->num_dofs &&
+              (solver->num_constraints == 0 || solver->constraints != NULL));
+    for (int i = 0; i < num_manifolds; i++) {
+        const struct manifold *manifold = manifolds[i];
+        CHECK("btPersistentManifold.m_cachedPoints",
+              manifold->num_points >= 0 && manifold->num_points <= 4);
+        CHECK("btPersistentManifold.m_contactProcessingThreshold",
+              manifold->processing_threshold > 0.0);
+        const struct link_collider *const colliders[] = {manifold->body_a,
+                                                         manifold->body_b};
+        for (int k = 0; k < 2; k++) {
+            CHECK("btPersistentManifold.m_body0", colliders[k] != NULL);
+            CHECK("btCollisionObject.m_internalType",
+                  colliders[k]->base.internal_type == LINK_COLLIDER);
+            CHECK("btCollisionObject.m_hasAnisotropicFriction",
+                  colliders[k]->base.has_anisotropic_friction == 0);
+            CHECK("btMultiBodyLinkCollider.m_link",
+                  colliders[k]->link >= -1 &&
+                      colliders[k]->link < expected->num_links);
+            CHECK("btMultiBodyLinkCollider.m_multiBody", colliders[k]->body != NULL);
+            const char *wrong = probe_base(colliders[k]->body, expected);
+            if (wrong != NULL) return wrong;
+        }
+    }
+    return NULL;
+}
+
 /* The body that has joints, link by link. */
 static const char *probe_links(const struct multi_body *body,
                                const struct expectation *expected) {
@@ -189,6 +282,12 @@ const char *probe_rows(const struct solver *solver, const struct solver_info *in
         CHECK("a contact's m_friction", row->friction == expected->friction);
         CHECK("a contact's m_upperLimit", row->upper_limit == 1e10f);
         CHECK("a contact's m_frictionIndex", row->friction_index == 2 * i);
+        wrong = probe_point(row->contact_point,
+                            (const struct constraint_row *)
+                                    solver->multi_body_friction_rows.data +
+                                2 * i,
+                            expected);
+        if (wrong != NULL) return wrong;
     }
     row = solver->multi_body_friction_rows.data;
     for (int i = 0; i < 2 * num_contacts; i++, row++) {

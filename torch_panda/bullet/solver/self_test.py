@@ -5,7 +5,7 @@ steps the scene first, and the layout of its objects is probed. Then the replace
 steps it. All state must be the same, bit for bit, after every step.
 """
 
-from ctypes import c_int
+from ctypes import c_double, c_int
 from pathlib import Path
 
 from torch_panda.bullet import capi
@@ -30,6 +30,8 @@ _NUM_ITERATIONS = 40
 _RESIDUAL_THRESHOLD = 1e-8
 _FORCE = 40.0
 _FRICTION = 0.6
+_RESTITUTION = 0.3
+_MASSES = (0.2, 0.1)  # of the boxes
 _KP = 0.3
 _KD = 1.0
 _JOINT_TYPES = (REVOLUTE, REVOLUTE, FIXED, PRISMATIC, PRISMATIC)  # of the arm's links
@@ -55,6 +57,8 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         _RESIDUAL_THRESHOLD,
         _FORCE * _TIME_STEP,
         _FRICTION * _FRICTION,
+        _RESTITUTION * _RESTITUTION,
+        (c_double * 2)(*_MASSES),
         _NUM_ITERATIONS,
         _NUM_JOINTS,
         len(_JOINT_TYPES),
@@ -79,7 +83,7 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
     if counts.left or not counts.solved:
         raise GateError("it did not solve all groups of the self-test")
     # Bullet creates the first rows of a joint, and those for which it makes room.
-    if counts.created <= counts.not_created:
+    if counts.created <= counts.not_created or not counts.converted:
         raise GateError("it did not create the rows of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
@@ -126,15 +130,15 @@ def _build(client: int) -> list[int]:
     arm = capi.status_body(status)
     table = _box(client, 0.0, (0.5, 0.5, 0.05), (0.0, 0.0, -0.05))
     boxes = [
-        _box(client, 0.2, (0.03, 0.03, 0.03), (0.44, 0.05, 0.03)),
-        _box(client, 0.1, (0.02, 0.03, 0.02), (0.44, 0.05, 0.08)),
+        _box(client, _MASSES[0], (0.03, 0.03, 0.03), (0.44, 0.05, 0.03)),
+        _box(client, _MASSES[1], (0.02, 0.03, 0.02), (0.44, 0.05, 0.08)),
     ]
     for body in (arm, table, *boxes):
         for link in range(-1, capi.joint_count(client, body)):
             command = capi.dynamics_init(client)
             capi.dynamics_set_lateral_friction(command, body, link, _FRICTION)
             capi.dynamics_set_spinning_friction(command, body, link, 0.1)
-            capi.dynamics_set_restitution(command, body, link, 0.3)
+            capi.dynamics_set_restitution(command, body, link, _RESTITUTION)
             _submit(client, command)
     return [arm, *boxes]
 

@@ -30,6 +30,14 @@ int create_limit_rows(struct responses **responses, struct limit *limit,
                       struct array *rows, struct jacobian_data *data,
                       const struct solver_info *info);
 
+/*
+ * The rows of all contacts of a manifold.
+ *
+ * Returns as the functions above do.
+ */
+int convert_manifold(struct solver *solver, struct manifold *manifold,
+                     const struct solver_info *info);
+
 /* What the layout probe knows of the scene that it looks at. */
 struct expectation {
     void **motor_table, **limit_table; /* of virtual functions */
@@ -37,6 +45,8 @@ struct expectation {
     double residual_threshold;
     double motor_impulse; /* of every motor: largest force times time step */
     double friction;      /* of every contact */
+    double restitution;   /* of every contact */
+    double masses[2];     /* of the bodies that move and have no joints */
     int num_iterations;
     int num_dofs; /* joints of the one body that has joints */
     int num_links;
@@ -45,10 +55,15 @@ struct expectation {
 };
 
 /*
- * Compares fields with the scene before and after Bullet solves a group.
+ * Compare fields with the scene, before Bullet converts a group, and before and after
+ * it solves the group.
  *
  * Each returns NULL, or the name of the first field that is not as expected.
  */
+const char *probe_manifolds(const struct solver *solver,
+                            struct manifold *const *manifolds, int num_manifolds,
+                            const struct solver_info *info,
+                            const struct expectation *expected);
 const char *probe_rows(const struct solver *solver, const struct solver_info *info,
                        const struct expectation *expected);
 const char *probe_result(const struct solver *solver,

@@ -1,0 +1,48 @@
+/* Appending rows to Bullet's arrays, where they have room. */
+#ifndef TORCH_PANDA_ROWS_H
+#define TORCH_PANDA_ROWS_H
+
+#include "bullet_types.h"
+
+#include <string.h>
+
+static const double EPSILON = 2.2204460492503131e-16; /* SIMD_EPSILON */
+
+static inline int has_room(const struct array *array, int count) {
+    return array->capacity - array->size >= count;
+}
+
+/* Appends zeros to an array of doubles. */
+static inline double *append(struct array *array, int count) {
+    double *end = (double *)array->data + array->size;
+    memset(end, 0, count * sizeof(double));
+    array->size += count;
+    return end;
+}
+
+static inline struct constraint_row *expand(struct array *rows) {
+    return (struct constraint_row *)rows->data + rows->size++;
+}
+
+/* Where the body's velocities are in the group's array; appends them at first. */
+static inline int velocity_index(struct multi_body *body, struct jacobian_data *data) {
+    if (body->companion_id < 0) {
+        body->companion_id = data->delta_velocities.size;
+        append(&data->delta_velocities, body->num_dofs + 6);
+    }
+    return body->companion_id;
+}
+
+/* Adds up zeros, or an undefined number if one of the numbers is not finite. */
+static inline double finite_zero(const double *numbers, int count) {
+    double even = 0.0, odd = 0.0;
+    int i = 0;
+    for (; i + 2 <= count; i += 2) {
+        even += numbers[i] * 0.0;
+        odd += numbers[i + 1] * 0.0;
+    }
+    if (i < count) even += numbers[i] * 0.0;
+    return even + odd;
+}
+
+#endif
