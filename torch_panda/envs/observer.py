@@ -238,6 +238,14 @@ class EpisodeObserver:
         if self._has_failure:
             failure = task.failure(simulation)
             check_output(f"{function}.failure", failure, (n, 1), torch.bool)
+        if self._goal_indices is not None:
+            size = robot.observation_dim + task.observation_dim
+            is_inside = all(0 <= index < size for index in self._goal_indices)
+            if len(self._goal_indices) != task.goal_dim or not is_inside:
+                raise ValueError(
+                    f"{function}.goal_entries must name {task.goal_dim} entries of an "
+                    f"observation of {size}, got {task.goal_entries}"
+                )
 
 
 class ExtraObserver:
