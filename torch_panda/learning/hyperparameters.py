@@ -7,6 +7,7 @@ from torch_panda.learning.limits import Discount, Positive, Ratio, Weight
 
 Algo = Literal["ddpg", "td3", "sac", "tqc"]
 RelativeInputs = Literal["none", "coarse", "fine"]
+Exploration = Literal["actions", "points"]
 Network = Literal["paper", "layer-norm", "wide"]
 AugmentationKind = Literal["none", "mirror", "mirror-shift"]
 
@@ -32,8 +33,11 @@ class Hyperparameters:
     noise_eps: Weight = 0.2
     """DDPG, TD3: the standard deviation of the Gaussian noise on actions"""
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)
-    """DDPG, TD3: the probability of a random action in the first and in the last of the
-    parallel environments; those between are evenly spaced"""
+    """ratio of exploring steps in the first and in the last of the parallel
+    environments; those between are evenly spaced. SAC and TQC need "points" for it"""
+    exploration: Exploration = "actions"
+    """explore with random actions (DDPG, TD3), or by moving towards random points
+    ("points"; joint control moves to random joint positions)"""
     relative_inputs: RelativeInputs = "none"
     """give the networks positions of objects from the hand and of goals from objects,
     too ("coarse"), and these once more clipped, so that millimetres count ("fine")"""

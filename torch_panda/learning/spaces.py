@@ -29,6 +29,10 @@ class Spaces:
         has_free_gripper: Whether the last number of an action moves the fingers.
         has_sparse_reward: Whether every reward is -1 or 0.
         geometry: Layout of observation, goal and action; None if it is unknown.
+        action_scale: Displacement that an action of 1 causes in one step, [m] for the
+            end-effector and [rad] for joints.
+        moves_joints: Whether actions are displacements of joints, and not of the
+            end-effector.
     """
 
     observation_size: int
@@ -39,6 +43,8 @@ class Spaces:
     has_free_gripper: bool
     has_sparse_reward: bool
     geometry: Geometry | None
+    action_scale: float = 0.05
+    moves_joints: bool = False
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -76,6 +82,8 @@ def read_spaces(env: RobotTaskEnv) -> Spaces:
         has_free_gripper=robot.has_free_gripper,
         has_sparse_reward=has_sparse_reward(task),
         geometry=read_geometry(env),
+        action_scale=float(robot.action_scale),
+        moves_joints=robot.control_type == "joints",
     )
 
 

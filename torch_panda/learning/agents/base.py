@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torch_panda.learning.augmentation import Augmentation
+from torch_panda.learning.exploration import RandomPointModule
 from torch_panda.learning.fingers import from_fine, to_fine
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.normalizer import Normalizer
@@ -76,6 +77,18 @@ class Agent(nn.Module, ABC):
             normalize, actor, *noise, *last
         )
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
+
+    def random_points(self) -> RandomPointModule:
+        """Exploration towards random points, by ``random_eps`` of the options."""
+        spaces = self.spaces
+        gripper_size = int(spaces.has_free_gripper)
+        return RandomPointModule(
+            torch.linspace(*self.hp.random_eps, spaces.num_envs),
+            action_size=spaces.action_size,
+            action_scale=spaces.action_scale,
+            moves_joints=spaces.moves_joints,
+            num_arm_actions=spaces.action_size - gripper_size,
+        )
 
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None

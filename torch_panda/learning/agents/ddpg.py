@@ -8,7 +8,7 @@ import copy
 import math
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
@@ -46,9 +46,13 @@ class DDPG(Agent):
         noise = AdditiveGaussianModule(
             action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
         )
-        random_action = EGreedyModule(action_spec)
-        # (num_envs,): compared with one random number per environment.
-        random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
+        random_action: TensorDictModuleBase
+        if hp.exploration == "points":
+            random_action = self.random_points()
+        else:
+            random_action = EGreedyModule(action_spec)
+            # (num_envs,): compared with one random number per environment.
+            random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
         self.actor_parameters = list(self.actor.parameters())
         self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
         self.target: list[Tensor] = [

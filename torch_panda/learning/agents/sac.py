@@ -50,7 +50,8 @@ class SAC(Agent):
         # A buffer, but only once it was asked for: in the states that runs save.
         _ = self.loss.target_entropy
         self.soft_update = SoftUpdate(self.loss, tau=TAU)
-        self.assemble(actor, [], trained=list(self.loss.parameters()))
+        noise = [self.random_points()] if hp.exploration == "points" else []
+        self.assemble(actor, noise, trained=list(self.loss.parameters()))
 
     def make_loss(
         self,

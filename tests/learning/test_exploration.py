@@ -1,0 +1,139 @@
+"""Exploration towards random points."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import torch_panda
+from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
+from torch_panda.learning.exploration import (
+    DURATION,
+    HIGHEST_POINT,
+    LOWEST_POINT,
+    RandomPointModule,
+)
+
+NUM_ENVS = 64
+
+
+def make_module(eps, *, moves_joints=False, action_size=4):
+    return RandomPointModule(
+        torch.as_tensor(eps).expand(NUM_ENVS).clone(),
+        action_size=action_size,
+        action_scale=0.05,
+        moves_joints=moves_joints,
+        num_arm_actions=7 if moves_joints else 3,
+    )
+
+
+def explore(module, steps, action_size=4, hand=(0.0, 0.0, 0.1)):
+    """Actions (steps, num_envs, action_size) of a hand that does not move."""
+    observation = torch.tensor(hand).expand(NUM_ENVS, 3)
+    actions = []
+    with set_exploration_type(ExplorationType.RANDOM):
+        for _ in range(steps):
+            td = {"observation": observation, "action": torch.full((NUM_ENVS, 1), 9.0)}
+            td["action"] = td["action"].expand(NUM_ENVS, action_size)
+            actions.append(module(TensorDict(td, [NUM_ENVS]))["action"])
+    return torch.stack(actions)
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.3, 0.5, 1.0])
+def test_the_ratio_of_exploring_steps_is_eps(eps):
+    torch.manual_seed(0)
+    replaced = explore(make_module(eps), steps=2000)[..., 0] != 9.0
+    assert replaced.float().mean() == pytest.approx(eps, abs=0.01)
+
+
+def test_a_point_and_the_gripper_are_kept_for_several_steps():
+    torch.manual_seed(0)
+    module = make_module(0.3)
+    moves, last = [], None
+    for _ in range(500):
+        explore(module, steps=1)
+        now = (int(module.steps_left[0]), module.point[0].tolist())
+        if last is not None and last[0] > 0:
+            assert now[0] == last[0] - 1
+            assert now[1] == last[1]
+        elif now[0] > 0:
+            moves.append(now[0] + 1)
+        last = now
+    assert min(moves) >= DURATION[0]
+    assert max(moves) <= DURATION[1]
+    assert len(set(moves)) > 3
+
+
+def test_the_hand_reaches_points_of_the_region():
+    """The real hand ends near the point, wherever the region has it."""
+    torch.manual_seed(0)
+    module = make_module(1.0, action_size=3)
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=NUM_ENVS, seed=0) as env,
+        set_exploration_type(ExplorationType.RANDOM),
+    ):
+        td = env.reset()
+        distances = []
+        for _ in range(30):
+            td["action"] = torch.zeros(NUM_ENVS, 3)
+            td = module(td)
+            arrives = module.steps_left == 0
+            td = env.step(td)["next"]
+            hand = td["observation"][:, :3]
+            distances.append((hand - module.point).norm(dim=1)[arrives])
+    assert torch.cat(distances[10:]).median() < 0.05
+    low, high = torch.tensor(LOWEST_POINT), torch.tensor(HIGHEST_POINT)
+    assert ((module.point >= low) & (module.point <= high)).all()
+
+
+def test_joint_control_spends_a_displacement():
+    torch.manual_seed(0)
+    module = make_module(1.0, moves_joints=True, action_size=8)
+    explore(module, steps=1, action_size=8)
+    first = module.point.clone()
+    explore(module, steps=3, action_size=8)
+    assert (module.point.abs() <= first.abs() + 1e-6).all()
+    assert (module.point.abs() < first.abs()).any()
+
+
+def test_a_deterministic_policy_is_left_alone():
+    module = make_module(1.0)
+    td = TensorDict(
+        {"observation": torch.zeros(NUM_ENVS, 3), "action": torch.ones(NUM_ENVS, 4)},
+        [NUM_ENVS],
+    )
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(module(td)["action"], torch.ones(NUM_ENVS, 4))
+
+
+def test_a_restored_module_continues_bit_for_bit():
+    torch.manual_seed(0)
+    module = make_module(0.5)
+    explore(module, steps=20)
+    state = {key: value.clone() for key, value in module.state_dict().items()}
+    random = torch.get_rng_state()
+    expected = explore(module, steps=20)
+    restored = make_module(0.5)
+    restored.load_state_dict(state)
+    torch.set_rng_state(random)
+    assert torch.equal(explore(restored, steps=20), expected)
+
+
+@pytest.mark.parametrize("algo", AGENTS)
+@pytest.mark.parametrize("env_id", ["PandaPickAndPlace-v1", "PandaPushJoints-v1"])
+def test_every_agent_explores_by_it(algo, env_id):
+    torch.manual_seed(0)
+    hp = Hyperparameters(
+        algo=algo, exploration="points", random_eps=(1.0, 1.0), noise_eps=0.0
+    )
+    with (
+        torch_panda.make(env_id, num_envs=4, seed=0) as env,
+        set_exploration_type(ExplorationType.RANDOM),
+    ):
+        agent = make_agent(env, hp)
+        rollout = env.rollout(10, agent.explore, break_when_any_done=False)
+    (module,) = (m for m in agent.modules() if isinstance(m, RandomPointModule))
+    assert module.steps_left.any()
+    assert any(key.endswith("steps_left") for key in agent.state_dict())
+    assert not any("steps_left" in key for key in agent.policy.state_dict())
+    assert rollout["action"].abs().max() <= 1.0
