@@ -1,0 +1,67 @@
+"""MkDocs hooks that add the guides and the registered classes to the pages."""
+
+import re
+import subprocess
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import torch_panda
+from torch_panda.registry import FAMILIES
+from torch_panda.sensors import SENSORS
+
+ROOT = Path(__file__).parents[2]
+CLASSES: dict[str, list[type]] = {
+    "tasks": [family.task for family in FAMILIES],
+    "robots": [family.robot for family in FAMILIES],
+    "sensors": [type(sensor) for sensor in SENSORS.values()],
+}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the guides under ``guides/``, and the files to which they link.
+
+    Relative links between guides stay valid, because the folders are kept.
+    """
+    for path in sorted(guide_files()):
+        name = f"guides/{path.relative_to(ROOT)}"
+        files.append(File.generated(config, name, abs_src_path=str(path)))
+    return files
+
+
+def guide_files() -> set[Path]:
+    """The README.md of every folder, and the files to which they link."""
+    listed = subprocess.run(
+        ["git", "ls-files", "README.md", "*/README.md"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.split()
+    guides = {ROOT / name for name in listed}
+    linked = set()
+    for guide in guides:
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", guide.read_text()):
+            path = (guide.parent / link).resolve()
+            if path.is_file():
+                linked.add(path)
+    return guides | linked
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Replace ``{{ tasks }}``, ``{{ robots }}`` and ``{{ sensors }}`` by sections.
+
+    There is one section for each registered class.
+    """
+    for name, classes in CLASSES.items():
+        sections = "\n\n".join(f"::: {_path(item)}" for item in dict.fromkeys(classes))
+        markdown = markdown.replace(f"{{{{ {name} }}}}", sections)
+    return markdown
+
+
+def _path(item: type) -> str:
+    """Import path of a class, the short one if there is one."""
+    if item.__name__ in torch_panda.__all__:
+        return f"torch_panda.{item.__name__}"
+    return f"{item.__module__}.{item.__name__}"

@@ -1,0 +1,80 @@
+"""The pages of the API reference, in .ci/docs."""
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import torch_panda
+
+DOCS = Path(__file__).parents[1] / ".ci" / "docs"
+
+
+def read_pages():
+    """Text of every page by name, as the hook completes it."""
+    pytest.importorskip("mkdocs")
+    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    pages = (DOCS / "pages").glob("*.md")
+    return {page.name: hooks.on_page_markdown(page.read_text()) for page in pages}
+
+
+def resolve(path):
+    """Name and object of an import path such as "torch_panda.Camera"."""
+    module, _, name = path.rpartition(".")
+    return name, getattr(importlib.import_module(module), name)
+
+
+def documented():
+    """Name and object of every entry of the pages, with repetitions."""
+    text = "\n".join(read_pages().values())
+    return [resolve(path) for path in re.findall(r"^::: (\S+)", text, re.MULTILINE)]
+
+
+def public_names():
+    """Name and object of everything that a package exports in ``__all__``."""
+    walk = pkgutil.walk_packages(torch_panda.__path__, "torch_panda.")
+    packages = ["torch_panda", *(entry.name for entry in walk if entry.ispkg)]
+    for package in packages:
+        module = importlib.import_module(package)
+        for name in getattr(module, "__all__", ()):
+            yield name, getattr(module, name)
+
+
+def count(entries, name, value):
+    return sum(name == other and value is x for other, x in entries)
+
+
+def test_every_public_name_is_on_exactly_one_page():
+    entries = documented()
+    counts = {name: count(entries, name, value) for name, value in public_names()}
+    assert len(counts) > 50
+    wrong = {name: number for name, number in counts.items() if number != 1}
+    assert not wrong, "add the name to a page in .ci/docs/pages"
+
+
+def test_no_entry_is_repeated():
+    names = [name for name, _ in documented()]
+    assert [name for name, number in Counter(names).items() if number > 1] == []
+
+
+def test_every_documented_class_and_function_has_a_docstring():
+    for name, value in documented():
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert inspect.getdoc(value), name
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (DOCS / "mkdocs.yml").read_text()
+    assert [page for page in read_pages() if f": {page}\n" not in navigation] == []
+
+
+def test_the_registered_classes_have_entries():
+    names = {name for name, _ in documented()}
+    assert {"Push", "PegInsertion", "XArm6", "JointTorque"} <= names
