@@ -138,6 +138,19 @@ def test_a_bare_environment_takes_a_nested_state():
             env.reset(observed)
 
 
+def test_an_observation_named_state_is_no_state():
+    class Observing(torch_panda.Reach):
+        def extra_observation(self, simulation):
+            return {"state": simulation.joint_position}
+
+    robot = torch_panda.Panda(block_gripper=True)
+    with torch_panda.RobotTaskEnv(robot=robot, task=Observing(), num_envs=2) as env:
+        start = env.reset()
+        again = env.reset(start.clone())
+        assert not torch.equal(start["desired_goal"], again["desired_goal"])
+        env.reset(start.clone().update(env.get_state()), set_state=True)
+
+
 def test_a_state_transform_wraps_one_environment():
     env = TransformedEnv(SerialEnv(2, make_env), StateTransform())
     with pytest.raises(TypeError, match="must wrap a RobotTaskEnv, got SerialEnv"):

@@ -22,7 +22,7 @@ from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, STATE_KEY, is_state
+from torch_panda.envs.state import EXACT_KEYS, STATE_KEY, is_state, unpack_state
 from torch_panda.rendering import Camera, RendererName, Window, segmentation_ids
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -511,8 +511,7 @@ class RobotTaskEnv(EnvBase):
     ) -> TensorDict:
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = None if mask is None else indices(mask)
-        state = {} if tensordict is None else tensordict
-        state = state.get(STATE_KEY, state)
+        state = unpack_state({} if tensordict is None else tensordict)
         return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     @property
@@ -535,7 +534,7 @@ class RobotTaskEnv(EnvBase):
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         """Whether a tensordict holds a state; `TransformedEnv` asks this."""
-        return tensordict is not None and STATE_KEY in set(tensordict.keys())
+        return tensordict is not None and unpack_state(tensordict) is not tensordict
 
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)

@@ -115,7 +115,8 @@ def is_state(
     is_observed = "achieved_goal" in keys
     if is_observed:
         keys -= set(observed_keys)
-    if not keys.intersection((*PHYSICAL, STATE_KEY)):
+    is_nested = entries is not None and unpack_state(entries) is not entries
+    if not is_nested and not keys.intersection(PHYSICAL):
         return "desired_goal" in keys and not is_observed
     if is_observed:
         raise ValueError(
@@ -124,6 +125,15 @@ def is_state(
             f"it, set_state=False to start a new episode"
         )
     return True
+
+
+def unpack_state(entries: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The state under the key ``state``, or else the entries themselves.
+
+    A tensor under this key is an observation of a task or sensor.
+    """
+    nested = entries.get(STATE_KEY, None)
+    return entries if nested is None or isinstance(nested, Tensor) else nested
 
 
 def read_state(
