@@ -5,7 +5,8 @@ import torch
 
 import torch_panda
 from tests.ids import PHYSICS_IDS
-from torch_panda.learning.evaluation_tasks import QUANTILES, evaluation_tasks
+from torch_panda import evaluation_tasks
+from torch_panda.learning.evaluation_tasks import QUANTILES
 
 
 @pytest.mark.parametrize("env_id", PHYSICS_IDS[::4])
