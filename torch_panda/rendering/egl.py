@@ -5,6 +5,8 @@ import subprocess
 import sys
 from typing import Literal, get_args
 
+from torch_panda.checks import check_choice
+
 # Bullet's software renderer, and its OpenGL renderer without a window.
 RendererName = Literal["tiny", "egl"]
 RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
@@ -31,8 +33,7 @@ def check_renderer(renderer: str) -> None:
         ValueError: there is no renderer of this name.
         RuntimeError: EGL does not work on this machine.
     """
-    if renderer not in RENDERERS:
-        raise ValueError(f"renderer must be one of {RENDERERS}, got {renderer!r}")
+    check_choice("renderer", renderer, RENDERERS)
     if renderer == "egl":
         _check_egl()
 

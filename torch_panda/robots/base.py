@@ -18,7 +18,7 @@ from torch_panda.bullet import (
     VectorSimulation,
 )
 from torch_panda.bullet.urdf import Tool
-from torch_panda.checks import check_quaternion
+from torch_panda.checks import check_choice, check_quaternion
 from torch_panda.robots.control_type import ACTION_SCALES, ARM_MODES, ControlType
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
@@ -96,11 +96,7 @@ class Robot(Configured):
         wrist_joint: int | None = None,
         finger_links: Sequence[int] = (),
     ) -> None:
-        if control_type not in get_args(ControlType):
-            raise ValueError(
-                f"control_type must be one of {get_args(ControlType)}, "
-                f"got {control_type!r}"
-            )
+        check_choice("control_type", control_type, get_args(ControlType))
         if len(neutral_joint_position) != len(joint_forces):
             raise ValueError(
                 f"neutral_joint_position and joint_forces must have the same length, "

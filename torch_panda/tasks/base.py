@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_panda.arguments import Configured
 from torch_panda.bullet import PhysicsClient, VectorSimulation
-from torch_panda.checks import check_not_negative
+from torch_panda.checks import check_choice, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
 
@@ -124,11 +124,7 @@ class Task(Configured, ABC):
     distance_threshold: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.reward_type not in get_args(RewardType):
-            raise ValueError(
-                f"reward_type must be one of {get_args(RewardType)}, "
-                f"got {self.reward_type!r}"
-            )
+        check_choice("reward_type", self.reward_type, get_args(RewardType))
         check_not_negative(distance_threshold=self.distance_threshold)
 
     @abstractmethod
