@@ -86,6 +86,11 @@ def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
         torch_panda.make("PandaPush-v1", **{option: value})
 
 
+def test_make_says_what_to_use_with_an_id_of_a_user(env_id):
+    with pytest.raises(TypeError, match="use task_options={'reward_type': 'dense'};"):
+        torch_panda.make(env_id, reward_type="dense")
+
+
 def test_options_of_task_and_robot_are_checked():
     with pytest.raises(
         TypeError,

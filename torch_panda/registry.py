@@ -131,10 +131,10 @@ class Family:
 
 BLOCKED = {"block_gripper": True}
 FIRM = {"finger_friction": 5.0}
-SPINNING = {"finger_spinning_friction": 0.001}
+SPINNING = {"finger_spinning_friction": 0.001}  # panda-gym 3.0.7; the URDF has 0.1
 
-# The robots at the tasks. The page tasks/README.md shows both versions side by side,
-# with their sources.
+# To add a task or a robot, add its line here. The page tasks/README.md shows the numbers
+# of both versions side by side, with their sources.
 FAMILIES = (
     Family(Panda, Reach, BLOCKED, v3_task={"table_friction": 0.5}, v3_robot=SPINNING),
     Family(
@@ -189,7 +189,6 @@ FAMILIES = (
     Family(XArm6Gripper, Reach, BLOCKED, joints=False),
     Family(XArm6Gripper, PickAndPlace, FIRM, joints=False),
 )
-
 
 _REGISTRATIONS = {
     registration.env_id: registration
@@ -404,25 +403,28 @@ def _check_options(registration: Registration, options: Options) -> None:
     """Refuse options of `make` that `RobotTaskEnv` does not have.
 
     Raises:
-        TypeError: An option is unknown; the error says what to use instead.
+        TypeError: An option is unknown. The error says what to use instead.
     """
-    advice = dict(_ADVICE)
-    for name, value in options.items():
-        for argument in ("task", "robot"):
-            factory = getattr(registration, argument)
-            if name in inspect.signature(factory).parameters:
-                advice[name] = f"use {argument}_options={{{name!r}: {value!r}}}"
-    dense_id = "Dense-".join(registration.env_id.rsplit("-", 1))
-    if "reward_type" in advice and dense_id in ENV_IDS:
-        advice["reward_type"] += f", or the id {dense_id} for dense rewards"
     names = (
         *inspect.signature(make).parameters,
         *inspect.signature(RobotTaskEnv.__init__).parameters,
     )
     hidden = {"self", "options", *_ADVICE}
-    check_names(
-        "make", options, [n for n in dict.fromkeys(names) if n not in hidden], advice
-    )
+    accepted = [name for name in dict.fromkeys(names) if name not in hidden]
+    unknown = [name for name in options if name not in accepted]
+    if not unknown:
+        return
+    advice = dict(_ADVICE)
+    for argument, made in (
+        ("task_options", registration.make_task()),
+        ("robot_options", registration.make_robot()),
+    ):
+        for name in inspect.signature(type(made)).parameters.keys() & set(unknown):
+            advice[name] = f"use {argument}={{{name!r}: {options[name]!r}}}"
+    dense_id = "Dense-".join(registration.env_id.rsplit("-", 1))
+    if "reward_type" in advice and dense_id in ENV_IDS:
+        advice["reward_type"] += f", or the id {dense_id} for dense rewards"
+    check_names("make", unknown, accepted, advice)
 
 
 def _call(factory: Callable[..., Made], owner: str, options: Options | None) -> Made:
