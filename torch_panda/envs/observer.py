@@ -14,7 +14,8 @@ from torch_panda.robots import Robot
 from torch_panda.sensors import Entry, JointState, Observer, Sensor, join_entries
 from torch_panda.tasks import Task
 
-# Number of vector observations whose numbers are checked. Later ones cost nothing.
+# Number of observations, of all environments at once, whose numbers are checked. The
+# check is too expensive for every step.
 _NUM_CHECKED = 20
 
 Observed = dict[str, Tensor]
@@ -61,7 +62,7 @@ class EpisodeObserver:
         self._max_episode_steps = max_episode_steps
         self._terminate_on_success = terminate_on_success
         self._goal_indices = None if goal_indices is None else list(goal_indices)
-        self._num_unchecked = _NUM_CHECKED
+        self._num_to_check = _NUM_CHECKED
         # Hooks that the task leaves out are never called.
         self._has_reward = type(task).reward is not Task.reward
         self._has_failure = type(task).failure is not Task.failure
@@ -127,9 +128,9 @@ class EpisodeObserver:
             observed["reward"] = self._reward(action, achieved_goal, desired_goal)
         for observer in self._observers:
             observed |= observer.observe()
-        if self._num_unchecked:
+        if self._num_to_check:
             self._check_numbers(observed)
-            self._num_unchecked -= 1
+            self._num_to_check -= 1
         return observed
 
     def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
@@ -170,7 +171,7 @@ class EpisodeObserver:
         }
 
     def _check_numbers(self, observed: Observed) -> None:
-        """Check what robot and task returned; see `observe`."""
+        """Check the numbers that robot and task returned; see `observe`."""
         robot, task = type(self._robot).__name__, type(self._task).__name__
         num_robot = self._robot.observation_dim
         observation = observed["observation"]
@@ -203,7 +204,9 @@ class EpisodeObserver:
             return
         invalid = (~is_valid).flatten(1).any(dim=1).nonzero().flatten().tolist()
         # Where Bullet itself diverged, the functions are not to blame.
-        for env in sorted(set(invalid) - set(self._simulation.diverged())):
+        blamed = set(invalid).difference(self._simulation.diverged())
+        if blamed:
+            env = min(blamed)
             raise ValueError(
                 f"{function} must return numbers that are finite, but returned "
                 f"{values[env].tolist()} for environment {env}: look for a division by "
@@ -222,28 +225,28 @@ class EpisodeObserver:
         ):
             value = getattr(owner, name)(simulation)
             check_output(f"{type(owner).__name__}.{name}", value, (n, size))
-        function = type(task).__name__
+        task_name = type(task).__name__
         if simulation.scene.markers:
             shape = (n, len(simulation.scene.markers), 7)
-            check_output(f"{function}.marker_pose", task.marker_pose(goal), shape)
+            check_output(f"{task_name}.marker_pose", task.marker_pose(goal), shape)
         goals = task.achieved_goal(simulation).float(), goal.float()
-        check_output(f"{function}.compute_reward", task.compute_reward(*goals), (n, 1))
+        check_output(f"{task_name}.compute_reward", task.compute_reward(*goals), (n, 1))
         check_output(
-            f"{function}.is_success", task.is_success(*goals), (n, 1), torch.bool
+            f"{task_name}.is_success", task.is_success(*goals), (n, 1), torch.bool
         )
         if self._has_reward:
             action = torch.zeros(n, robot.action_dim, dtype=torch.float32, device="cpu")
             reward = task.reward(simulation, action, goals[1], goals[1].clone())
-            check_output(f"{function}.reward", reward, (n, 1))
+            check_output(f"{task_name}.reward", reward, (n, 1))
         if self._has_failure:
             failure = task.failure(simulation)
-            check_output(f"{function}.failure", failure, (n, 1), torch.bool)
+            check_output(f"{task_name}.failure", failure, (n, 1), torch.bool)
         if self._goal_indices is not None:
             size = robot.observation_dim + task.observation_dim
             is_inside = all(0 <= index < size for index in self._goal_indices)
             if len(self._goal_indices) != task.goal_dim or not is_inside:
                 raise ValueError(
-                    f"{function}.goal_entries must name {task.goal_dim} entries of an "
+                    f"{task_name}.goal_entries must name {task.goal_dim} entries of an "
                     f"observation of {size}, got {task.goal_entries}"
                 )
 
