@@ -87,7 +87,7 @@ def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
 
 
 def test_make_says_what_to_use_with_an_id_of_a_user(env_id):
-    with pytest.raises(TypeError, match="use task_options={'reward_type': 'dense'};"):
+    with pytest.raises(TypeError, match=r"use task_options=\{'reward_type': 'dense'}"):
         torch_panda.make(env_id, reward_type="dense")
 
 

@@ -133,8 +133,8 @@ BLOCKED = {"block_gripper": True}
 FIRM = {"finger_friction": 5.0}
 SPINNING = {"finger_spinning_friction": 0.001}  # panda-gym 3.0.7; the URDF has 0.1
 
-# To add a task or a robot, add its line here. The page tasks/README.md shows the numbers
-# of both versions side by side, with their sources.
+# To add a task or a robot, add its line here. The page tasks/README.md shows the
+# numbers of both versions side by side, with their sources.
 FAMILIES = (
     Family(Panda, Reach, BLOCKED, v3_task={"table_friction": 0.5}, v3_robot=SPINNING),
     Family(
