@@ -1,4 +1,4 @@
-"""Which ids the tests take."""
+"""Ids of one environment for each physics."""
 
 import torch_panda
 from torch_panda.registry import find_registration

@@ -88,7 +88,7 @@ def test_flip_has_the_fingers_of_panda_gym_3():
         assert (robot.finger_friction, robot.finger_spinning_friction) == (1.0, 0.001)
 
 
-# How fast a body is after sliding for a while: friction brakes it by mu g.
+# Friction brakes a sliding body by mu g, where mu is the product of both values.
 @pytest.mark.parametrize(
     ("env_id", "friction"),
     [
@@ -99,7 +99,7 @@ def test_flip_has_the_fingers_of_panda_gym_3():
         ("PandaSlide-v3", 0.04 * 0.5),
     ],
 )
-def test_objects_slide_as_far_as_their_friction_lets_them(env_id, friction):
+def test_friction_brakes_sliding_objects_by_mu_g(env_id, friction):
     speed = 0.3
     with torch_panda.make(env_id) as env:
         state = env.reset().update(env.get_state())
@@ -112,9 +112,9 @@ def test_objects_slide_as_far_as_their_friction_lets_them(env_id, friction):
         for _ in range(steps):
             td = env.step(td.set("action", env.action_spec.zero()))["next"]
         index = env.robot.observation_dim + 7
-        left = td["observation"][index].item()
+        final_speed = td["observation"][index].item()
     expected = speed - friction * 9.81 * 0.04 * steps
-    assert left == pytest.approx(expected, abs=0.1 * (speed - expected))
+    assert final_speed == pytest.approx(expected, abs=0.1 * (speed - expected))
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_objects_slide_as_far_as_their_friction_lets_them(env_id, friction):
         ({"table_friction": -0.1}, "lateral_friction must be finite"),
     ],
 )
-def test_impossible_constants(arguments, message):
+def test_masses_and_frictions_out_of_range_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         torch_panda.RobotTaskEnv(
             robot=torch_panda.Panda(), task=torch_panda.Push(**arguments)
