@@ -10,9 +10,9 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -32,6 +32,7 @@ from tqdm import tqdm
 
 import torch_panda
 from torch_panda.bullet.native import loop_name
+from torch_panda.bullet.solver import SOLVER_VARIABLE
 from torch_panda.info import num_cores
 from torch_panda.learning.user_modules import (
     Imports,
@@ -42,7 +43,16 @@ from torch_panda.learning.user_modules import (
 from torch_panda.transforms import HindsightRelabel
 
 OURS = "torch_panda"
-Other = Literal["fast", "bare-bullet", "async", "sb3", "parallel", "fetch", "envpool"]
+Other = Literal[
+    "fast",
+    "own-solver",
+    "bare-bullet",
+    "async",
+    "sb3",
+    "parallel",
+    "fetch",
+    "envpool",
+]
 
 
 @dataclass
@@ -57,14 +67,15 @@ class Args:
     """number of threads of contenders that use threads; None means one per core, and at
     most one per environment"""
     others: tuple[Other, ...] = get_args(Other)
-    """contenders beside torch_panda; one whose libraries are missing is skipped"""
+    """contenders beside torch_panda; a contender whose libraries are missing is
+    skipped"""
     rounds: int = 7
     """number of turns of each contender; the table shows the median"""
     steps: int = 50
     """steps of each environment in a turn, after as many steps that warm up"""
     render_size: int | None = None
-    """observe pictures of this width and height [pixels]; measures only torch_panda,
-    "fast" and "async" """
+    """width and height of pictures to observe [pixels]; measures only torch_panda,
+    `fast` and `async`"""
     buffers: bool = False
     """measure replay buffers with and without hindsight instead of environments"""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -162,7 +173,7 @@ def _make_ours(setting: Setting, **options: Any) -> Running:  # noqa: ANN401 (op
 
 
 def _make_bare_bullet(setting: Setting) -> Running:
-    """Our native loop with nothing between its steps.
+    """Our native loop around Bullet's own solver, with nothing between its steps.
 
     It repeats an episode of random actions, whose setpoints it computes the first time.
     """
@@ -282,6 +293,7 @@ class Contender:
         memory: Typical memory of one environment [MB].
         modules: Modules that must be installed.
         renders: Whether it can observe pictures.
+        variables: Environment variables of its process.
     """
 
     title: str
@@ -289,6 +301,7 @@ class Contender:
     memory: float
     modules: tuple[str, ...] = ()
     renders: bool = False
+    variables: Mapping[str, str] = field(default_factory=dict)
 
     def obstacle(self, setting: Setting) -> str | None:
         """Reason why the contender cannot run here; None if it can."""
@@ -307,6 +320,8 @@ class Contender:
         return None
 
 
+_OWN_SOLVER = {SOLVER_VARIABLE: "bullet"}
+
 CONTENDERS: dict[str, Contender] = {
     OURS: Contender("torch_panda", _make_ours, 45, renders=True),
     "fast": Contender(
@@ -315,7 +330,12 @@ CONTENDERS: dict[str, Contender] = {
         45,
         renders=True,
     ),
-    "bare-bullet": Contender("bare Bullet, C threads", _make_bare_bullet, 45),
+    "own-solver": Contender(
+        "torch_panda, Bullet's own solver", _make_ours, 45, variables=_OWN_SOLVER
+    ),
+    "bare-bullet": Contender(
+        "bare Bullet, C threads", _make_bare_bullet, 45, variables=_OWN_SOLVER
+    ),
     "async": Contender(
         "panda-gym, AsyncVectorEnv",
         partial(_make_async, _make_panda_gym_env),
@@ -369,6 +389,7 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     import_modules(setting.modules)
     # pybullet prints on stdout whenever it loads a robot.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.environ.update(CONTENDERS[name].variables)
     make = CONTENDERS[name].make
     # A first environment takes the imports out of creation and memory.
     first = make(replace(setting, num_envs=1, num_threads=1))
