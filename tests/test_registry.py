@@ -4,7 +4,7 @@ import pytest
 
 import torch_panda
 from tests.test_custom import PushBall
-from torch_panda import Panda, Push
+from torch_panda import Panda, PickAndPlace, Push, XArm6Gripper
 from torch_panda.registry import Family, find_registration
 
 
@@ -44,7 +44,9 @@ def test_a_family_with_changes_for_v3_has_ids_of_both_versions():
         joints=False,
     )
     first, second, *dense = family.registrations()
-    assert (first.version, second.version, len(dense)) == ("v1", "v3", 2)
+    assert first.env_id == "PandaPushBall-v1"
+    assert second.env_id == "PandaPushBall-v3"
+    assert len(dense) == 2
     assert (first.terminate_on_success, second.terminate_on_success) == (False, True)
     assert second.max_episode_steps == PushBall.max_episode_steps
     assert second.make_task().distance_threshold == 0.1
@@ -52,14 +54,15 @@ def test_a_family_with_changes_for_v3_has_ids_of_both_versions():
     assert first.make_task().distance_threshold == 0.05
 
 
-def test_a_registration_names_robot_task_and_version(env_id):
+def test_a_registration_makes_robot_and_task(env_id):
     registration = find_registration("XArm6GripperPickAndPlaceDense-v1")
-    assert registration.robot_name == "XArm6Gripper"
-    assert registration.task_name == "PickAndPlace"
-    assert registration.version == "v1"
+    assert type(registration.make_robot()) is XArm6Gripper
+    task = registration.make_task({"distance_threshold": 0.02})
+    assert type(task) is PickAndPlace
+    assert (task.reward_type, task.distance_threshold) == ("dense", 0.02)
     registration = find_registration(env_id)
-    assert (registration.robot_name, registration.task_name) == ("Panda", "PushBall")
-    assert registration.version == ""
+    assert registration.make_robot().control_type == "joints"
+    assert type(registration.make_task()) is PushBall
 
 
 @pytest.mark.parametrize(

@@ -65,21 +65,6 @@ class Registration:
         """Make the task of the id; see `make_robot`."""
         return _call(self.task, f"task_options of {self.env_id}", options)
 
-    @property
-    def task_name(self) -> str:
-        """Name of the task's class, such as "Push"."""
-        return type(self.make_task()).__name__
-
-    @property
-    def robot_name(self) -> str:
-        """Name of the robot's class, such as "Panda"."""
-        return type(self.make_robot()).__name__
-
-    @property
-    def version(self) -> str:
-        """Version of the id, such as "v1"; empty if the id has none."""
-        return self.env_id.rpartition("-")[2] if "-" in self.env_id else ""
-
 
 @dataclass(frozen=True)
 class Family:

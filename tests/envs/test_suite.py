@@ -68,10 +68,12 @@ def test_ids_are_unique():
 def test_an_id_names_its_robot_its_task_and_its_version():
     for env_id in torch_panda.ENV_IDS:
         registration = find_registration(env_id)
-        control = {"joints": "Joints", "ee": ""}[registration.make_robot().control_type]
-        reward = {"dense": "Dense", "sparse": ""}[registration.make_task().reward_type]
-        name = registration.robot_name + registration.task_name
-        assert env_id == f"{name}{control}{reward}-{registration.version}"
+        robot, task = registration.make_robot(), registration.make_task()
+        control = {"joints": "Joints", "ee": ""}[robot.control_type]
+        reward = {"dense": "Dense", "sparse": ""}[task.reward_type]
+        version = "v3" if registration.terminate_on_success else "v1"
+        name = f"{type(robot).__name__}{type(task).__name__}"
+        assert env_id == f"{name}{control}{reward}-{version}"
 
 
 def test_specs(env):
