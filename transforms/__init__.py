@@ -2,5 +2,6 @@
 
 from torch_panda.transforms.augment import HindsightAugment
 from torch_panda.transforms.relabel import HindsightRelabel
+from torch_panda.transforms.sampler import GoalSampler
 
-__all__ = ["HindsightAugment", "HindsightRelabel"]
+__all__ = ["GoalSampler", "HindsightAugment", "HindsightRelabel"]

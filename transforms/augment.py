@@ -30,6 +30,8 @@ class HindsightAugment(BufferTransform):
         ValueError: an argument has a value that is not accepted.
     """
 
+    _shown = ("strategy", "k")
+
     def __init__(self, reward_fn: GoalFunction, *, k: int = 4, **options: Any) -> None:  # noqa: ANN401
         super().__init__(reward_fn, **options)
         if k < 1 or not float(k).is_integer():

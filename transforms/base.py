@@ -5,6 +5,7 @@ import gc
 import inspect
 import threading
 import weakref
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ class BufferTransform(envs.Transform):
             rewards of the first batches are compared with it.
         strategy: Name of a strategy, a function `(step, first, end, generator) -> goal
             step` (see `strategies`), or a mapping of these to weights.
+        discount: Discount per step of the strategy "geometric".
         success_fn: Maps goals to the success, bool, (n, 1). With it, `success_key` is
             rewritten.
         terminated_fn: Maps goals to whether the episode terminates, for tasks that end
@@ -65,12 +67,14 @@ class BufferTransform(envs.Transform):
     # Processes that share the buffer would have to share this transform's memory.
     requires_shared_write_state = True
     goal_parts: tuple[int, ...] | None = None
+    _shown: tuple[str, ...]  # attributes that the representation names
 
     def __init__(
         self,
         reward_fn: GoalFunction,
         *,
         strategy: StrategyOption = "future",
+        discount: float = 0.99,
         success_fn: GoalFunction | None = None,
         terminated_fn: GoalFunction | None = None,
         goal_key: NestedKey = "desired_goal",
@@ -87,8 +91,8 @@ class BufferTransform(envs.Transform):
             raise TypeError(self._explain_unknown(name, value))
         if not callable(reward_fn):
             raise ValueError(f"reward_fn must be a function, got {reward_fn!r}")
-        self.strategy = strategy
-        self._mixture = Mixture.parse(strategy)
+        self.strategy, self.discount = strategy, discount
+        self._mixture = Mixture.parse(strategy, discount)
         self.trajectory_key = unravel_key(trajectory_key)
         self.single_env = single_env
         keys = goal_key, achieved_goal_key, reward_key, success_key
@@ -113,8 +117,11 @@ class BufferTransform(envs.Transform):
         for base in cls.__mro__[: cls.__mro__.index(BufferTransform) + 1]:
             names = inspect.signature(base).parameters
             accepted += [x for x in names if x not in ("options", "unknown")]
-        translation = None
-        if name in ("k", "n_sampled_goal") and isinstance(value, int) and value > 0:
+        if "strategies" in accepted:  # GoalSampler has a strategy per key
+            accepted.remove("strategy")
+        translation, has_ratio = None, "her_ratio" in accepted
+        is_count = isinstance(value, int) and value > 0
+        if name in ("k", "n_sampled_goal") and is_count and has_ratio:
             translation = f"her_ratio={value / (value + 1):.3g}"
         elif name == "her_ratio" and isinstance(value, float) and 0 < value < 1:
             translation = f"k={max(1, round(value / (1 - value)))}"
@@ -212,7 +219,7 @@ class BufferTransform(envs.Transform):
         self._check_written(batch)
         check_goals_agree(flat, rewriter)
         goals: Any = [achieved.numpy(force=True)]
-        if DESIRED in self._mixture.weights:
+        if any(DESIRED in mixture.weights for mixture in self._get_mixtures()):
             goals.append(desired.numpy(force=True))
         roots = None if root is None else root.numpy(force=True)
         is_done = done.numpy(force=True).reshape(-1)
@@ -222,6 +229,10 @@ class BufferTransform(envs.Transform):
         if batch.ndim > 1:
             tags = tags.view(shape[-1], *shape[:-1]).movedim(0, -1)
         return batch.set(SERIAL_KEY, tags.to(desired.device))
+
+    def _get_mixtures(self) -> Collection[Mixture]:
+        """Returns the mixtures of strategies that goals are drawn by."""
+        return [self._mixture]
 
     def _claim(self, buffer: ReplayBuffer | None) -> None:
         """Makes the buffer the only one whose transitions are remembered.
@@ -297,8 +308,7 @@ class BufferTransform(envs.Transform):
         return ids.numpy(force=True).reshape(-1)
 
     def __repr__(self) -> str:
-        names = ("strategy", "her_ratio", "unit", "goal_parts", "k")
-        options = [f"{n}={vars(self)[n]!r}" for n in names if n in vars(self)]
+        options = [f"{name}={getattr(self, name)!r}" for name in self._shown]
         return f"{type(self).__name__}({', '.join(options)})"
 
     def end_trajectories(self) -> None:

@@ -227,7 +227,9 @@ class GoalMemory:
             trajectories = self._trajectories.take(numbers)
             if strategy not in (RANDOM, DESIRED):
                 first, end = trajectories["first"], trajectories["end"]
-                steps = choose_steps(strategy, steps, first, end, generator)
+                steps = choose_steps(
+                    strategy, steps, first, end, mixture.discount, generator
+                )
             column = int(strategy == DESIRED)
             goals[rows] = self._goals[:, column].take(
                 trajectories["offset"] + steps, axis=0

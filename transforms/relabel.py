@@ -21,9 +21,10 @@ class HindsightRelabel(SampleTimeTransform):
     guide.
 
     Strategies draw the goal from what a transition's own trajectory achieved: at this
-    step or later ("future"), at the last step ("final"), or at any step ("episode").
-    Or they draw from all stored transitions: an achieved goal ("random") or a desired
-    goal ("desired").
+    step or later, uniformly ("future") or preferring early steps ("geometric"), at this
+    step ("current"), at the last step ("final"), or at any step ("episode"). Or they
+    draw from all stored transitions: an achieved goal ("random") or a desired goal
+    ("desired").
 
     Args:
         reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
@@ -40,6 +41,8 @@ class HindsightRelabel(SampleTimeTransform):
         TypeError: an argument is unknown.
         ValueError: an argument has a value that is not accepted.
     """
+
+    _shown = ("strategy", "her_ratio", "unit", "goal_parts")
 
     def __init__(
         self,

@@ -84,7 +84,7 @@ class SampleTimeTransform(BufferTransform):
                 self._rewriter.check_entries(tensordict)
                 self._warn_of_slices(buffer)
             self._check_sampled(tensordict)
-            if not self._mixture.only_looks_ahead:
+            if not all(m.only_looks_ahead for m in self._get_mixtures()):
                 self._memory.forget(oldest)
             serials = tags.numpy(force=True).reshape(-1)
             drawn = self._draw(serials, tensordict)

@@ -3,7 +3,8 @@
 The stored steps of a trajectory are numbered from `first` to `end - 1`. A strategy that
 stays within the trajectory chooses one of these steps for a transition of step `step`.
 Strategies "future", "final", "episode" and "random" are those of Andrychowicz et al.
-2017 (arXiv 1707.01495), section 4.5.
+2017 (arXiv 1707.01495), section 4.5. "geometric" draws the step of a discounted future
+state, as in contrastive RL (Eysenbach et al. 2022, arXiv 2206.07568).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -25,7 +26,7 @@ StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
 RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
 # A stored transition's later steps are stored too, so these never need older steps.
-LOOKING_AHEAD = ("future", "final")
+LOOKING_AHEAD = ("current", "future", "geometric", "final")
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
@@ -35,17 +36,23 @@ class Mixture:
 
     Attributes:
         weights: Probability of each strategy. They add up to 1.
+        discount: "geometric" draws the goal that is achieved k steps later with a
+            probability proportional to discount**k, up to the last stored step.
     """
 
     weights: Mapping[Strategy, float]
+    discount: float
 
     @classmethod
-    def parse(cls, strategy: StrategyOption) -> "Mixture":
+    def parse(cls, strategy: StrategyOption, discount: float) -> "Mixture":
         """Makes the mixture of a strategy, or of a mapping of strategies to weights.
 
         Raises:
-            ValueError: a strategy is unknown, or a weight is not positive and finite.
+            ValueError: a strategy is unknown, a weight is not positive and finite, or
+                the discount is not within [0, 1].
         """
+        if not 0 <= discount <= 1:
+            raise ValueError(f"discount must be within [0, 1], got {discount}")
         weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
         for name in weights or [strategy]:
             if not callable(name) and name not in NAMES:
@@ -58,7 +65,8 @@ class Mixture:
                 f"strategy must have positive, finite weights, got {strategy!r}"
             )
         total = sum(weights.values())
-        return cls({name: weight / total for name, weight in weights.items()})
+        shares = {name: weight / total for name, weight in weights.items()}
+        return cls(shares, discount)
 
     @property
     def only_looks_ahead(self) -> bool:
@@ -93,25 +101,46 @@ def draw_integers(
     return low + (u * (end - low)).astype(np.int64)
 
 
+def draw_geometric(
+    end: Integers, discount: float, generator: Generator | None
+) -> Integers:
+    """Draws k < `end` with probability proportional to discount**k, (n,)."""
+    if discount == 1:
+        return draw_integers(0, end, generator)
+    u = draw_uniform(len(end), generator)
+    if discount == 0:
+        return np.zeros(len(end), dtype=np.int64)
+    # The inverse of P(k < x) = (1 - discount**x) / (1 - discount**end).
+    x = np.log1p(-u * (1 - discount**end)) / np.log(discount)
+    return np.minimum(x.astype(np.int64), end - 1)
+
+
 def choose_steps(
     strategy: Strategy,
     step: Integers,
     first: Integers,
     end: Integers,
+    discount: float,
     generator: Generator | None,
 ) -> Integers:
     """Chooses a step of its own trajectory for each transition.
 
     Args:
-        strategy: "future", "final", "episode", or a user's function.
+        strategy: Name of a strategy other than "random" and "desired", or a user's
+            function.
         step: Steps of the transitions, (n,).
         first: Oldest stored step of each transition's trajectory, (n,).
         end: One more than the last stored step of each trajectory, (n,).
+        discount: Discount per step of "geometric".
         generator: Generator of the random draws, torch's if None.
 
     Raises:
         ValueError: a user's function did not return stored steps.
     """
+    if strategy == "current":
+        return step
+    if strategy == "geometric":
+        return step + draw_geometric(end - step, discount, generator)
     if strategy == "final":
         return end - 1
     if strategy == "future":

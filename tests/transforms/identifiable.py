@@ -92,6 +92,33 @@ def relabelled(batch: TensorDict) -> Tensor:
     return (batch["desired_goal"] != STORED_GOAL).any(-1)
 
 
+def check_goals(
+    goal: Tensor, achieved: Tensor, stored: TensorDict, strategy: str
+) -> None:
+    """Asserts that goals, (n, 3), are where their strategy may draw them.
+
+    Args:
+        goal: The drawn goals.
+        achieved: What their rows achieved, (n, 3).
+        stored: All that the storage holds.
+        strategy: Name of the strategy.
+    """
+    goals = stored["next", "achieved_goal"].flatten(0, -2)
+    if strategy == "desired":
+        goals = stored["desired_goal"].flatten(0, -2)
+    assert (goal[:, None] == goals).all(-1).any(-1).all(), "overwritten or invented"
+    if strategy not in ("random", "desired"):
+        assert (goal[:, :2] == achieved[:, :2]).all(), "from another trajectory"
+    if strategy in ("current", "future", "geometric", "final"):
+        assert (goal[:, 2] >= achieved[:, 2]).all(), "from the past"
+    if strategy == "current":
+        assert (goal == achieved).all(), "from another step"
+    if strategy == "final":
+        for a, g in zip(achieved, goal, strict=True):
+            same = goals[(goals[:, :2] == a[:2]).all(-1)]
+            assert g[2] == same[:, 2].max(), "not the last step"
+
+
 def check_batch(batch: TensorDict, stored: TensorDict, strategy: str) -> None:
     """Asserts that a sampled batch is right, given all that the storage holds."""
     mask = relabelled(batch)
@@ -99,17 +126,7 @@ def check_batch(batch: TensorDict, stored: TensorDict, strategy: str) -> None:
     assert (batch["next", "desired_goal"] == goal).all()
     reward = torch.where(mask[..., None], reward_fn(achieved, goal), STORED_REWARD)
     assert (batch["next", "reward"] == reward).all()
-    achieved, goal = achieved[mask], goal[mask]
-    held = stored["next", "achieved_goal"].flatten(0, -2)
-    assert (goal[:, None] == held).all(-1).any(-1).all(), "overwritten or invented"
-    if strategy != "random":
-        assert (goal[:, :2] == achieved[:, :2]).all(), "from another trajectory"
-    if strategy in ("future", "final"):
-        assert (goal[:, 2] >= achieved[:, 2]).all(), "from the past"
-    if strategy == "final":
-        for a, g in zip(achieved, goal, strict=True):
-            same = held[(held[:, :2] == a[:2]).all(-1)]
-            assert g[2] == same[:, 2].max()
+    check_goals(goal[mask], achieved[mask], stored, strategy)
 
 
 def check_untouched(batch: TensorDict, stored: TensorDict) -> None:

@@ -1,0 +1,278 @@
+"""`GoalSampler` writes goals where their strategies say, and the first key's reward."""
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torchrl.collectors import Collector
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    SliceSampler,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
+from torchrl.envs import CatTensors, TransformedEnv
+
+from tests.transforms import toy
+from tests.transforms.identifiable import (
+    Envs,
+    check_goals,
+    name_goals,
+    reward_fn,
+    terminated_fn,
+)
+from tests.transforms.pipelines import buffer, collect, make
+from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
+
+NAMES = ["current", "future", "geometric", "final", "episode", "random", "desired"]
+ALL = {f"{name}_goal": name for name in NAMES}
+
+
+def check_sample(batch, stored):
+    """Asserts that every key of a batch by `ALL` is right."""
+    batch, achieved = batch.reshape(-1), batch["next", "achieved_goal"].reshape(-1, 3)
+    for key, strategy in ALL.items():
+        assert torch.equal(batch[key], batch["next", key])
+        check_goals(batch[key], achieved, stored, strategy)
+    first = batch[next(iter(ALL))]
+    assert torch.equal(batch["next", "reward"], reward_fn(achieved, first))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    num_envs=st.integers(1, 5),
+    lengths=st.lists(st.integers(1, 30), min_size=1, max_size=3),
+    steps=st.integers(2, 12),
+    capacity=st.integers(60, 300),
+    layout=st.sampled_from(["flat", "time first", "two-dimensional", "no ids"]),
+)
+def test_no_goal_is_wrong(num_envs, lengths, steps, capacity, layout):
+    ndim = 1 if layout in ("flat", "time first") else 2
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity, ndim=ndim),
+        transform=GoalSampler(ALL, reward_fn),
+        batch_size=64,
+    )
+    envs = Envs(num_envs, lengths)
+    for _ in range(30):
+        data = name_goals(envs.chunk(steps))
+        if layout == "no ids":
+            data = data.exclude("collector")
+        if layout == "time first":
+            data = data.transpose(0, 1)
+        rb.extend(data.reshape(-1) if ndim == 1 else data)
+        check_sample(rb.sample(), rb.storage[:])
+
+
+@pytest.mark.parametrize("cls", [ReplayBuffer, TensorDictReplayBuffer])
+@pytest.mark.parametrize("prefetch", [None, 2])
+def test_storages_on_disk_and_prefetching(cls, prefetch, tmp_path):
+    rb = cls(
+        storage=LazyMemmapStorage(60, scratch_dir=tmp_path),
+        transform=GoalSampler(ALL, reward_fn),
+        batch_size=32,
+        prefetch=prefetch,
+    )
+    envs = Envs(3, [5, 9])
+    for _ in range(2):
+        rb.extend(name_goals(envs.chunk(10)).reshape(-1))
+    before = rb.storage[:].clone()
+    for _ in range(5):
+        check_sample(rb.sample(), before)
+    check_sample(rb[:], before)
+    assert (rb.storage[:] == before).all(), "the storage was written into"
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_collectors(ndim):
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(200, ndim=ndim),
+        transform=GoalSampler(ALL, reward_fn),
+        batch_size=64,
+    )
+    for data in Collector(toy.make_env, frames_per_batch=15, total_frames=600):
+        rb.extend(data if ndim == 2 else data.reshape(-1))
+        check_sample(rb.sample(), rb.storage[:])
+
+
+def test_existing_data():
+    data = name_goals(Envs(20, [9]).chunk(9)).exclude("collector")
+    transform = GoalSampler(ALL, reward_fn)
+    prepared = transform.prepare(data)
+    rb = TensorDictReplayBuffer(
+        storage=TensorStorage(prepared), transform=transform, batch_size=256
+    )
+    check_sample(rb.sample(), prepared)
+
+
+def test_the_first_key_determines_reward_success_and_ends():
+    strategies = {"value_goal": {"current": 1, "random": 1}, "actor_goal": "random"}
+    options = {"success_fn": terminated_fn, "terminated_fn": terminated_fn}
+    rb = buffer(GoalSampler(strategies, reward_fn, seed=0, **options))
+    data = name_goals(Envs(3, [4, 9]).chunk(20)).reshape(-1)
+    data["next", "success"] = torch.zeros_like(data["next", "done"])
+    rb.extend(data)
+    batch, stored = rb.sample(), rb.storage[:]
+    after, index = batch["next"], batch["index"]
+    reached = terminated_fn(after["achieved_goal"], batch["value_goal"])
+    assert 0.3 < reached.float().mean() < 0.8
+    assert torch.equal(after["reward"], reached.float() - 1)
+    assert torch.equal(after["success"], reached)
+    assert torch.equal(after["terminated"], reached)
+    truncated = stored["next", "truncated"][index]
+    assert torch.equal(after["done"], reached | truncated)
+    assert (batch["actor_goal"] != batch["value_goal"]).any()
+    for place, name in ((batch, "desired_goal"), (after, "desired_goal")):
+        assert torch.equal(place[name], stored["desired_goal"][index])
+
+
+def test_the_desired_goal_may_be_a_key():
+    rb = buffer(GoalSampler({"desired_goal": "final"}, reward_fn))
+    rb.extend(name_goals(Envs(3, [4, 9]).chunk(20)).reshape(-1))
+    batch = rb.sample()
+    goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
+    check_goals(goal, achieved, rb.storage[:], "final")
+    assert torch.equal(batch["next", "reward"], reward_fn(achieved, goal))
+
+
+def test_keys_draw_independently():
+    rb = buffer(GoalSampler({"a": "random", "b": "random"}, reward_fn, seed=0))
+    rb.extend(name_goals(Envs(10, [10]).chunk(10)).reshape(-1))
+    batch = rb.sample(5000)
+    assert (batch["a"] == batch["b"]).all(1).float().mean() < 0.03  # 1 in 100
+
+
+def test_slices_share_goals():
+    sampler = SliceSampler(slice_len=4, traj_key=("collector", "traj_ids"))
+    rb = buffer(GoalSampler(ALL, reward_fn, unit="slice"), sampler=sampler)
+    rb.extend(name_goals(Envs(4, [16]).chunk(32)).reshape(-1))
+    slices = rb.sample().reshape(-1, 4)
+    for key in ALL:
+        expected = slices["next", "achieved_goal"][:, -1:] if key[:3] == "cur" else None
+        expected = slices[key][:, :1] if expected is None else expected
+        assert (slices[key] == expected).all()
+
+
+def test_rows_that_were_overwritten_get_their_own_goal():
+    transform = GoalSampler(ALL, reward_fn, capacity=20)
+    data = transform._inv_call(name_goals(Envs(2, [10]).chunk(20)).reshape(-1))
+    batch = transform.forward(data)
+    old = data["hindsight_serial"] < 20
+    for key in ALL:
+        assert torch.equal(batch[key][old], data["next", "achieved_goal"][old])
+        assert key == "current_goal" or (batch[key] != batch["current_goal"]).any()
+
+
+def test_a_reloaded_buffer_draws_the_same_goals(tmp_path):
+    def make_buffer():
+        return buffer(GoalSampler(ALL, reward_fn, seed=3))
+
+    rb, new = make_buffer(), make_buffer()
+    rb.extend(name_goals(Envs(3, [5, 9]).chunk(50)).reshape(-1))
+    rb.dumps(tmp_path)
+    new.loads(tmp_path)
+    batches = []
+    for loaded in (rb, new):
+        torch.manual_seed(0)
+        batches.append(loaded.sample())
+    assert (batches[0] == batches[1]).all()
+
+
+def test_from_env_reads_what_belongs_together():
+    env = make("PandaReach-v3")
+    strategies = {"value_goal": {"current": 1, "random": 1}}
+    rb = buffer(GoalSampler.from_env(env, strategies, seed=0))
+    for data in collect(env):
+        rb.extend(data.reshape(-1))
+    batch = rb.sample()
+    goals = batch["next", "achieved_goal"], batch["value_goal"]
+    success = env.is_success(*goals)
+    assert torch.equal(batch["next", "reward"], env.compute_reward(*goals))
+    assert torch.equal(batch["next", "success"], success)
+    assert torch.equal(batch["next", "terminated"], success)
+
+
+def test_data_are_refused_as_by_hindsight():
+    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
+    env = TransformedEnv(make(), cat)
+    rb = buffer(GoalSampler.from_env(env, {"value_goal": "future"}))
+    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
+        rb.extend(next(iter(collect(env))).reshape(-1))
+
+
+@pytest.mark.parametrize(
+    ("strategies", "options", "message"),
+    [
+        ({}, {}, "strategies must map keys"),
+        ("future", {}, "strategies must map keys.*'future'"),
+        ({"goal": "past"}, {}, "strategy must be one of.*'past'"),
+        ({"achieved_goal": "future"}, {}, "must not replace 'achieved_goal'"),
+        ({"goal": "future"}, {"discount": 1.5}, r"discount must be within \[0, 1\]"),
+    ],
+)
+def test_bad_values_are_refused(strategies, options, message):
+    with pytest.raises(ValueError, match=message):
+        GoalSampler(strategies, reward_fn, **options)
+
+
+@pytest.mark.parametrize("name", ["strategy", "her_ratio", "k"])
+def test_arguments_of_other_transforms_are_refused(name):
+    with pytest.raises(TypeError, match=f"GoalSampler has no argument '{name}'"):
+        GoalSampler({"goal": "future"}, reward_fn, **{name: 1})
+
+
+def test_the_representation_names_the_strategies():
+    transform = GoalSampler({"goal": "future"}, reward_fn)
+    assert repr(transform) == (
+        "GoalSampler(strategies={'goal': 'future'}, discount=0.99, unit='row')"
+    )
+
+
+# -- the distribution of "geometric" goals, in all transforms -------------------------
+
+LENGTH = 8
+
+
+def draw(hindsight, discount, n=4000):
+    """Returns steps and goal steps of n or more rows, of finished episodes."""
+    data = name_goals(Envs(5, [LENGTH]).chunk(LENGTH)).reshape(-1)
+    options = {"discount": discount, "seed": 0}
+    if hindsight is GoalSampler:
+        transform = GoalSampler({"goal": "geometric"}, reward_fn, **options)
+    else:
+        options |= {"strategy": "geometric"}
+        options |= {"k": n // 40} if hindsight is HindsightAugment else {"her_ratio": 1}
+        transform = hindsight(reward_fn, **options)
+    storage = LazyTensorStorage(2 * n)
+    rb = TensorDictReplayBuffer(storage=storage, transform=transform, batch_size=n)
+    rb.extend(data)
+    torch.manual_seed(0)
+    batch = rb.storage[40:] if hindsight is HindsightAugment else rb.sample()
+    goal = batch["goal" if hindsight is GoalSampler else "desired_goal"]
+    achieved = batch["next", "achieved_goal"]
+    assert torch.equal(goal[:, :2], achieved[:, :2])
+    return achieved[:, 2].long(), goal[:, 2].long()
+
+
+@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment, GoalSampler])
+@pytest.mark.parametrize("discount", [0.5, 0.9, 0.99, 1.0])
+def test_geometric_goals_have_their_distribution(hindsight, discount):
+    steps, goal_steps = draw(hindsight, discount)
+    chi2, freedom = 0.0, 0
+    for step in range(1, LENGTH + 1):
+        delays = (goal_steps - steps)[steps == step]
+        counts = torch.bincount(delays, minlength=LENGTH)
+        weights = discount ** torch.arange(LENGTH - step + 1.0)
+        expected = len(delays) * weights / weights.sum()
+        assert counts.sum() == counts[: len(expected)].sum()
+        chi2 += ((counts[: len(expected)] - expected) ** 2 / expected).sum()
+        freedom += len(expected) - 1
+    assert chi2 <= freedom + 5 * (2 * freedom) ** 0.5
+
+
+@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment, GoalSampler])
+def test_geometric_goals_without_future_are_the_current_ones(hindsight):
+    steps, goal_steps = draw(hindsight, 0.0)
+    assert torch.equal(steps, goal_steps)

@@ -1,0 +1,126 @@
+"""Several goals for each sampled transition, as a transform of a replay buffer."""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torchrl import envs
+from typing_extensions import Self
+
+from torch_panda.transforms.goal_memory import Goals
+from torch_panda.transforms.rewrite import GoalFunction
+from torch_panda.transforms.sample_time import SampleTimeTransform
+from torch_panda.transforms.strategies import Integers, Mixture, StrategyOption
+
+
+class GoalSampler(SampleTimeTransform):
+    """Adds goals to sampled transitions, each drawn by strategies of its own.
+
+    Offline goal-conditioned learning draws goals for values and goals for policies
+    separately (OGBench, Park et al. 2025, arXiv 2410.20092):
+
+        GoalSampler(
+            {
+                "value_goal": {"current": 0.2, "geometric": 0.5, "random": 0.3},
+                "actor_goal": "future",
+            },
+            reward_fn=compute_reward,
+        )
+
+    Every row gets a goal under each key, (n, *goal), and the same goal under "next".
+    The first key's goals determine the reward of all rows and, if the functions for
+    them are known, success and ends. The desired goals stay as stored, unless
+    `goal_key` is among the keys.
+
+    Args:
+        strategies: For each key, a strategy as in `HindsightRelabel`: a name, a
+            function, or a mapping of these to weights.
+        reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
+            (n, 1).
+        **options: `unit` and `capacity` (see `SampleTimeTransform`), and arguments of
+            `BufferTransform` except `strategy`.
+
+    Raises:
+        TypeError: an argument is unknown.
+        ValueError: an argument has a value that is not accepted.
+    """
+
+    _shown = ("strategies", "discount", "unit")
+
+    def __init__(
+        self,
+        strategies: Mapping[Any, StrategyOption],
+        reward_fn: GoalFunction,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        if "strategy" in options:
+            raise TypeError(
+                "GoalSampler has no argument 'strategy'; pass strategies, one for each "
+                'key, such as {"value_goal": "geometric"}'
+            )
+        super().__init__(reward_fn, **options)
+        if not isinstance(strategies, Mapping) or not strategies:
+            raise ValueError(
+                "strategies must map keys of new entries to strategies, such as "
+                f'{{"value_goal": "geometric"}}, got {strategies!r}'
+            )
+        self.strategies = {**strategies}
+        self._mixtures: dict[NestedKey, Mixture] = {
+            unravel_key(key): Mixture.parse(strategy, self.discount)
+            for key, strategy in strategies.items()
+        }
+        if self._rewriter.achieved_goal_key in self._mixtures:
+            raise ValueError(
+                f"strategies must not replace {self._rewriter.achieved_goal_key!r}: "
+                "name a new entry"
+            )
+
+    @classmethod
+    def from_env(
+        cls,
+        env: envs.EnvBase,
+        strategies: Mapping[Any, StrategyOption] | None = None,
+        **options: Any,  # noqa: ANN401
+    ) -> Self:
+        """Makes the transform that belongs to an environment; see `BufferTransform`."""
+        return super().from_env(env, strategies=strategies, **options)
+
+    def _get_mixtures(self) -> Collection[Mixture]:
+        return self._mixtures.values()
+
+    def _draw(self, serials: Integers, batch: TensorDictBase) -> dict[NestedKey, Goals]:
+        """Draws a goal for each row and key, (n, *goal)."""
+        last_rows, units = self._find_units(serials)
+        oldest = self._memory.oldest
+        drawn = {}
+        for key, mixture in self._mixtures.items():
+            goals = self._memory.draw(last_rows.clip(oldest), mixture, self._generator)
+            drawn[key] = goals if units is None else goals[units]
+        # Rows that were overwritten since they were sampled have left the memory. They
+        # get what they achieved themselves.
+        is_forgotten = serials < oldest
+        if is_forgotten.any():
+            achieved = batch.get(self._rewriter.next_achieved_key)
+            own = achieved.reshape(len(serials), *achieved.shape[batch.ndim :])
+            for goals in drawn.values():
+                goals[is_forgotten] = own.numpy(force=True)[is_forgotten]
+        return drawn
+
+    def _write(
+        self, batch: TensorDictBase, drawn: dict[NestedKey, Goals], *, inplace: bool
+    ) -> TensorDictBase:
+        flat = batch if inplace else batch.reshape(-1).to_tensordict()
+        stored_goals = flat.get(self._rewriter.goal_key)
+        goals = {
+            key: torch.from_numpy(values).to(stored_goals)
+            for key, values in drawn.items()
+        }
+        rows = torch.arange(len(flat), device=stored_goals.device)
+        first = next(iter(goals.values()))
+        values = self._rewriter.evaluate(flat, rows, first)
+        for key, new in goals.items():
+            values |= {key: new, unravel_key(("next", key)): new.clone()}
+        for key, new in values.items():
+            flat.set(key, new)
+        return flat.reshape(batch.shape)
