@@ -1,4 +1,4 @@
-"""``python -m torch_panda info``."""
+"""The command ``info``."""
 
 import re
 from pathlib import Path
@@ -12,27 +12,27 @@ from torch_panda.info import stepping
 ROOT = Path(__file__).parents[1]
 
 
-def test_names_the_loop(loop):
+def test_it_names_the_loop(loop):
     assert stepping().startswith(f"{loop}: ")
 
 
-def test_names_versions_ids_and_spaces(capsys):
+def test_it_prints_versions_and_the_sizes_of_every_environment(capsys):
     main(["info"])
     output = capsys.readouterr().out
     assert re.search(r"pybullet 3\.\d", output)
-    assert "cores usable" in output
+    assert "default: one per core" in output
     assert "TinyRenderer" in output
     push = "PandaPush{-v1,-v3,Dense-v1,Dense-v3}"
     assert f"{push}: observation 18, goal 3, action 3 in [-1, 1], 50 steps" in output
-    named = [
+    ids = [
         family + suffix
         for family, suffixes in re.findall(r"(\w+)\{(.*?)\}", output)
         for suffix in suffixes.split(",")
     ]
-    assert sorted(named) == sorted(torch_panda.ENV_IDS)
+    assert sorted(ids) == sorted(torch_panda.ENV_IDS)
 
 
-def test_says_how_to_get_what_is_missing(monkeypatch):
+def test_it_says_how_to_install_what_is_missing(monkeypatch):
     monkeypatch.setattr(info, "find_spec", lambda name: None)
     monkeypatch.setattr(info, "loop_problem", lambda: "there is no C compiler")
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -45,8 +45,8 @@ def test_says_how_to_get_what_is_missing(monkeypatch):
     assert "egl" in missing
 
 
-def test_knows_the_extras():
-    """Those for users; `test` and `docs` are for who changes the package."""
+def test_it_lists_every_extra():
+    """`test` and `docs` are for developers, so `info` leaves them out."""
     text = (ROOT / "pyproject.toml").read_text()
     section = text.split("[project.optional-dependencies]")[1].split(
         "\n[project.scripts]"

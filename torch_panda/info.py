@@ -1,4 +1,4 @@
-"""``python -m torch_panda info``: what is installed, and what it offers."""
+"""Text of ``python -m torch_panda info``: versions, environments and extras."""
 
 import os
 import platform
@@ -29,7 +29,7 @@ _PACKAGES = (
 
 
 def num_cores() -> int:
-    """Cores that this process may use."""
+    """Number of processor cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # macOS
@@ -37,18 +37,18 @@ def num_cores() -> int:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages; "not installed" where there is none."""
-    found = {"python": platform.python_version()}
+    """Versions of Python and of the packages, or "not installed"."""
+    numbers = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            numbers[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            numbers[package] = "not installed"
+    return numbers
 
 
 def environments() -> list[str]:
-    """A line for each robot, task and control: ids, spaces and length of episodes."""
+    """Ids, sizes and length of episodes, a line for each robot, task and control."""
     families: dict[str, list[str]] = {}
     for env_id in torch_panda.ENV_IDS:
         families.setdefault(re.sub(r"(Dense)?-v\d+$", "", env_id), []).append(env_id)
@@ -69,13 +69,13 @@ def environments() -> list[str]:
 
 
 def renderers() -> list[str]:
-    """What pictures could be drawn with: parts of pybullet's wheel."""
-    egl = "found" if find_spec("eglRenderer") else "not found"
-    return ["TinyRenderer (CPU): in pybullet", f"OpenGL (EGL plugin): {egl}"]
+    """Renderers that pybullet was installed with, a line for each."""
+    egl = "installed" if find_spec("eglRenderer") else "not installed"
+    return ["tiny (TinyRenderer, on the CPU): installed", f"egl (OpenGL): {egl}"]
 
 
 def extras() -> list[str]:
-    """A line for each extra: its purpose, and whether it is installed."""
+    """Purpose of each extra, and whether it is installed, a line for each."""
     lines = []
     for name, extra in EXTRAS.items():
         if find_spec(extra.modules[0]) is not None:
@@ -91,32 +91,34 @@ def extras() -> list[str]:
 
 
 def missing() -> list[str]:
-    """What does not work here although it is installed, and what would help."""
+    """Features that do not work here, with the reason or the fix, a line for each."""
     lines = []
     if problem := loop_problem():
         lines.append(f"the native loop: {problem}")
     if find_spec("eglRenderer") is None:
-        lines.append('renderer="egl": this build of pybullet is without it')
+        lines.append('renderer="egl": this build of pybullet lacks the EGL plugin')
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        lines.append("open_window(): there is no DISPLAY; open_viewer() needs none")
+        lines.append(
+            "open_window(): DISPLAY is not set; open_viewer() works without a display"
+        )
     if not torch.cuda.is_available():
-        lines.append("CUDA: trainings run on the CPU, as does physics in any case")
+        lines.append("CUDA: training runs on the CPU; physics always does")
     return lines or ["nothing"]
 
 
 def stepping() -> str:
-    """Which loop steps the environments."""
+    """Loop that steps the environments."""
     if loop_name() == "native":
-        return "native: in threads of C"
-    return "ctypes: in threads of Python, slower; a C compiler at installation helps"
+        return "native: threads of C"
+    return "ctypes: slower threads of Python; a C compiler at installation helps"
 
 
 def describe() -> str:
-    """All of it, as text."""
-    threads = f"{num_cores()} of {os.cpu_count()} cores usable; default: one a core"
+    """The whole text."""
+    threads = f"default: one per core, here {num_cores()} of {os.cpu_count()}"
     sections = {
         "versions": [f"{name} {number}" for name, number in versions().items()],
-        "threads": [f"{threads}, at most one an environment"],
+        "threads": [f"{threads}, and at most one per environment"],
         "stepping": [stepping()],
         "solver": [str(solver.activate())],
         "renderers": renderers(),
