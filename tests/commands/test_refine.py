@@ -30,7 +30,7 @@ def episode(achieved: list[float], asked: list[float]) -> TensorDict:
 def test_the_goal_becomes_what_was_achieved_where_goals_differ():
     varies = torch.tensor([True, True, False])
     slid = episode([0.5, 0.1, 0.015], [0.4, 0.3, 0.03])
-    slid = refine.ask_for_achieved(slid, torch_panda.Slide(), varies)
+    slid = refine.relabel(slid, torch_panda.Slide(), varies)
     expected = torch.tensor([[0.5, 0.1, 0.03]] * 2)
     torch.testing.assert_close(slid["desired_goal"], expected)
     torch.testing.assert_close(slid["next", "desired_goal"], expected)
@@ -39,7 +39,7 @@ def test_the_goal_becomes_what_was_achieved_where_goals_differ():
 def test_an_episode_that_achieves_what_is_never_asked_for_is_left_out():
     fallen = episode([0.5, 0.1, -0.3], [0.1, 0.1, 0.02])  # off the table
     varies = torch.tensor([True, True, False])
-    assert refine.ask_for_achieved(fallen, torch_panda.Push(), varies) is None
+    assert refine.relabel(fallen, torch_panda.Push(), varies) is None
 
 
 @pytest.fixture
@@ -136,7 +136,7 @@ def test_a_stochastic_policy_is_refined_without_its_noise(tmp_path, monkeypatch)
     options = {"steps": 100, "updates": 1, "num_envs": 2, "batch_size": 4}
     run = refine.Refinement(refine.Args(tmp_path / "sac.pt", tmp_path, **options))
     asked = []
-    monkeypatch.setattr(refine, "ask_for_achieved", lambda x, *_: asked.append(x))
+    monkeypatch.setattr(refine, "relabel", lambda x, *_: asked.append(x))
     run.play(stop=False)
     run.close()
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

@@ -1,4 +1,4 @@
-"""Evaluate a trained policy over many episodes, run in parallel.
+"""Measure how often a trained policy succeeds.
 
 python -m torch_panda evaluate runs/PandaPush-v1-ddpg-relabel-0 --episodes 200
 """
@@ -19,30 +19,30 @@ from torch_panda.learning.user_modules import Imports, import_modules, read_modu
 
 @dataclass
 class Args:
-    """Which policy to evaluate, and how long."""
+    """Measure how often a trained policy succeeds."""
 
     run: Annotated[str, tyro.conf.Positional]
     """folder of a run, its checkpoint.pt, or an id whose policy torch_panda ships"""
     env_id: str | None = None
-    """another task with the same spaces; None means the one it was trained on"""
+    """another task with the same spaces; None means the task of the policy"""
     episodes: Positive = 200
     """number of episodes"""
     num_envs: Positive = 32
-    """environments that are stepped in parallel"""
+    """number of environments that are stepped in parallel"""
     num_threads: Positive | None = None
-    """threads that step them; None means one per core"""
+    """number of threads that step the environments; None means one per core"""
     seed: Seed = 1_000
-    """of the environments"""
+    """seed of the environments"""
     task_options: dict[str, Finite] = field(default_factory=dict)
-    """numbers of the task that are others than in training, such as `play 0.0005`"""
+    """arguments of the task to change, such as `clearance 0.0005`"""
     physics: PhysicsName = "exact"
-    """how Bullet integrates: as panda-gym, or faster and coarser"""
+    """how Bullet integrates: "exact" as in panda-gym, or "fast" and coarser"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 
 
 def main(args: Args) -> None:
-    """Print what the policy achieves, with 95 % intervals."""
+    """Print success rates and return, with 95 % intervals."""
     try:
         check_limits(args)
         import_modules(read_modules(args.imports))

@@ -43,7 +43,7 @@ class Args:
     actions without noise, so that imitating them teaches how to correct errors (DART,
     arXiv 1703.09327)"""
     task_options: dict[str, Finite] = field(default_factory=dict)
-    """arguments of the task to change, such as `play 0.0005`"""
+    """arguments of the task to change, such as `clearance 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
     """a file with a nested dict of tensors (transitions, ...), or a data set"""
     out: Path | None = None

@@ -1,11 +1,12 @@
-"""Refine a policy by hindsight alone: it imitates itself, asked for what it achieved.
+"""Refine a policy: let it imitate itself on the goals that it achieved.
 
     python -m torch_panda refine runs/PandaSlide-v1-ddpg-relabel-0 --out runs/slide
 
-A policy that nearly does what it is asked for does exactly what it achieves. So it
-plays, its episodes' goals become what they achieved at their end, and it imitates them:
-goal-conditioned supervised learning (arXiv 1912.06088), from where reinforcement
-learning stopped. There are no rewards, no demonstrations and no noise.
+A policy that misses its goal by a little has shown how to reach the place where it
+ended. So the policy plays episodes, the goal of each episode becomes the goal that was
+achieved at its end, and the policy imitates these episodes. This is goal-conditioned
+supervised learning (arXiv 1912.06088), starting from a policy that reinforcement
+learning has trained. It needs neither rewards nor demonstrations nor noise.
 """
 
 import os
@@ -40,43 +41,43 @@ from torch_panda.learning.policy_files import SavedPolicy
 from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
-LEARNING_RATE = 0.3  # at first, of that of training
+LEARNING_RATE = 0.3  # at the start, as a fraction of the learning rate of training
 
 
 @dataclass
 class Args:
-    """What to refine, how long, and where to write."""
+    """Refine a policy on the goals that it achieved."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """folder of a run, or its checkpoint.pt"""
     out: Path
-    """the folder of the results, as of train.py"""
+    """folder of the results; it holds the same files as that of `train`"""
     env_id: str | None = None
-    """another task with the same spaces; None means the one it was trained on"""
+    """another task with the same spaces; None means the task of the policy"""
     steps: Positive = 640_000
-    """environment steps to play, in whole episodes; the last million is imitated"""
+    """environment steps to play, in whole episodes; the last million are imitated"""
     updates: Positive = 60_000
-    """gradient steps; the learning rate falls to 0 in them"""
+    """gradient steps of imitation, during which the learning rate falls to 0"""
     batch_size: Positive = 1024
     """transitions per gradient step"""
     num_envs: Positive = 64
-    """environments that are stepped in parallel"""
+    """number of environments that are stepped in parallel"""
     seed: Seed = 0
-    """the seed of the environments and the sampling"""
+    """seed of the environments and the sampling"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
-    """continue in that folder, with the same other options"""
+    """continue the run in that folder; all other options must be the same"""
 
 
 class Refinement:
-    """A policy, what it has played, and how far it is.
+    """A refinement: the agent, the episodes that it played, and the progress.
 
     Args:
-        args: the options.
+        args: The options.
 
     Raises:
-        ValueError: there is no such policy, or no such run to continue.
+        ValueError: There is no such policy, or no such run to resume.
     """
 
     def __init__(self, args: Args) -> None:
@@ -102,26 +103,29 @@ class Refinement:
             self.checkpoint.load()
 
     def run(self, stop: object = False) -> bool:
-        """Play, then imitate, until that is done or ``stop`` is true.
+        """Play, then imitate, until the end or until ``stop`` is true.
 
         Returns:
-            whether it is done.
+            Whether the end was reached.
 
         Raises:
-            ValueError: the policy achieves nothing that could be asked for.
+            ValueError: No episode achieved a goal that the task could ask for.
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if len(progress.curve) > 1:
             return True
         if not progress.curve:
-            self.curve.add(progress)  # the policy that was given
+            self.curve.add(progress)  # the policy before refinement
             checkpoint.save()
         self.play(stop)
         checkpoint.save()
         if stop:
             return False
         if not len(self.buffer):
-            raise ValueError("no episode achieved what a goal of the task can be")
+            raise ValueError(
+                "no episode ended at a goal that the task could ask for, so there is "
+                "nothing to imitate: train the policy for longer first"
+            )
         pretrain(
             checkpoint,
             self.buffer,
@@ -137,7 +141,7 @@ class Refinement:
         return True
 
     def play(self, stop: object) -> None:
-        """Store what the policy achieves."""
+        """Play episodes, and store those with an achieved goal."""
         progress, last = self.progress, self.args.steps
         bar = tqdm(desc="playing", initial=progress.steps, total=last, unit="step")
         while progress.steps < last and not stop:
@@ -146,8 +150,10 @@ class Refinement:
             # torchrl makes the members of this enum strings.
             exploration = ExplorationType.DETERMINISTIC
             episodes = play(self.env, policy, exploration)  # type: ignore[arg-type]
-            asked = [ask_for_achieved(x, self.env.task, self.varies) for x in episodes]
-            if rows := [row for row in asked if row is not None]:
+            relabelled = [
+                relabel(episode, self.env.task, self.varies) for episode in episodes
+            ]
+            if rows := [row for row in relabelled if row is not None]:
                 self.buffer.extend(TensorDict.cat(rows))
             steps, before = sum(map(len, episodes)), progress.steps
             progress.steps += steps
@@ -162,16 +168,20 @@ class Refinement:
         self.curve.close()
 
 
-def ask_for_achieved(
+def relabel(
     episode: TensorDictBase, task: torch_panda.Task, varies: Tensor
 ) -> TensorDictBase | None:
-    """An episode (steps,) with what it achieved as its goal; None: that is no goal.
+    """Replace the goal of an episode by the goal that it achieved at its end.
 
     Args:
-        episode: with the goal that was asked for.
-        task: says whether the other goal is achieved at the end.
-        varies: (goal_dim,) bool, where goals of the task differ. Elsewhere they stay:
-            Slide's puck lies lower than all of its goals.
+        episode: The transitions, (steps,).
+        task: Task whose success function judges the new goal.
+        varies: Which entries of a goal differ between episodes, (goal_dim,) bool. The
+            other entries keep the desired goal: a puck of Slide lies lower than all
+            goals.
+
+    Returns:
+        A copy of the episode, or None if it does not succeed with the new goal.
     """
     end = episode["next", "achieved_goal"][-1]
     goal = torch.where(varies, end, episode["desired_goal"][0])
@@ -184,7 +194,7 @@ def ask_for_achieved(
 
 
 def main(args: Args) -> None:
-    """Refine, and say where the results are."""
+    """Refine, and print where the results are."""
     try:
         check_limits(args)
         import_modules(read_modules(args.imports))

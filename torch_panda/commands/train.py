@@ -2,9 +2,9 @@
 
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
 
-The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687);
-where its table is silent they follow the HER of OpenAI Baselines. `--preset tuned`
-takes the task's recipe of `torch_panda.learning.recipes`.
+The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687).
+Those that the paper does not give follow the HER of OpenAI Baselines. `--preset tuned`
+takes the recipe of the task from `torch_panda.learning.recipes`.
 """
 
 from collections.abc import Sequence
@@ -37,10 +37,10 @@ def parse(arguments: Sequence[str] | None = None) -> Args:
 
 
 def make_run(args: Args, out: Path) -> Run:
-    """Start a training, with its demonstrations if there are any.
+    """Prepare a training, with its demonstrations if there are any.
 
     Raises:
-        ValueError: the options do not fit each other, the task or the files.
+        ValueError: The options do not fit each other, the task or the files.
     """
     demos = None
     if args.demos is not None:
@@ -50,7 +50,7 @@ def make_run(args: Args, out: Path) -> Run:
 
 
 def main(args: Args) -> None:
-    """Train, and say where the results are."""
+    """Train, and print where the results are."""
     out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
     try:
         check(args)
@@ -70,7 +70,7 @@ def main(args: Args) -> None:
             ) as env:
                 record(env, run.agent.policy, out / "video.mp4")
         except KeyboardInterrupt:
-            print("no video")
+            print("interrupted: no video was written")
     progress = run.progress
     print(f"success {progress.success} after {progress.steps} steps; see {out}")
     if not finished:

@@ -1,4 +1,4 @@
-"""Watch a policy: a video of environments side by side, a window, or a browser.
+"""Watch a policy in a video, in a window, or in a browser.
 
 python -m torch_panda watch --policy runs/PandaPush-v1-ddpg-relabel-0 --out push.mp4
 python -m torch_panda watch --policy expert --env-id PandaStack-v1 --out stack.gif
@@ -24,7 +24,7 @@ from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 from torch_panda.learning.video import FPS, play, record
 
-CAMERA = torch_panda.Camera(distance=1.1)  # where a browser's view starts
+CAMERA = torch_panda.Camera(distance=1.1)  # the first view in a browser
 
 
 def show(
@@ -54,14 +54,14 @@ def serve(
     port: int,
     allowed_hosts: Sequence[str],
 ) -> None:
-    """Play episodes in a browser, in real time, with the next policy for each.
+    """Play episodes in a browser, in real time.
 
     Args:
-        env: all its environments can be looked at.
-        policies: one for each episode; with the last one it ends.
-        host: the address at which the page is.
-        port: or the next one that is free.
-        allowed_hosts: names of this machine under which browsers may open the page.
+        env: Environments; the page shows any of them.
+        policies: One policy per episode.
+        host: Address at which the page is served.
+        port: Port of the page; if it is taken, the next free port.
+        allowed_hosts: Names of this machine under which browsers may open the page.
     """
     with env.open_viewer(
         CAMERA, host=host, port=port, allowed_hosts=allowed_hosts
@@ -77,10 +77,10 @@ def serve(
 
 
 def follow(path: Path) -> Iterator[TensorDictModuleBase]:
-    """The policy of a run, time and again; anew when a training has saved it.
+    """Yield the policy of a run; read it again whenever a training has saved it.
 
     Args:
-        path: folder of the run, or a checkpoint.
+        path: Folder of the run, or a checkpoint.
     """
     file = path / "checkpoint.pt" if path.is_dir() else path
     seen = None
@@ -93,36 +93,36 @@ def follow(path: Path) -> Iterator[TensorDictModuleBase]:
 
 @dataclass
 class Args:
-    """What to watch, and where to write it."""
+    """Watch a policy in a video, in a window, or in a browser."""
 
     policy: str = "expert"
-    """a run's folder or checkpoint, an id whose policy torch_panda ships, "random", or
+    """folder or checkpoint of a run, an id whose policy torch_panda ships, "random", or
     "expert" """
     env_id: str | None = None
-    """task; None means the one the policy was trained on, or Push"""
+    """task; None means the task of the policy, or Push"""
     num_envs: Positive = 6
-    """environments side by side; with a window, episodes one after the other"""
+    """number of environments in the picture; with --human, number of episodes"""
     seed: Seed = 0
-    """of the environments and of random actions"""
+    """seed of the environments and of random actions"""
     out: Path = Path("watch.mp4")
-    """video to write, .mp4 or .gif"""
+    """video to write, a .mp4 or .gif file"""
     human: bool = False
-    """show it in a window of pybullet's GUI instead, at the speed of the real robot"""
+    """show the episodes in a window of pybullet's GUI instead, in real time"""
     web: bool = False
-    """show it in a browser instead (extra viewer), episode after episode; the policy of
-    a run that is training is read again as it changes"""
+    """show the episodes in a browser instead (extra viewer); the policy of a run that
+    is training is read again whenever it is saved"""
     host: str = "127.0.0.1"
-    """with --web, the address to serve at; 0.0.0.0 lets other machines in"""
+    """with --web, address of the page; 0.0.0.0 serves it to other machines too"""
     port: Port = 8080
-    """with --web, the port, or the next one that is free"""
+    """with --web, port of the page; if it is taken, the next free port"""
     allowed_hosts: tuple[str, ...] = ()
-    """with --web, names of this machine under which other machines open the page"""
+    """with --web, names of this machine under which browsers may open the page"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 
 
 def main(args: Args) -> None:
-    """Record a policy, or show it."""
+    """Record a policy as a video, or show it."""
     try:
         check_limits(args)
         import_modules(read_modules(args.imports))
