@@ -44,6 +44,7 @@ class RandomPointModule(TensorDictModuleBase):
     steps_left: Tensor
     point: Tensor
     gripper: Tensor
+    start_probability: Tensor
 
     def __init__(
         self,
@@ -55,7 +56,8 @@ class RandomPointModule(TensorDictModuleBase):
         num_arm_actions: int,
     ) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = ["observation", "action"], ["action"]
+        self.in_keys = ["observation", "action"]
+        self.out_keys = ["action"]  # type: ignore[misc]  # it has a setter
         num_envs = len(eps)
         # A move that lasts d steps on average starts with the probability p for which
         # d / (d + (1 - p) / p) is eps.
