@@ -10,7 +10,15 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from torch_panda import Gripper, Panda, Reach, RobotTaskEnv
+from torch_panda import (
+    Gripper,
+    Kuka,
+    Panda,
+    Reach,
+    RobotTaskEnv,
+    XArm6,
+    XArm6Gripper,
+)
 from torch_panda.bullet import native
 from torch_panda.robots import ControlType
 from torch_panda.rotations import (
@@ -230,3 +238,20 @@ def test_fingers_open_as_wide_as_the_gripper_allows():
         simulation, td = hold(env, unit(4, 3))
         assert td["observation"][0, 6] == pytest.approx(0.08, abs=0.001)
         assert simulation.joint_position[0, 7:].sum().item() == pytest.approx(0.08)
+
+
+def test_a_repr_shows_the_arguments():
+    assert repr(Panda(control_type="joints", fingers_width=0.02)) == (
+        "Panda(control_type='joints', action_scale=0.05, block_gripper=False, "
+        "base_position=(-0.6, 0.0, 0.0), base_orientation=(0.0, 0.0, 0.0, 1.0), "
+        "workspace=((-inf, -inf, 0.0), (inf, inf, inf)), fingers_width=0.02, "
+        "finger_friction=1.0, finger_spinning_friction=None)"
+    )
+    assert repr(Kuka()).startswith("Kuka(control_type='ee', ")
+
+
+@pytest.mark.parametrize("robot_class", [Panda, Kuka, XArm6, XArm6Gripper])
+def test_an_unknown_argument_is_named_with_the_accepted_ones(robot_class):
+    message = f"^{robot_class.__name__} .*'control'; did you mean 'control_type'"
+    with pytest.raises(TypeError, match=message):
+        robot_class(control="joints")
