@@ -37,7 +37,7 @@ def test_files_that_hold_no_policy(tmp_path, script, content):
     path = tmp_path / "checkpoint.pt"
     save(path, content)
     given = {"run": path} if script is evaluate else {"policy": str(tmp_path)}
-    message = f"^{path} does not hold a policy, or is damaged \\(\\w+\\)$"
+    message = f"^{path} does not hold a policy, or is damaged \\(.+\\)$"
     with pytest.raises(SystemExit, match=message):
         script.main(script.Args(**given))
 
@@ -64,7 +64,7 @@ def test_a_policy_with_a_value_of_another_version(tmp_path):
 def test_files_that_hold_no_demonstrations(tmp_path, content):
     path = tmp_path / "demos.pt"
     save(path, content)
-    message = f"^{path} does not hold demonstrations, or is damaged \\(\\w+\\)$"
+    message = f"^{path} does not hold demonstrations, or is damaged \\(.+\\)$"
     with (
         torch_panda.make("PandaReach-v1", num_envs=1) as env,
         pytest.raises(ValueError, match=message),

@@ -3,10 +3,10 @@
 import csv
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import pytest
 
 from torch_panda.commands import plot
+from torch_panda.learning import plots
 from torch_panda.learning.checkpoint import write_options
 from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.recipes import find_changes
@@ -31,12 +31,10 @@ def runs(tmp_path):
 
 @pytest.fixture
 def figures(monkeypatch):
-    """What is drawn, before it is closed."""
-    drawn = []
-    with monkeypatch.context() as patch:
-        patch.setattr(plt, "close", drawn.append)
-        yield drawn
-    plt.close("all")
+    """The figures that are written."""
+    drawn, save = [], plots.save
+    monkeypatch.setattr(plots, "save", lambda x, path: drawn.append(x) or save(x, path))
+    return drawn
 
 
 @pytest.mark.parametrize(

@@ -46,10 +46,11 @@ def test_v3_episodes_end_at_success():
         assert not episode["next", "success"][:-1].any()
 
 
-@pytest.mark.parametrize("task", list(experts.EXPERTS))
-def test_the_actions_of_an_environment_depend_on_its_observation_only(task):
+@pytest.mark.parametrize(
+    "env_id", [f"Panda{task.__name__}-v1" for task in experts.EXPERTS]
+)
+def test_the_actions_of_an_environment_depend_on_its_observation_only(env_id):
     torch.manual_seed(0)
-    env_id = f"Panda{task}-v1"
     expert = experts.make_expert(env_id)
     with torch_panda.make(env_id, num_envs=4, seed=0) as env:
         rollout = env.rollout(20, expert, break_when_any_done=False)
@@ -77,8 +78,37 @@ def test_collectors_take_an_expert():
 
 
 @pytest.mark.parametrize(
-    "env_id", ["PandaPushJoints-v1", "PandaFly-v1", "PandaDrawer-v3", "Push"]
+    "env_id", ["PandaPushJoints-v1", "KukaReach-v1", "XArm6GripperPickAndPlace-v1"]
 )
 def test_ids_without_an_expert(env_id):
-    with pytest.raises(ValueError, match="no expert for"):
+    with pytest.raises(ValueError, match=f"^no expert for '{env_id}': .* Reach, Push"):
         experts.make_expert(env_id)
+
+
+def test_unknown_ids():
+    with pytest.raises(ValueError, match="unknown environment id 'PandaFly-v1'"):
+        experts.make_expert("PandaFly-v1")
+
+
+@pytest.mark.parametrize(("table_friction", "expected"), [(0.1, "drag"), (0.5, "push")])
+def test_an_id_of_your_own_at_a_shipped_task(table_friction, expected):
+    task = torch_panda.Push(table_friction=table_friction)
+    robot = torch_panda.Panda(block_gripper=True)
+    assert experts.find_expert(robot, task) is getattr(experts.push, expected)
+
+
+class PushFar(torch_panda.Push):
+    """Another task, although it inherits from a shipped one."""
+
+
+@pytest.mark.parametrize(
+    ("robot", "task"),
+    [
+        (torch_panda.Panda(block_gripper=True), PushFar()),
+        (torch_panda.Panda(), torch_panda.Push()),
+        (torch_panda.Panda(block_gripper=True), torch_panda.Stack()),
+        (torch_panda.XArm6(), torch_panda.Reach()),
+    ],
+)
+def test_robots_and_tasks_that_an_expert_was_not_made_for(robot, task):
+    assert experts.find_expert(robot, task) is None

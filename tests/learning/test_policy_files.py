@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import torch_panda
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
 from torch_panda.learning.policy_files import SavedPolicy, save_policy
+from torch_panda.learning.spaces import read_spaces
 from torch_panda.policies import shipped_policies
 
 
@@ -80,6 +81,13 @@ def test_shipped_policies_act_on_batches_of_any_shape(env_id):
     grid = policy(td.reshape(2, 3))["action"]
     torch.testing.assert_close(grid.flatten(0, 1), actions)
     torch.testing.assert_close(policy(td[0])["action"], actions[0])
+
+
+@pytest.mark.parametrize("env_id", shipped_policies())
+def test_shipped_policies_have_the_spaces_of_their_environment(env_id):
+    spaces = torch_panda.load_policy(env_id).spaces
+    with torch_panda.make(env_id, num_envs=spaces.num_envs) as env:
+        assert spaces == read_spaces(env)
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])

@@ -1,8 +1,12 @@
 """The recipes of --preset tuned."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 
 import torch_panda
+from torch_panda.commands import train
 from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.recipes import RECIPES, find_recipe
@@ -11,7 +15,7 @@ from torch_panda.learning.training import Run
 
 @pytest.mark.parametrize("task", RECIPES)
 def test_recipes_are_options(task):
-    args = default_args("tuned", f"Panda{task}-v1")
+    args = default_args("tuned", f"Panda{task.__name__}-v1")
     check_limits(args)
     assert args.preset == "tuned"
     assert args != Args(preset="tuned", env_id=args.env_id)
@@ -20,7 +24,7 @@ def test_recipes_are_options(task):
 def test_every_task_has_a_recipe():
     for env_id in torch_panda.ENV_IDS:
         assert find_recipe(env_id)
-    push = RECIPES["Push"]
+    push = RECIPES[torch_panda.Push]
     assert find_recipe("PandaPush-v1") == find_recipe("PandaPushDense-v3") == push
     assert find_recipe("PandaPickAndPlace-v1") != push
 
@@ -34,9 +38,29 @@ def test_recipes_fit_joint_control(env_id, tmp_path):
     Run(args, tmp_path).close()
 
 
-def test_unknown_tasks_and_the_paper_have_none():
-    assert find_recipe("PandaFly-v1") == find_recipe("Fly-v1") == {}
-    assert find_recipe("BallPush-v0") == {}  # somebody's own
+class PushBall(torch_panda.Push):
+    """A task of a user."""
+
+
+@pytest.mark.usefixtures("quick")
+def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(tmp_path, capsys):
+    blocked = partial(torch_panda.Panda, block_gripper=True)
+    torch_panda.register("PushBall-v0", robot=blocked, task=PushBall)
+    assert find_recipe("PushBall-v0") == {}
+    default = Args(preset="tuned", env_id="PushBall-v0")
+    assert default_args("tuned", "PushBall-v0") == default
+    near = partial(torch_panda.Push, goal_xy_range=0.1)
+    torch_panda.register("PushNear-v0", robot=blocked, task=near)
+    assert find_recipe("PushNear-v0") == RECIPES[torch_panda.Push]
+    small = {"total_steps": 50, "num_envs": 1, "video": False}
+    train.main(replace(default, **small, out=tmp_path / "run"))
+    message = "PushBall-v0 has no recipe: training as in the panda-gym paper"
+    assert message in capsys.readouterr().out
+
+
+def test_the_paper_has_no_recipes():
+    with pytest.raises(ValueError, match="unknown environment id 'PandaFly-v1'"):
+        find_recipe("PandaFly-v1")
     assert default_args("paper", "PandaPush-v1") == Args(env_id="PandaPush-v1")
 
 

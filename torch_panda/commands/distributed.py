@@ -42,6 +42,7 @@ from torch_panda.learning.checkpoint import (
     StopSignal,
     check_folder,
     crossed,
+    lock_folder,
     write_options,
 )
 from torch_panda.learning.curve import Curve
@@ -296,8 +297,9 @@ def main(args: Args) -> None:
             address=args.address,
             cpus_per_worker=args.cpus_per_worker,
         )
-        write_options(out, args, default, preset="distributed")
-        learner.train(StopSignal())
+        with lock_folder(out):
+            write_options(out, args, default, preset="distributed")
+            learner.train(StopSignal())
         learner.close()
     except (OSError, ValueError) as error:
         raise SystemExit(str(error)) from None

@@ -33,6 +33,7 @@ from torch_panda.learning.checkpoint import (
     StopSignal,
     check_folder,
     crossed,
+    lock_folder,
     write_options,
 )
 from torch_panda.learning.curve import Curve, reseed
@@ -115,6 +116,7 @@ class Refinement:
         if len(progress.curve) > 1:
             return True
         if not progress.curve:
+            checkpoint.save()
             self.curve.add(progress)  # the policy before refinement
             checkpoint.save()
         self.play(stop)
@@ -202,9 +204,10 @@ def main(args: Args) -> None:
         run = Refinement(args)
         default = Args(args.policy, args.out, env_id=args.env_id)
         more = {"algo": run.agent.hp.algo, "preset": "refined"}
-        write_options(args.out, args, default, **more)
         stop = StopSignal()
-        finished = run.run(stop)
+        with lock_folder(args.out):
+            write_options(args.out, args, default, **more)
+            finished = run.run(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
     stop.release()

@@ -14,8 +14,14 @@ import tyro
 
 import torch_panda
 from torch_panda.datasets import read_demos
-from torch_panda.learning.checkpoint import StopSignal, check_folder, write_options
+from torch_panda.learning.checkpoint import (
+    StopSignal,
+    check_folder,
+    lock_folder,
+    write_options,
+)
 from torch_panda.learning.options import Args, check, default_args
+from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.training import Run
 from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.learning.video import record
@@ -56,11 +62,14 @@ def main(args: Args) -> None:
         check(args)
         check_folder(out, resume=args.resume)
         run = make_run(args, out)
-        write_options(out, args, default_args(args.preset, args.env_id))
+        if args.preset == "tuned" and not find_recipe(args.env_id):
+            print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
+        stop = StopSignal()
+        with lock_folder(out):
+            write_options(out, args, default_args(args.preset, args.env_id))
+            finished = run.train(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
-    stop = StopSignal()
-    finished = run.train(stop)
     stop.release()
     run.close()
     if finished and args.video:

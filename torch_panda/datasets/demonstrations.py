@@ -40,7 +40,7 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     if (name := format_of(path)) is not None:
         demos = load_format(name).read(path).select(*STORED_KEYS)
     else:
-        content = files.read(path, "demonstrations", STORED_KEYS)
+        content = files.read(path, "demonstrations", STORED_KEYS, finite=STORED_KEYS)
         try:
             demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
         except (

@@ -5,11 +5,12 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 from torchrl.modules import AdditiveGaussianModule
 
 import torch_panda
 from torch_panda.learning.files import prepare, save
+from torch_panda.learning.rollouts import play_episodes
 
 
 class TensorWriter:
@@ -76,15 +77,7 @@ def play(
     Returns:
         The episodes, each with its transitions (steps,).
     """
-    with torch.no_grad(), set_exploration_type(exploration):
-        rollout = env.rollout(
-            env.max_episode_steps,
-            expert,
-            break_when_any_done=False,
-            break_when_all_done=True,
-        )
-    ended = rollout["next", "done"].squeeze(-1)
-    lengths = (ended.cumsum(1) == 0).sum(1) + 1
+    rollout, lengths = play_episodes(env, expert, exploration)
     return [row[:length] for row, length in zip(rollout, lengths.tolist(), strict=True)]
 
 

@@ -6,11 +6,10 @@ so experts serve rollouts and collectors of any batch size. Positions are in the
 frame [m]; an action of 1 displaces the end-effector by 5 cm.
 """
 
-import re
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -24,45 +23,94 @@ from torch_panda.experts import (
     slide,
     stack,
 )
-from torch_panda.registry import ENV_IDS
+from torch_panda.registry import find_registration
+from torch_panda.robots import Panda, Robot
+from torch_panda.tasks import (
+    Drawer,
+    Flip,
+    PegInsertion,
+    PickAndPlace,
+    Push,
+    Reach,
+    Slide,
+    Stack,
+    Task,
+)
 
-# (observation, achieved_goal, desired_goal), each (..., size), to the action.
-Expert = Callable[[Tensor, Tensor, Tensor], Tensor]
+Act = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""A function of observation, achieved goal and desired goal, (..., size) each, to the
+action."""
 
-EXPERTS: dict[str, Expert] = {
-    "Reach": reach.act,
-    "Push": push.drag,
-    "Slide": slide.act,
-    "PickAndPlace": pick_and_place.act,
-    "Stack": stack.act,
-    "Flip": flip.act,
-    "Drawer": drawer.act,
-    "PegInsertion": peg_insertion.act,
-}
-# On the rougher table of -v3 a cube can be pushed, and spins less.
-V3_EXPERTS: dict[str, Expert] = EXPERTS | {
-    "Push": push.push,
-    "Flip": partial(flip.act, table=flip.ROUGH),
+# Lateral friction from which on a table counts as rough: 0.5 of -v3, not 0.1 of -v1.
+ROUGH_FRICTION = 0.3
+
+
+class Expert(NamedTuple):
+    """An expert for the Panda with end-effector control.
+
+    Attributes:
+        act: Its actions.
+        act_on_rough_table: Its actions on the table of -v3; None means the same.
+        uses_fingers: Whether it opens and closes the gripper.
+    """
+
+    act: Act
+    act_on_rough_table: Act | None = None
+    uses_fingers: bool = False
+
+
+EXPERTS: dict[type[Task], Expert] = {
+    Reach: Expert(reach.act),
+    # On a rough table a cube can be pushed; on a slippery one it would slide on.
+    Push: Expert(push.drag, push.push),
+    Slide: Expert(slide.act),
+    PickAndPlace: Expert(pick_and_place.act, uses_fingers=True),
+    Stack: Expert(stack.act, uses_fingers=True),
+    Flip: Expert(flip.act, partial(flip.act, table=flip.ROUGH), uses_fingers=True),
+    Drawer: Expert(drawer.act),
+    PegInsertion: Expert(peg_insertion.act),
 }
 
 
 def make_expert(env_id: str) -> TensorDictModule:
-    """The policy for an id of end-effector control.
+    """Make the scripted expert for an id.
+
+    Args:
+        env_id: Id of a Panda with end-effector control at one of the shipped tasks.
+
+    Returns:
+        A module from ``observation``, ``achieved_goal`` and ``desired_goal`` to
+        ``action``, for batches of any shape.
 
     Raises:
-        ValueError: there is no expert for it.
+        ValueError: The id is unknown, or there is no expert for it.
     """
-    match = re.fullmatch(r"Panda([A-Za-z]+?)(Dense)?-v([13])", env_id)
-    if match is None or match[1] not in EXPERTS or env_id not in ENV_IDS:
+    registration = find_registration(env_id)
+    act = find_expert(registration.make_robot(), registration.make_task())
+    if act is None:
+        names = ", ".join(task.__name__ for task in EXPERTS)
         raise ValueError(
-            f"no expert for {env_id!r}; there are experts for the ids of "
-            f"{', '.join(EXPERTS)} with end-effector control"
+            f"no expert for {env_id!r}: there are experts for the Panda with "
+            f"end-effector control at {names}"
         )
-    expert = (EXPERTS if match[3] == "1" else V3_EXPERTS)[match[1]]
 
-    def act(*observed: Tensor) -> Tensor:
-        # The environment clips what is beyond; who imitates it must see what it does.
-        return expert(*observed).clamp(-1.0, 1.0)
+    def act_within_limits(*observed: Tensor) -> Tensor:
+        # The environment clips actions; a network that imitates them must see that.
+        return act(*observed).clamp(-1.0, 1.0)
 
-    keys: list[NestedKey] = ["observation", "achieved_goal", "desired_goal"]
-    return TensorDictModule(act, keys, ["action"])
+    return TensorDictModule(
+        act_within_limits, ["observation", "achieved_goal", "desired_goal"], ["action"]
+    )
+
+
+def find_expert(robot: Robot, task: Task) -> Act | None:
+    """The expert for a robot at a task; None if there is none."""
+    expert = EXPERTS.get(type(task))
+    if expert is None or type(robot) is not Panda or robot.control_type != "ee":
+        return None
+    if robot.has_free_gripper != expert.uses_fingers:
+        return None
+    is_rough = getattr(task, "table_friction", 0.0) >= ROUGH_FRICTION
+    if is_rough and expert.act_on_rough_table is not None:
+        return expert.act_on_rough_table
+    return expert.act

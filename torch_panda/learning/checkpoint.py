@@ -1,12 +1,17 @@
 """Saving a run and going on with it, bit for bit."""
 
 import json
+import os
 import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
@@ -15,6 +20,7 @@ from torch_panda.learning.agents import Agent
 from torch_panda.learning.policy_files import save_policy
 from torch_panda.learning.recipes import find_changes
 
+LOCK = "run.lock"  # file that the process of a run keeps locked
 RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
 SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
 # Options in which a run and its continuation may differ.
@@ -81,7 +87,8 @@ class Checkpoint:
             ValueError: it is the state of a run with other options, or damaged.
         """
         keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
-        state = files.read(self.path, "the state of a run", keys)
+        finite = ("agent", "optimizer")
+        state = files.read(self.path, "the state of a run", keys, finite=finite)
         theirs = state["args"]
         differing = [
             f"{key} was {theirs.get(key)!r}, is {value!r}"
@@ -130,7 +137,8 @@ def write_options(
     """
     options = {**more, **asdict(args), "changed": find_changes(args, default)}
     out.mkdir(parents=True, exist_ok=True)
-    (out / "args.json").write_text(json.dumps(options, default=str, indent=2))
+    text = json.dumps(options, default=str, indent=2)
+    files.save_text(out / "args.json", text)
 
 
 def check_folder(out: Path, *, resume: bool) -> None:
@@ -141,6 +149,9 @@ def check_folder(out: Path, *, resume: bool) -> None:
     """
     if out.exists() and not out.is_dir():
         raise ValueError(f"out must be a folder, got the file {out}")
+    if (out / LOCK).exists():
+        with lock_folder(out):
+            pass  # no other process has the lock
     if resume and not (out / "resume.pt").exists():
         raise ValueError(f"there is no run to resume in {out}")
     if not resume and any((out / name).exists() for name in RESULTS):
@@ -148,6 +159,34 @@ def check_folder(out: Path, *, resume: bool) -> None:
             f"{out} holds a run: continue it with --resume, remove it, or choose "
             "another folder with --out"
         )
+
+
+@contextmanager
+def lock_folder(out: Path) -> Iterator[None]:
+    """Make the folder of a run, and keep other processes from writing into it.
+
+    The operating system releases the lock when the process ends, however it ends.
+
+    Raises:
+        ValueError: Another process has the lock; the error names it.
+        OSError: The folder cannot be written to.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    lock, process = FileLock(out / LOCK), out / "process.txt"
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        name = process.read_text() if process.exists() else "another process"
+        raise ValueError(
+            f"{name} writes into {out}: stop it first, or choose another folder with "
+            "--out"
+        ) from None
+    try:
+        files.save_text(process, f"process {os.getpid()} on {socket.gethostname()}")
+        yield
+    finally:
+        process.unlink(missing_ok=True)
+        lock.release()
 
 
 class StopSignal:

@@ -1,11 +1,13 @@
 """The evaluations of a run: a curve that is written, drawn and saved at every point."""
 
 import csv
+import io
 from pathlib import Path
 
 import torch
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning import files
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import Progress
 from torch_panda.learning.evaluation import evaluate_in
@@ -44,11 +46,12 @@ class Curve:
             "seconds": round(progress.seconds, 2),
         }
         progress.curve.append({**row, **(losses or {})})
-        with (self.out / "curve.csv").open("w", newline="") as file:
-            fields = {key: None for row in progress.curve for key in row}
-            writer = csv.DictWriter(file, fieldnames=list(fields))
-            writer.writeheader()
-            writer.writerows(progress.curve)
+        fields = {key: None for row in progress.curve for key in row}
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, fieldnames=list(fields))
+        writer.writeheader()
+        writer.writerows(progress.curve)
+        files.save_text(self.out / "curve.csv", text.getvalue())
         plot_curve(progress.curve, self.env_id, self.out / "curve.png")
         save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
 

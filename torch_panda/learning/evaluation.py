@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.rollouts import play_episodes
 from torch_panda.registry import make
 
 
@@ -101,23 +101,21 @@ def evaluate_in(
 ) -> Evaluation:
     """Evaluate a policy over the next episodes of a batch of environments."""
     parts: list[Evaluation] = []
-    steps = env.max_episode_steps
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        while sum(len(part.success) for part in parts) < episodes:
-            rollout = env.rollout(steps, policy, break_when_any_done=False)
-            success, done = rollout["next", "success"], rollout["next", "done"]
-            # A -v3 episode ends at its first success; what follows is another one.
-            first_done = done.cumsum(1).cumsum(1) == 1
-            lived = done.cumsum(1) - done.long() == 0
-            parts.append(
-                Evaluation(
-                    success=(success & first_done).any(1).squeeze(-1),
-                    ever=(success & lived).any(1).squeeze(-1),
-                    at_start=rollout["success"][:, 0].squeeze(-1),
-                    returns=(rollout["next", "reward"] * lived).sum(1).squeeze(-1),
-                    lengths=lived.sum(1).squeeze(-1),
-                )
+    while sum(len(part.success) for part in parts) < episodes:
+        rollout, lengths = play_episodes(env, policy)
+        success = rollout["next", "success"].squeeze(-1)
+        reward = rollout["next", "reward"].squeeze(-1)
+        steps = torch.arange(rollout.shape[1], device=lengths.device)
+        is_played = steps < lengths[:, None]
+        parts.append(
+            Evaluation(
+                success=success.gather(1, lengths[:, None] - 1).squeeze(1),
+                ever=(success & is_played).any(1),
+                at_start=rollout["success"][:, 0, 0],
+                returns=(reward * is_played).sum(1),
+                lengths=lengths,
             )
+        )
     joined = {
         field.name: torch.cat([getattr(part, field.name) for part in parts])
         for field in fields(Evaluation)

@@ -1,66 +1,148 @@
 """Files of tensors and numbers: written whole, and read without running code."""
 
 import os
-from collections.abc import Callable, Iterable
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from operator import getitem
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from tensordict import NestedKey
+from torch import Tensor
 
 
 def prepare(path: Path) -> None:
-    """Make a file's folder, so that what takes long to make will not be lost.
+    """Make the folder of a file, and check that the file can be written.
 
     Raises:
-        OSError: the file could not be written.
+        OSError: The file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise OSError(f"cannot write to {path}")
 
 
-def replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file whole or not at all: a kill never leaves half of it."""
+def replace(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file whole or not at all, also if the process is killed meanwhile.
+
+    A temporary file in the same folder takes the new content, and then the name.
+
+    Args:
+        path: The file.
+        write: Writes the content.
+
+    Raises:
+        OSError: The content cannot be written, for example because the disk is full.
+            The file stays as it was.
+    """
     temporary = path.with_name(path.name + ".new")
-    write(temporary)
-    os.replace(temporary, path)
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # torch raises a RuntimeError
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise OSError(
+            f"cannot write {path.name} into {path.parent}: {reason}"
+        ) from None
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def save(path: Path, content: object) -> None:
-    """Write tensors, numbers and dicts."""
-    replace(path, lambda temporary: torch.save(content, temporary))
+    """Write tensors, numbers, strings and dicts.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    replace(path, lambda file: torch.save(content, file))
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write text.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    replace(path, lambda file: file.write(text.encode()))
 
 
 def read(
     path: Path,
     what: str,
     keys: Iterable[NestedKey],
+    *,
+    finite: Iterable[NestedKey] = (),
     **options: Any,  # noqa: ANN401 (those of torch.load)
-) -> Any:  # noqa: ANN401 (what was saved)
-    """Read a file of tensors, numbers and dicts that torch.save wrote.
-
-    Nothing in it is run, so it may come from a stranger.
+) -> Any:  # noqa: ANN401 (the content)
+    """Read a file that `save` wrote. No code in it is run.
 
     Args:
-        path: of the file.
-        what: it should hold, for the error.
-        keys: that this has.
-        options: of torch.load.
+        path: The file.
+        what: Content that the file should have, for the error.
+        keys: Keys of this content.
+        finite: Keys under which all numbers must be finite.
+        **options: Options of `torch.load`.
 
     Raises:
-        ValueError: it is missing, empty or damaged, or holds something else.
+        ValueError: The file is missing or damaged, or has another content.
     """
     if not path.exists():
         raise ValueError(f"there is no file {path}")
     try:
+        check_archive(path)
         content = torch.load(path, weights_only=True, **options)
         for key in keys:
-            reduce(getitem, key if isinstance(key, tuple) else (key,), content)
-    except Exception as error:  # of almost any kind: it depends on the bytes
+            get(content, key)
+        for key in finite:
+            check_finite(key, get(content, key))
+    except Exception as error:  # damaged bytes can raise almost any exception
+        reason = str(error) if isinstance(error, ValueError) else type(error).__name__
         raise ValueError(
-            f"{path} does not hold {what}, or is damaged ({type(error).__name__})"
+            f"{path} does not hold {what}, or is damaged ({reason})"
         ) from None
     return content
+
+
+def get(content: Any, key: NestedKey) -> Any:  # noqa: ANN401 (nested dicts)
+    """The content under a key, which may be a tuple of keys."""
+    return reduce(getitem, key if isinstance(key, tuple) else (key,), content)
+
+
+def check_archive(path: Path) -> None:
+    """Compare the checksums in an archive of `torch.save` with its content.
+
+    `torch.load` does not compare them.
+
+    Raises:
+        ValueError: The checksums differ, or the file is not such an archive.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, NotImplementedError):
+        raise ValueError("not an archive of torch.save") from None
+    if damaged is not None:
+        raise ValueError(f"wrong checksum of {damaged}")
+
+
+def check_finite(name: NestedKey, values: object) -> None:
+    """Check that all numbers in tensors and nested dicts and lists are finite.
+
+    Raises:
+        ValueError: A number is infinite or not a number.
+    """
+    if isinstance(values, Mapping):
+        values = list(values.values())
+    if isinstance(values, list | tuple):
+        for value in values:
+            check_finite(name, value)
+    elif (
+        isinstance(values, Tensor | float)
+        and not torch.as_tensor(values).isfinite().all()
+    ):
+        raise ValueError(f"{name} has numbers that are not finite")

@@ -1,6 +1,8 @@
-"""What an agent may know of the shipped tasks: where things are, and the symmetry."""
+"""Geometry of the tasks: where positions are in observations, and the symmetry."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,26 +16,35 @@ from torch_panda.experts.cube_orientations import (
     straighten,
     to_matrix,
 )
-from torch_panda.tasks import Drawer, PegInsertion, Slide, Task
+from torch_panda.tasks import Task
+from torch_panda.tasks.base import Quantity
+
+OBSERVED = ("observation", "desired_goal")
 
 # Factors that mirror a quantity in the plane y = 0, in which robot and table are
 # symmetric.
-_POINT = (1.0, -1.0, 1.0)
-_ANGLES = (-1.0, 1.0, -1.0)
-_QUATERNION = (-1.0, 1.0, -1.0, 1.0)
-_FACTORS = {
-    "position": _POINT,
-    "velocity": _POINT,
-    "angles": _ANGLES,
-    "angular velocity": _ANGLES,
-    "quaternion": _QUATERNION,
+_MIRROR: dict[Quantity, tuple[float, ...]] = {
+    "position": (1.0, -1.0, 1.0),
+    "velocity": (1.0, -1.0, 1.0),
+    "euler_angles": (-1.0, 1.0, -1.0),
+    "angular_velocity": (-1.0, 1.0, -1.0),
+    "quaternion": (-1.0, 1.0, -1.0, 1.0),
     "number": (1.0,),
 }
-_OBJECT = ("position", "angles", "velocity", "angular velocity")
 
-# [m]. Slide draws goals 1.5 cm above where its puck can be, by which networks would
-# tell them from hindsight goals.
-SLIDE_GOAL_HEIGHT = 0.03
+WIDTH: Quantity = "number"  # of the fingers
+
+
+class Part(NamedTuple):
+    """A quantity in an observation or in a goal.
+
+    Attributes:
+        quantity: What it is.
+        start: Index of its first entry.
+    """
+
+    quantity: Quantity
+    start: int
 
 
 @dataclass(frozen=True)
@@ -90,47 +101,65 @@ class Geometry:
 
 
 def read_geometry(env: RobotTaskEnv) -> Geometry | None:
-    """The geometry of an environment; None if the layout of its task is unknown."""
+    """The geometry of an environment; None if its task does not declare its layout."""
     robot, task = env.robot, env.task
-    gripper = ("number",) * (robot.observation_dim - 6)
-    layout = ("position", "velocity", *gripper, *_task_layout(task))
-    sizes = [len(_FACTORS[kind]) for kind in layout]
-    places = [sum(sizes[:k]) for k in range(len(layout))]
-    size = sum(sizes)
-    if size != robot.observation_dim + task.observation_dim:
+    if task.observation_layout is None or task.goal_entries is None:
+        return None
+    fingers = (WIDTH,) * (robot.observation_dim - 6)
+    parts = locate(("position", "velocity", *fingers, *task.observation_layout))
+    size = sum(len(_MIRROR[part.quantity]) for part in parts)
+    goals = locate_goals(parts, task, first=robot.observation_dim)
+    goal_size = sum(len(_MIRROR[part.quantity]) for part, _ in goals)
+    sizes = tuple(env.observation_spec[key].shape[-1] for key in OBSERVED)
+    if (size, goal_size) != sizes:  # a subclass changed its observation or its goals
         return None
 
-    positions = zip(places, layout, strict=True)
-    _, *starts = (place for place, kind in positions if kind == "position")
-    rotates = task.goal_dim == 4  # Flip: orientations are quaternions
-    goals = () if rotates else tuple(range(0, task.goal_dim, 3))
-    # What an object is seen from, and a goal: the hand, and what is to be moved there.
-    pairs = [(0, start) for start in starts]
-    pairs += [
-        (here, size + goal) for here, goal in zip(starts or (0,), goals, strict=False)
-    ]
+    _, *objects = (part.start for part in parts if part.quantity == "position")
+    positions = [goal for goal in goals if goal[0].quantity == "position"]
+    rotations = [goal for goal in goals if goal[0].quantity == "quaternion"]
+    # An object is seen from the hand, and a goal from the object that should go there.
+    pairs = [(0, start) for start in objects]
+    pairs += [(part.start, size + start) for part, start in positions]
     return Geometry(
         later=tuple(there + axis for _, there in pairs for axis in range(3)),
         earlier=tuple(here + axis for here, _ in pairs for axis in range(3)),
-        observation=tuple(factor for kind in layout for factor in _FACTORS[kind]),
-        goal=_QUATERNION if rotates else _POINT * len(goals),
-        action=(*_POINT, *(1.0 for _ in gripper))
+        observation=tuple(x for part in parts for x in _MIRROR[part.quantity]),
+        goal=tuple(x for part, _ in goals for x in _MIRROR[part.quantity]),
+        action=(*_MIRROR["position"], *(1.0 for _ in fingers))
         if robot.control_type == "ee"
         else None,
-        positions=(0, *starts),
-        goal_positions=goals,
-        goal_height=SLIDE_GOAL_HEIGHT if isinstance(task, Slide) else None,
-        orientation=starts[0] + 3 if rotates else None,
+        positions=(0, *objects),
+        goal_positions=tuple(start for _, start in positions),
+        goal_height=task.drawn_goal_height,
+        orientation=rotations[0][0].start if rotations else None,
     )
 
 
-def _task_layout(task: Task) -> tuple[str, ...]:
-    """What the numbers of a task's observation are, by names of `_FACTORS`."""
-    match task:
-        case Drawer():
-            return ("position", "number", "number")
-        case PegInsertion():
-            return (*_OBJECT, "position")
-    if task.goal_dim == 4:
-        return ("position", "quaternion", "velocity", "angular velocity")
-    return _OBJECT * (task.observation_dim // 12)
+def locate(layout: Sequence[Quantity]) -> list[Part]:
+    """The quantities of an observation with the indices at which they start."""
+    parts, start = [], 0
+    for quantity in layout:
+        parts.append(Part(quantity, start))
+        start += len(_MIRROR[quantity])
+    return parts
+
+
+def locate_goals(
+    parts: Iterable[Part], task: Task, first: int
+) -> list[tuple[Part, int]]:
+    """The quantities that a goal consists of.
+
+    Args:
+        parts: Quantities of the observation.
+        task: The task.
+        first: Index of the first entry of the task in an observation.
+
+    Returns:
+        Each quantity in the observation, and the index at which it starts in a goal.
+    """
+    assert task.goal_entries is not None
+    offset = first if task.goal_entries.part == "task" else 0
+    entries = [offset + index for index in task.goal_entries.indices]
+    return [
+        (part, entries.index(part.start)) for part in parts if part.start in entries
+    ]

@@ -9,14 +9,13 @@ import csv
 import json
 import textwrap
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
-
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torch_panda.learning import files
 
 Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
@@ -34,11 +33,22 @@ Runs = dict[str, dict[str, Lines]]
 
 def plot_curve(curve: Curve, title: str, path: Path) -> None:
     """Draw one run's success over environment steps."""
-    figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
+    figure = Figure(figsize=(5, 3.5), layout="constrained")
+    axes = figure.subplots()
     axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
     _label(axes, title, "success")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    save(figure, path)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure in the format that the ending of its file names.
+
+    Raises:
+        OSError: The file cannot be written.
+        ValueError: There is no such format.
+    """
+    format = path.suffix.removeprefix(".") or "png"
+    files.replace(path, lambda file: figure.savefig(file, dpi=120, format=format))
 
 
 def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
@@ -54,20 +64,15 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     looks = {name: next_look(i) for i, name in enumerate(names)}
     width = min(COLUMNS, len(panels))
     height = -(-len(panels) // width)
-    figure, grid = plt.subplots(
-        height,
-        width,
-        figsize=(4.2 * width, 4.0 * height),  # legends are below
-        squeeze=False,
-        layout="constrained",
-    )
+    # Legends are below the panels.
+    figure = Figure(figsize=(4.2 * width, 4.0 * height), layout="constrained")
+    grid = figure.subplots(height, width, squeeze=False)
     for axes in grid.flat[len(panels) :]:
         axes.remove()
     for axes, (title, lines) in zip(grid.flat, panels, strict=False):
         draw_panel(axes, lines, metric, looks)
         _label(axes, title, metric)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    save(figure, path)
 
 
 def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
@@ -98,10 +103,10 @@ def next_look(number: int) -> dict[str, str]:
 
 
 def draw_panel(
-    axes: plt.Axes,
+    axes: Axes,
     lines: Lines,
     metric: Metric,
-    looks: dict[str, dict[str, str]],
+    looks: dict[str, dict[str, Any]],
 ) -> None:
     """Draw lines, each with a band over its seeds."""
     for name, curves in lines.items():
@@ -162,7 +167,7 @@ def line_label(preset: str, changed: dict[str, object]) -> str:
     return ", ".join(parts)
 
 
-def _label(axes: plt.Axes, title: str, metric: Metric) -> None:
+def _label(axes: Axes, title: str, metric: Metric) -> None:
     names = {"success": "success rate", "ever_success": "success rate at any step"}
     axes.set(xlabel="environment steps", ylabel=names.get(metric, metric), title=title)
     if metric in names:

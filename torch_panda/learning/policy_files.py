@@ -94,7 +94,9 @@ class SavedPolicy:
         if path.is_dir():
             path = path / "checkpoint.pt"
         keys = ("env_id", "hyperparameters", "policy")
-        content = files.read(path, "a policy", keys, map_location="cpu")
+        content = files.read(
+            path, "a policy", keys, finite=keys[1:], map_location="cpu"
+        )
         hp = _read_hyperparameters(path, content["hyperparameters"])
         try:
             spaces = Spaces.from_dict(content["spaces"])

@@ -4,11 +4,21 @@ What a recipe leaves out is as in the panda-gym paper, the default. Options give
 command line come before a recipe's.
 """
 
-import re
 from dataclasses import asdict
 from typing import Any
 
-from torch_panda.registry import ENV_IDS
+from torch_panda.registry import find_registration
+from torch_panda.tasks import (
+    Drawer,
+    Flip,
+    PegInsertion,
+    PickAndPlace,
+    Push,
+    Reach,
+    Slide,
+    Stack,
+    Task,
+)
 
 # Every object task: hindsight about what moved, and symmetry.
 OBJECT: dict[str, Any] = {
@@ -26,15 +36,15 @@ PLAIN_OPTIONS = {
 }
 # What joint control cannot do.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
-RECIPES: dict[str, dict[str, Any]] = {
-    "Reach": {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
+RECIPES: dict[type[Task], dict[str, Any]] = {
+    Reach: {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
     # One environment takes no random actions, and the last one half: learned twice as
     # soon as with 30 to 100 %.
-    "Push": {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
+    Push: {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
     # Goals out of reach are seldom achieved: some of the batch get them all the same.
     # One environment takes no random actions: where the puck stops depends on the whole
     # strike, and no strike of which a third is random shows where a clean one leads.
-    "Slide": {
+    Slide: {
         "num_envs": 8,
         "gamma": 0.98,
         "random_eps": (0.0, 0.3),
@@ -51,7 +61,7 @@ RECIPES: dict[str, dict[str, Any]] = {
         "eval_interval": 25_000,
     },
     # Seldom lifted by chance: half of the episodes begin with the cube in the hand.
-    "PickAndPlace": {
+    PickAndPlace: {
         **OBJECT,
         "relative_inputs": "fine",
         "start_at_object": 0.5,
@@ -61,7 +71,7 @@ RECIPES: dict[str, dict[str, Any]] = {
     },
     # A stack is many steps, and seldom done by a hand that acts at random: most
     # episodes begin in its course, and each cube has a hindsight of its own.
-    "Stack": {
+    Stack: {
         **OBJECT,
         "gamma": 0.98,
         "random_eps": (0.0, 0.5),
@@ -74,16 +84,16 @@ RECIPES: dict[str, dict[str, Any]] = {
     },
     # By imitation; not yet learned from rewards. A firm grasp and one in which the cube
     # swings are tenths of a millimetre apart.
-    "Flip": {
+    Flip: {
         **OBJECT,
         "relative_inputs": "fine",
         "fine_fingers": True,
         "batch_size": 512,
         "total_steps": 1_000_000,
     },
-    "Drawer": {**OBJECT, "anneal_lr": True, "total_steps": 20_000},
+    Drawer: {**OBJECT, "anneal_lr": True, "total_steps": 20_000},
     # By imitation; not yet known to work without demonstrations.
-    "PegInsertion": {
+    PegInsertion: {
         **OBJECT,
         "relative_inputs": "fine",
         "anneal_lr": True,
@@ -94,15 +104,16 @@ RECIPES: dict[str, dict[str, Any]] = {
 
 
 def find_recipe(env_id: str) -> dict[str, Any]:
-    """The recipe of an environment's task; none of an unknown one."""
-    if env_id not in ENV_IDS:
-        return {}
-    tasks = "|".join(RECIPES)
-    found = re.match(rf"[A-Z]\w*?({tasks})(Joints)?(Dense)?-v\d", env_id)
-    recipe = RECIPES.get(found[1], {}) if found else {}
-    if found and found[2]:
-        return {k: x for k, x in recipe.items() if k not in END_EFFECTOR_OPTIONS}
-    return recipe
+    """The recipe for the task of an id; empty if there is none.
+
+    Raises:
+        ValueError: The id is unknown.
+    """
+    registration = find_registration(env_id)
+    recipe = RECIPES.get(type(registration.make_task()), {})
+    if registration.make_robot().control_type == "ee":
+        return recipe
+    return {k: x for k, x in recipe.items() if k not in END_EFFECTOR_OPTIONS}
 
 
 def find_changes(args: Any, default: Any) -> dict[str, Any]:  # noqa: ANN401 (dataclasses)

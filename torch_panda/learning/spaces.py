@@ -43,8 +43,8 @@ class Spaces:
     has_free_gripper: bool
     has_sparse_reward: bool
     geometry: Geometry | None
-    action_scale: float = 0.05
-    moves_joints: bool = False
+    action_scale: float
+    moves_joints: bool
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -74,8 +74,8 @@ def read_spaces(env: RobotTaskEnv) -> Spaces:
     """The numbers of a batch of environments."""
     robot, task = env.robot, env.task
     return Spaces(
-        observation_size=robot.observation_dim + task.observation_dim,
-        goal_size=task.goal_dim,
+        observation_size=env.observation_spec["observation"].shape[-1],
+        goal_size=env.observation_spec["desired_goal"].shape[-1],
         action_size=robot.action_dim,
         num_envs=env.batch_size.numel(),
         max_episode_steps=env.max_episode_steps,

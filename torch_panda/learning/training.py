@@ -121,6 +121,8 @@ class Run:
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if not progress.curve:
+            # A run that is killed before its first evaluation can be resumed, too.
+            checkpoint.save()
             self.curve.add(progress)  # the untrained policy
             checkpoint.save()
         if progress.pretrained < args.pretrain_updates:

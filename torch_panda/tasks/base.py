@@ -18,9 +18,11 @@ from torch_panda.tasks.table import create_table
 # A task of a user needs these names.
 __all__ = [
     "NO_ROTATION",
+    "OBJECT_LAYOUT",
     "Bodies",
     "GoalEntries",
     "ObjectState",
+    "Quantity",
     "Start",
     "Task",
     "create_table",
@@ -28,6 +30,15 @@ __all__ = [
 ]
 
 RewardType = Literal["sparse", "dense"]
+Quantity = Literal[
+    "position", "velocity", "euler_angles", "quaternion", "angular_velocity", "number"
+]
+"""A quantity of an observation, in the world frame. A quaternion (xyzw) has 4 entries,
+a "number" that no rotation or reflection of the scene changes has 1, the others 3."""
+OBJECT_LAYOUT: tuple[Quantity, ...] = (
+    *("position", "euler_angles", "velocity", "angular_velocity"),
+)
+"""Quantities of `object_observation`."""
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
 """A function of achieved and desired goals, both (..., goal_dim), to (..., 1)."""
 
@@ -119,6 +130,14 @@ class Task(Configured, ABC):
 
     `RobotTaskEnv.goal_indices` and ``goal="observation"`` need it. A subclass that
     overrides `observation` or `achieved_goal` must declare it again."""
+
+    observation_layout: ClassVar[tuple[Quantity, ...] | None] = None
+    """Quantities of `observation`, in their order; None if they are not declared.
+
+    Relative inputs and data augmentation in training need it, and ``goal_entries``. The
+    position of each object comes before its other quantities."""
+    drawn_goal_height: ClassVar[float | None] = None
+    """Height of all goals that are drawn, where objects end lower [m]; else None."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05

@@ -45,6 +45,7 @@ class Drawer(Task):
     goal_dim = 3
     observation_dim = 5
     goal_entries = GoalEntries("task", (0, 1, 2))
+    observation_layout = ("position", "number", "number")
 
     cabinet_x_range: float = 0.06
     cabinet_y_range: float = 0.2

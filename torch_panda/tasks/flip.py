@@ -46,6 +46,7 @@ class Flip(Task):
     goal_dim = 4
     observation_dim = 13
     goal_entries = GoalEntries("task", (3, 4, 5, 6))
+    observation_layout = ("position", "quaternion", "velocity", "angular_velocity")
 
     distance_threshold: float = 0.2
     obj_xy_range: float = 0.3

@@ -11,6 +11,7 @@ from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import RED, Box
 from torch_panda.rotations import NO_ROTATION, rotate
 from torch_panda.tasks.base import (
+    OBJECT_LAYOUT,
     Bodies,
     GoalEntries,
     ObjectState,
@@ -54,6 +55,7 @@ class PegInsertion(Task):
     goal_dim = 3
     observation_dim = 15
     goal_entries = GoalEntries("task", (0, 1, 2))
+    observation_layout = (*OBJECT_LAYOUT, "position")
 
     distance_threshold: float = 0.01
     depth: float = 0.03

@@ -8,7 +8,13 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import Bodies, GoalEntries, Task, object_observation
+from torch_panda.tasks.base import (
+    OBJECT_LAYOUT,
+    Bodies,
+    GoalEntries,
+    Task,
+    object_observation,
+)
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -36,6 +42,7 @@ class Push(Task):
     goal_dim = 3
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
+    observation_layout = OBJECT_LAYOUT
     # Height at which panda-gym creates the marker, before the first goal [m].
     marker_height = CUBE_SIZE / 2
 

@@ -27,6 +27,7 @@ class Reach(Task):
     goal_dim = 3
     observation_dim = 0
     goal_entries = GoalEntries("robot", (0, 1, 2))
+    observation_layout = ()
 
     goal_range: float = 0.3
     table_friction: float = TABLE_FRICTION

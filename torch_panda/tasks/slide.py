@@ -8,7 +8,13 @@ from torch import Tensor
 
 from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import Bodies, GoalEntries, Task, object_observation
+from torch_panda.tasks.base import (
+    OBJECT_LAYOUT,
+    Bodies,
+    GoalEntries,
+    Task,
+    object_observation,
+)
 from torch_panda.tasks.table import TABLE_FRICTION, create_table, sample_on_table
 
 PUCK_RADIUS = 0.03  # [m]
@@ -41,6 +47,8 @@ class Slide(Task):
     goal_dim = 3
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
+    observation_layout = OBJECT_LAYOUT
+    drawn_goal_height = PUCK_START_HEIGHT
 
     goal_xy_range: float = 0.5
     goal_x_offset: float = 0.51

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import GREEN, RED, Color
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.base import Bodies, GoalEntries, Task
+from torch_panda.tasks.base import OBJECT_LAYOUT, Bodies, GoalEntries, Task
 from torch_panda.tasks.table import (
     CUBE,
     CUBE_SIZE,
@@ -50,6 +50,7 @@ class Stack(Task):
     goal_dim = 6
     observation_dim = 24
     goal_entries = GoalEntries("task", (0, 1, 2, 12, 13, 14))
+    observation_layout = OBJECT_LAYOUT * 2
     max_episode_steps = 100
 
     per_object: bool = True

@@ -184,7 +184,7 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
     uses_layout = (hp.relative_inputs, hp.augmentation) != ("none", "none")
     if uses_layout and spaces.geometry is None:
         raise ValueError(
-            "relative inputs and augmentation need to know what the numbers of an "
-            "observation are, and this task does not say it: pass "
-            "--relative-inputs none --augmentation none"
+            "relative inputs and augmentation need a task whose observation_layout "
+            "and goal_entries name all entries of its observations and goals: declare "
+            "them, or pass --relative-inputs none --augmentation none"
         )

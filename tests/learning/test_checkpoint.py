@@ -1,0 +1,97 @@
+"""Folders of runs: killed runs can be resumed, and two runs do not share a folder."""
+
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torch_panda.commands import train
+from torch_panda.learning import curve
+from torch_panda.learning.checkpoint import check_folder, lock_folder
+from torch_panda.learning.options import Args
+from torch_panda.learning.training import Run
+
+pytestmark = pytest.mark.usefixtures("quick")
+
+
+class Kill(BaseException):
+    """Ends a run as a kill of its process does."""
+
+
+def train_whole(args, out):
+    """Train until the end, and return the weights and the curve without times."""
+    out.mkdir(exist_ok=True)
+    run = Run(args, out)
+    run.train()
+    run.close()
+    rows = [{**row, "seconds": 0} for row in run.progress.curve]
+    return run.agent.state_dict(), rows
+
+
+def kill(*arguments):
+    raise Kill
+
+
+@pytest.mark.parametrize("during", ["plot_curve", "save_policy"])
+def test_a_run_killed_in_its_first_evaluation_can_be_resumed(
+    tmp_path, monkeypatch, during
+):
+    """Its curve.csv is there already."""
+    args = Args(num_envs=2, total_steps=100, updates_per_step=0.1)
+    weights, rows = train_whole(args, tmp_path / "whole")
+    out = tmp_path / "killed"
+    out.mkdir()
+    run = Run(args, out)
+    with monkeypatch.context() as patch, pytest.raises(Kill):
+        patch.setattr(curve, during, kill)
+        run.train()
+    run.close()
+    assert (out / "curve.csv").exists()
+    check_folder(out, resume=True)
+    resumed_weights, resumed_rows = train_whole(replace(args, resume=True), out)
+    torch.testing.assert_close(resumed_weights, weights, rtol=0, atol=0)
+    assert resumed_rows == rows
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from torch_panda.learning.checkpoint import lock_folder
+with lock_folder(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(100)
+"""
+
+
+@pytest.fixture
+def other_process(tmp_path):
+    """A process that writes into the folder."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "locked\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_folder_that_another_process_uses_is_refused(tmp_path, other_process, resume):
+    (tmp_path / "resume.pt").touch()
+    name = f"process {other_process.pid} on {socket.gethostname()}"
+    with pytest.raises(SystemExit, match=f"^{name} writes into {tmp_path}: stop it"):
+        train.main(Args(out=tmp_path, resume=resume))
+
+
+def test_the_lock_ends_with_its_process(tmp_path, other_process):
+    other_process.kill()
+    other_process.wait()
+    with lock_folder(tmp_path):
+        text = (tmp_path / "process.txt").read_text()
+        assert text == f"process {os.getpid()} on {socket.gethostname()}"
+    assert not (tmp_path / "process.txt").exists()
+    check_folder(tmp_path, resume=False)

@@ -1,0 +1,36 @@
+"""Plays whole episodes in a batch of environments."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torch_panda.envs import RobotTaskEnv
+
+
+def play_episodes(
+    env: RobotTaskEnv,
+    policy: TensorDictModuleBase,
+    exploration: ExplorationType = ExplorationType.DETERMINISTIC,  # type: ignore[assignment]
+) -> tuple[TensorDictBase, Tensor]:
+    """Play one new episode in every environment.
+
+    Args:
+        env: Batch of environments.
+        policy: Policy that writes ``action``.
+        exploration: Whether the policy may add its noise.
+
+    Returns:
+        Transitions [num_envs, steps], and the number of steps of each episode,
+        (num_envs,). Steps after the end of an episode have no meaning.
+    """
+    with torch.no_grad(), set_exploration_type(exploration):
+        rollout = env.rollout(
+            env.max_episode_steps,
+            policy,
+            break_when_any_done=False,
+            break_when_all_done=True,
+        )
+    has_ended = rollout["next", "done"].squeeze(-1).cumsum(1) > 0
+    return rollout, (~has_ended).sum(1) + 1
