@@ -33,8 +33,9 @@ RewardType = Literal["sparse", "dense"]
 Quantity = Literal[
     "position", "velocity", "euler_angles", "quaternion", "angular_velocity", "number"
 ]
-"""A quantity of an observation, in the world frame. A quaternion (xyzw) has 4 entries,
-a "number" that no rotation or reflection of the scene changes has 1, the others 3."""
+"""Kind of some entries of an observation. A "number" is one entry that does not change
+if the scene is rotated or mirrored. A quaternion (xyzw) has 4 entries. The others have
+3, in the world frame."""
 OBJECT_LAYOUT: tuple[Quantity, ...] = (
     *("position", "euler_angles", "velocity", "angular_velocity"),
 )
@@ -134,10 +135,10 @@ class Task(Configured, ABC):
     observation_layout: ClassVar[tuple[Quantity, ...] | None] = None
     """Quantities of `observation`, in their order; None if they are not declared.
 
-    Relative inputs and data augmentation in training need it, and ``goal_entries``. The
-    position of each object comes before its other quantities."""
+    Relative inputs and data augmentation in training need it, and ``goal_entries`` too.
+    The position of each object must precede its other quantities."""
     drawn_goal_height: ClassVar[float | None] = None
-    """Height of all goals that are drawn, where objects end lower [m]; else None."""
+    """Height of all sampled goals [m], if objects come to rest below it; else None."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
