@@ -1,9 +1,11 @@
 """Tasks: scene, goals, observation, success and reward."""
 
 from torch_panda.tasks.base import (
+    OBJECT_LAYOUT,
     Bodies,
     GoalEntries,
     ObjectState,
+    Quantity,
     RewardType,
     Start,
     Task,
@@ -20,6 +22,7 @@ from torch_panda.tasks.stack import Stack
 from torch_panda.tasks.table import create_table
 
 __all__ = [
+    "OBJECT_LAYOUT",
     "Bodies",
     "Drawer",
     "Flip",
@@ -28,6 +31,7 @@ __all__ = [
     "PegInsertion",
     "PickAndPlace",
     "Push",
+    "Quantity",
     "Reach",
     "RewardType",
     "Slide",
