@@ -131,6 +131,25 @@ def test_rolling_friction():
     assert_same(scene(fill), 200)
 
 
+@pytest.mark.parametrize(
+    "dynamics",
+    [
+        {"contactStiffness": 1e4, "contactDamping": 50.0},
+        {"frictionAnchor": 1},
+        {"anisotropicFriction": (1.0, 0.2, 0.1)},
+    ],
+)
+def test_settings_of_contacts(dynamics):
+    def fill(world):
+        pile(world, **dynamics)
+        chain = world.chain(5, (1.0, 0, 0.45))
+        world.box(0.5, (1.05, 0, 0.05))
+        for link in range(-1, 5):
+            world.client.changeDynamics(chain, link, **dynamics)
+
+    assert_same(scene(fill), 150, leaves_groups=None)
+
+
 def test_restitution():
     assert_same(scene(lambda world: pile(world, restitution=0.9)), 200)
 
@@ -354,22 +373,26 @@ def test_solver_analytics():
 
 ROBOTS = (
     "kuka_iiwa/model.urdf",
+    "humanoid/humanoid.urdf",
+    "aliengo/aliengo.urdf",
+    "spherical_joint_limit.urdf",
+)
+MORE_ROBOTS = (
     "r2d2.urdf",
     "cartpole.urdf",
-    "humanoid/humanoid.urdf",
+    "laikago/laikago.urdf",
     "xarm/xarm6_robot.urdf",
     "pr2_gripper.urdf",
     "racecar/racecar.urdf",
     "husky/husky.urdf",
-    "aliengo/aliengo.urdf",
-    "spherical_joint_limit.urdf",
     "sphere2.urdf",
     "teddy_vhacd.urdf",
 )
+SLOW_ROBOTS = [pytest.param(robot, marks=pytest.mark.slow) for robot in MORE_ROBOTS]
 
 
 @pytest.mark.parametrize("fixed_base", [False, True])
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [*ROBOTS, *SLOW_ROBOTS])
 def test_robots_of_pybullet(robot, fixed_base):
     """Floating bases, joints of several degrees of freedom, meshes, self-collisions."""
 

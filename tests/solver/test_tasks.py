@@ -10,23 +10,35 @@ from tests.ids import PHYSICS_IDS
 from tests.solver.solvers import assert_same, needs_packed
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.solver.gate import load_library
+from torch_panda.experts import make_expert
 
 pytestmark = needs_packed
 
 
-def environment(env_id, *, seed=0, **options):
-    """A scene of `assert_same`: episodes of one environment with random actions."""
+def environment(env_id, *, seed=0, expert=False, **options):
+    """A scene of `assert_same`: episodes of one environment.
+
+    Args:
+        env_id: The environment.
+        seed: Seed of the environment and of random actions.
+        expert: Whether a scripted expert acts instead.
+        **options: Options of `torch_panda.make`.
+    """
 
     def build():
         env = torch_panda.make(env_id, num_threads=1, seed=seed, **options)
         generator = torch.Generator().manual_seed(seed)
         latest = env.reset()
+        policy = make_expert(env_id) if expert else None
 
         def step(k):
             nonlocal latest
             if k and latest["done"].any():
                 latest = env.reset()
-            action = torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
+            if policy is not None:
+                action = policy(latest)["action"]
+            else:
+                action = torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
             latest = env.step(latest.set("action", action))["next"].exclude("reward")
 
         def state():
@@ -66,6 +78,11 @@ def test_control_types(control_type):
 
 def test_fast_physics():
     assert_same(environment("PandaStack-v1", physics="fast"), 40)
+
+
+@pytest.mark.parametrize("env_id", ["PandaPickAndPlace-v1", "PandaPush-v3"])
+def test_objects_in_the_hand(env_id):
+    assert_same(environment(env_id, expert=True), 50)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -43,7 +43,8 @@ struct link {
     char pad1[228];
     struct spatial axes[6];
     int dof_offset;
-    char pad2[36];
+    char pad2[4];
+    struct vector3 rotation; /* m_cachedRotParentToThis, a quaternion */
     struct vector3 r_vector; /* m_cachedRVector */
     char pad3[192];
     double joint_position[7];
@@ -86,7 +87,9 @@ struct contact_point {
     char pad0[24];
     int flags;
     double impulse, previous_rhs;
-    char pad1[64];
+    char pad1[32];
+    double cfm_or_stiffness, erp_or_damping; /* which of the two, say the flags */
+    char pad2[16];
     struct vector3 lateral_1, lateral_2;
 };
 
@@ -105,23 +108,25 @@ struct multi_body {
     struct collision_object *base_collider;
     char pad1[8];
     struct vector3 base_position;
-    char pad2[96];
+    char pad2[32];
+    struct vector3 base_rotation; /* a quaternion */
+    char pad3[32];
     double base_mass;
     struct vector3 base_inertia;
-    char pad3[128];
+    char pad4[128];
     struct array links; /* of struct link */
-    char pad4[32];
+    char pad5[32];
     struct array delta_v; /* m_deltaV */
     struct array real_buffer;   /* velocities, then inverses of D at squared offsets */
     struct array vector_buffer; /* h, a struct spatial for each degree of freedom */
     struct array matrix_buffer; /* rotations from the parent, the base's first */
-    char pad5[385];
+    char pad6[385];
     char fixed_base;
-    char pad6[46];
+    char pad7[46];
     int companion_id;
-    char pad7[45];
+    char pad8[45];
     char pos_updated; /* __posUpdated */
-    char pad8[2];
+    char pad9[2];
     int num_dofs;
 };
 
@@ -246,7 +251,13 @@ enum {
 };
 
 /* enum btContactPointFlags */
-enum { LATERAL_FRICTION_INITIALIZED = 1 };
+enum {
+    LATERAL_FRICTION_INITIALIZED = 1,
+    HAS_CFM = 2,
+    HAS_ERP = 4,
+    HAS_STIFFNESS_AND_DAMPING = 8,
+    FRICTION_ANCHOR = 16,
+};
 
 #define AT(type, field, offset)                                                        \
     _Static_assert(offsetof(struct type, field) == (offset), #type "." #field)
@@ -258,6 +269,7 @@ SIZE(array, 32);
 AT(link, parent, 40);
 AT(link, axes, 272);
 AT(link, dof_offset, 656);
+AT(link, rotation, 664);
 AT(link, r_vector, 696);
 AT(link, joint_position, 920);
 AT(link, flags, 1088);
@@ -279,6 +291,8 @@ AT(contact_point, restitution, 192);
 AT(contact_point, flags, 224);
 AT(contact_point, impulse, 232);
 AT(contact_point, previous_rhs, 240);
+AT(contact_point, cfm_or_stiffness, 280);
+AT(contact_point, erp_or_damping, 288);
 AT(contact_point, lateral_1, 312);
 AT(contact_point, lateral_2, 344);
 SIZE(contact_point, 376);
@@ -289,6 +303,7 @@ AT(manifold, num_points, 1528);
 AT(manifold, processing_threshold, 1544);
 AT(multi_body, base_collider, 8);
 AT(multi_body, base_position, 24);
+AT(multi_body, base_rotation, 88);
 AT(multi_body, base_mass, 152);
 AT(multi_body, base_inertia, 160);
 AT(multi_body, links, 320);

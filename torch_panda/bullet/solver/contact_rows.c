@@ -1,23 +1,28 @@
 /*
- * Rows of contacts between bodies without joints: boxes, the table, the ground.
+ * Rows of contacts, with friction and spinning friction.
  *
  * Which part of Bullet each function stands for
  * ---------------------------------------------
  * convert_manifold  btMultiBodyConstraintSolver::convertMultiBodyContact
- * fill_contact_row  btMultiBodyConstraintSolver::setupMultiBodyContactConstraint, and
+ * finish_contact    btMultiBodyConstraintSolver::setupMultiBodyContactConstraint, and
  *                   addMultiBodyFrictionConstraint for friction
- * fill_spinning_row btMultiBodyConstraintSolver::
+ * finish_spinning   btMultiBodyConstraintSolver::
  *                   setupMultiBodyTorsionalFrictionConstraint
- * add_body          btMultiBody::fillConstraintJacobianMultiDof
- * respond           btMultiBody::calcAccelerationDeltasMultiDof
+ * fill_jacobians    btMultiBody::fillConstraintJacobianMultiDof
+ * respond           btMultiBody::calcAccelerationDeltasMultiDof, for a body without links
  * set_directions    btPlaneSpace1 and btVector3::normalize
+ * matrix            btMatrix3x3::setRotation
  *
  * Why the results are the same bits
  * ---------------------------------
- * Bullet's functions serve bodies with any number of links. For a body without links
- * nearly all of their work is to prepare loops that end at once. Here are the
- * operations that remain, in Bullet's order. None is left out. Manifolds of other
- * bodies, and of contacts with settings of their own, are Bullet's.
+ * Bullet creates the rows of a contact one after the other. Each time it turns the
+ * contact into the frame of each link, and prepares loops over all links. Here, what the
+ * rows of a contact share is computed once, and a body without links has no loops. The
+ * other operations are Bullet's, in Bullet's order. responses.c says what is left out
+ * where a body has links.
+ *
+ * Manifolds of bodies that are not as simple as assumed, with rolling or anisotropic
+ * friction, or with numbers that are not finite, are Bullet's.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"
@@ -122,90 +127,179 @@ static void respond(const struct multi_body *body, const double *jacobian,
     unit[5] = world_linear.z;
 }
 
-/* Appends a body's part of a row; returns Jacobian times response. */
-static double add_body(struct jacobian_data *data, struct multi_body *body,
-                       const struct vector3 *arm, const struct vector3 *angular,
-                       const struct vector3 *linear, int *velocities, int *jac) {
-    *velocities = velocity_index(body, data);
-    *jac = data->jacobians.size;
-    double *jacobian = append(&data->jacobians, 6);
-    double *unit = append(&data->unit_impulses, 6);
-    const struct vector3 turn = cross(arm, linear);
-    jacobian[0] = turn.x + angular->x;
-    jacobian[1] = turn.y + angular->y;
-    jacobian[2] = turn.z + angular->z;
-    jacobian[3] = linear->x;
-    jacobian[4] = linear->y;
-    jacobian[5] = linear->z;
-    respond(body, jacobian, unit);
+static const struct vector3 ZERO = {0.0, 0.0, 0.0, 0.0};
+
+static struct matrix3 matrix(const struct vector3 *q) {
+    const double d = q->x * q->x + q->y * q->y + q->z * q->z + q->w * q->w;
+    const double s = 2.0 / d;
+    const double xs = q->x * s, ys = q->y * s, zs = q->z * s;
+    const double wx = q->w * xs, wy = q->w * ys, wz = q->w * zs;
+    const double xx = q->x * xs, xy = q->x * ys, xz = q->x * zs;
+    const double yy = q->y * ys, yz = q->y * zs, zz = q->z * zs;
+    return (struct matrix3){{{1.0 - (yy + zz), xy - wz, xz + wy, 0.0},
+                             {xy + wz, 1.0 - (xx + zz), yz - wx, 0.0},
+                             {xz - wy, yz + wx, 1.0 - (xx + yy), 0.0}}};
+}
+
+/* A row of a contact: its directions, and its parts for both bodies. */
+struct direction {
+    struct vector3 angular[2], linear[2];
+    double *jacobian[2], *unit[2];
+    struct constraint_row *row;
+};
+
+enum { MAX_ROWS = 4 }; /* of a contact: normal, spinning and two of friction */
+
+/* A body at a contact. */
+struct side {
+    struct multi_body *body;
+    int link;
+    const struct responses *responses; /* NULL for a body without joints */
+    const struct vector3 *position;
+};
+
+/* The Jacobians of all rows of a contact, for one of its bodies. */
+static void fill_jacobians(const struct side *side, struct direction *rows,
+                           int num_rows, int part) {
+    const struct multi_body *body = side->body;
+    const struct vector3 arm = minus(side->position, &body->base_position);
+    for (int i = 0; i < num_rows; i++) {
+        const struct vector3 *angular = &rows[i].angular[part];
+        const struct vector3 *linear = &rows[i].linear[part];
+        const struct vector3 turn = cross(&arm, linear);
+        double *jacobian = rows[i].jacobian[part];
+        jacobian[0] = turn.x + angular->x;
+        jacobian[1] = turn.y + angular->y;
+        jacobian[2] = turn.z + angular->z;
+        jacobian[3] = linear->x;
+        jacobian[4] = linear->y;
+        jacobian[5] = linear->z;
+    }
+    if (side->link < 0) return;
+
+    const struct link *links = body->links.data;
+    int chain[MAX_LINKS], length = 0; /* from the link to the base */
+    for (int i = side->link; i >= 0; i = links[i].parent) chain[length++] = i;
+    struct matrix3 rotation = matrix(&body->base_rotation);
+    struct vector3 local = rotate(&rotation, &arm);
+    struct vector3 angular[MAX_ROWS], linear[MAX_ROWS];
+    for (int i = 0; i < num_rows; i++) {
+        angular[i] = rotate(&rotation, &rows[i].angular[part]);
+        linear[i] = rotate(&rotation, &rows[i].linear[part]);
+    }
+    for (int k = length - 1; k >= 0; k--) {
+        const struct link *link = &links[chain[k]];
+        const struct vector3 *top = &link->axes[0].top, *bottom = &link->axes[0].bottom;
+        rotation = matrix(&link->rotation);
+        const struct vector3 turned = rotate(&rotation, &local);
+        local = minus(&turned, &link->r_vector);
+        struct vector3 lever = cross(top, &local);
+        lever = (struct vector3){lever.x + bottom->x, lever.y + bottom->y,
+                                 lever.z + bottom->z, 0.0};
+        for (int i = 0; i < num_rows; i++) {
+            angular[i] = rotate(&rotation, &angular[i]);
+            linear[i] = rotate(&rotation, &linear[i]);
+            if (!link->num_dofs) continue;
+            double *entry = &rows[i].jacobian[part][6 + link->dof_offset];
+            *entry = link->joint_type == REVOLUTE
+                         ? dot(&linear[i], &lever) + dot(&angular[i], top)
+                         : dot(&linear[i], bottom);
+        }
+    }
+}
+
+/* The responses of a body to unit impulses along all rows of a contact. */
+static void fill_responses(const struct side *side, struct direction *rows,
+                           int num_rows, int part) {
+    if (side->responses == NULL) {
+        for (int i = 0; i < num_rows; i++)
+            respond(side->body, rows[i].jacobian[part], rows[i].unit[part]);
+        return;
+    }
+    if (side->link < 0) return; /* the base is fixed: nothing responds */
+    double unused[MAX_LINKS];
+    for (int i = 0; i < num_rows; i += 2) {
+        const int has_second = i + 1 < num_rows;
+        const double *const impulses[2] = {
+            rows[i].jacobian[part] + 6,
+            has_second ? rows[i + 1].jacobian[part] + 6 : rows[i].jacobian[part] + 6};
+        double *const results[2] = {rows[i].unit[part] + 6,
+                                    has_second ? rows[i + 1].unit[part] + 6 : unused};
+        solve_pair(side->responses, impulses, results);
+    }
+}
+
+static double product(const double *a, const double *b, int count) {
     double sum = 0.0;
-    for (int i = 0; i < 6; i++) sum += jacobian[i] * unit[i];
+    for (int i = 0; i < count; i++) sum += a[i] * b[i];
     return sum;
 }
 
-/* Sets everything of a row that contacts and friction have in common. */
-static double begin_row(struct solver *solver, struct constraint_row *row,
-                        const struct manifold *manifold, struct contact_point *point,
-                        const struct vector3 *angular_a, const struct vector3 *linear_a,
-                        const struct vector3 *angular_b, const struct vector3 *linear_b,
-                        double cfm, const struct solver_info *info) {
-    struct multi_body *a = manifold->body_a->body, *b = manifold->body_b->body;
-    row->constraint = NULL;
-    row->constraint_row = -1;
-    row->solver_body_a = row->solver_body_b = -1;
-    row->multi_body_a = a;
-    row->multi_body_b = b;
-    row->link_a = row->link_b = -1;
-    row->contact_point = point;
-    const struct vector3 arm_a = minus(&point->position_a, &a->base_position);
-    const struct vector3 arm_b = minus(&point->position_b, &b->base_position);
-    struct jacobian_data *data = &solver->data;
-    const double denominator_a =
-        add_body(data, a, &arm_a, angular_a, linear_a, &row->delta_vel_a, &row->jac_a);
-    const double denominator_b =
-        add_body(data, b, &arm_b, angular_b, linear_b, &row->delta_vel_b, &row->jac_b);
+/* What all kinds of rows have in common; returns the velocity along the row. */
+static double finish_row(const struct side *sides, const struct direction *direction,
+                         double cfm, const struct solver_info *info) {
+    struct constraint_row *row = direction->row;
+    const int size_a = sides[0].body->num_dofs + 6, size_b = sides[1].body->num_dofs + 6;
+    const double *const *jacobian = (const double *const *)direction->jacobian;
+    const double denominator_a = product(jacobian[0], direction->unit[0], size_a);
+    const double denominator_b = product(jacobian[1], direction->unit[1], size_b);
     const double d = denominator_a + denominator_b + cfm;
     row->jac_diag_inv = d > EPSILON ? info->relaxation / d : 0.0;
     row->applied_impulse = 0.0;
     row->applied_push_impulse = 0.0;
     row->rhs_penetration = 0.0;
-    const double *jacobians = data->jacobians.data;
-    const double *velocity_a = a->real_buffer.data, *velocity_b = b->real_buffer.data;
+    const double *velocity_a = sides[0].body->real_buffer.data;
+    const double *velocity_b = sides[1].body->real_buffer.data;
     double velocity = 0.0;
-    for (int i = 0; i < 6; i++) velocity += velocity_a[i] * jacobians[row->jac_a + i];
-    for (int i = 0; i < 6; i++) velocity += velocity_b[i] * jacobians[row->jac_b + i];
+    for (int i = 0; i < size_a; i++) velocity += velocity_a[i] * jacobian[0][i];
+    for (int i = 0; i < size_b; i++) velocity += velocity_b[i] * jacobian[1][i];
     return velocity;
 }
 
-static const struct vector3 ZERO = {0.0, 0.0, 0.0, 0.0};
+/* Where the contact is, seen from the link's centre of mass. */
+static struct vector3 link_arm(const struct side *side) {
+    const struct link *links = side->body->links.data;
+    return minus(side->position, side->link < 0 ? &side->body->base_position
+                                                : &links[side->link].world_origin);
+}
 
-static void fill_contact_row(struct solver *solver, struct constraint_row *row,
-                             const struct manifold *manifold,
-                             struct contact_point *point, const struct vector3 *normal,
-                             int is_friction, const struct solver_info *info) {
+static void finish_contact(const struct side *sides, const struct direction *direction,
+                           const struct contact_point *point, int is_friction,
+                           const struct solver_info *info) {
+    struct constraint_row *row = direction->row;
     const double inverse_time_step = 1.0 / info->time_step;
-    const double cfm =
-        (is_friction ? info->friction_cfm : info->cfm) * inverse_time_step;
-    const double erp = is_friction ? info->friction_erp : info->erp2;
-    const struct vector3 opposite = negative(normal);
-    const double velocity = begin_row(solver, row, manifold, point, &ZERO, normal, &ZERO,
-                                      &opposite, cfm, info);
-    /* The arms once more: torques of the row, at the bodies' centres. */
-    const struct vector3 arm_a =
-        minus(&point->position_a, &row->multi_body_a->base_position);
-    const struct vector3 arm_b =
-        minus(&point->position_b, &row->multi_body_b->base_position);
+    double cfm = is_friction ? info->friction_cfm : info->cfm;
+    double erp = is_friction ? info->friction_erp : info->erp2;
+    if (!is_friction && point->flags & (HAS_CFM | HAS_ERP)) {
+        if (point->flags & HAS_CFM) cfm = point->cfm_or_stiffness;
+        if (point->flags & HAS_ERP) erp = point->erp_or_damping;
+    } else if (!is_friction && point->flags & HAS_STIFFNESS_AND_DAMPING) {
+        double denominator =
+            info->time_step * point->cfm_or_stiffness + point->erp_or_damping;
+        if (denominator < EPSILON) denominator = EPSILON;
+        cfm = 1.0 / denominator;
+        erp = info->time_step * point->cfm_or_stiffness / denominator;
+    }
+    cfm *= inverse_time_step;
+    const double velocity = finish_row(sides, direction, cfm, info);
+    const struct vector3 *normal = &direction->linear[0];
+    const struct vector3 arm_a = link_arm(&sides[0]), arm_b = link_arm(&sides[1]);
     const struct vector3 turn_b = cross(&arm_b, normal);
     row->relpos1_cross_normal = cross(&arm_a, normal);
     row->contact_normal1 = *normal;
     row->relpos2_cross_normal = negative(&turn_b);
-    row->contact_normal2 = opposite;
+    row->contact_normal2 = direction->linear[1];
     row->friction = point->friction;
 
     double velocity_error, position_error;
     if (is_friction) {
+        double distance = 0.0;
+        if (point->flags & FRICTION_ANCHOR) {
+            const struct vector3 gap = minus(&point->position_a, &point->position_b);
+            distance = dot(&gap, normal);
+        }
         velocity_error = 0.0 - velocity;
-        position_error = -0.0 * erp / info->time_step;
+        position_error = -distance * erp / info->time_step;
         row->lower_limit = -row->friction;
         row->upper_limit = row->friction;
     } else {
@@ -228,17 +322,14 @@ static void fill_contact_row(struct solver *solver, struct constraint_row *row,
     row->cfm = cfm * row->jac_diag_inv;
 }
 
-static void fill_spinning_row(struct solver *solver, struct constraint_row *row,
-                              const struct manifold *manifold,
-                              struct contact_point *point,
-                              const struct solver_info *info) {
-    const struct vector3 *normal = &point->normal_b;
-    const struct vector3 opposite = negative(normal);
-    const double velocity = begin_row(solver, row, manifold, point, normal, &ZERO,
-                                      &opposite, &ZERO, info->cfm, info);
-    row->relpos1_cross_normal = *normal;
+static void finish_spinning(const struct side *sides, const struct direction *direction,
+                            const struct contact_point *point,
+                            const struct solver_info *info) {
+    struct constraint_row *row = direction->row;
+    const double velocity = finish_row(sides, direction, info->cfm, info);
+    row->relpos1_cross_normal = direction->angular[0];
     row->contact_normal1 = ZERO;
-    row->relpos2_cross_normal = opposite;
+    row->relpos2_cross_normal = direction->angular[1];
     row->contact_normal2 = negative(&ZERO);
     row->friction = point->spinning_friction;
     row->rhs = (0.0 - velocity) * row->jac_diag_inv;
@@ -247,35 +338,133 @@ static void fill_spinning_row(struct solver *solver, struct constraint_row *row,
     row->cfm = info->cfm * row->jac_diag_inv;
 }
 
+/* Appends a row to one of the solver's arrays, with room for both bodies' parts. */
+static void begin_row(struct solver *solver, struct array *rows, int friction_index,
+                      const struct side *sides, struct contact_point *point,
+                      struct direction *direction) {
+    struct jacobian_data *data = &solver->data;
+    struct constraint_row *row = direction->row = expand(rows);
+    row->constraint = NULL;
+    row->constraint_row = -1;
+    row->solver_body_a = row->solver_body_b = -1;
+    row->multi_body_a = sides[0].body;
+    row->multi_body_b = sides[1].body;
+    row->link_a = sides[0].link;
+    row->link_b = sides[1].link;
+    row->contact_point = point;
+    row->friction_index = friction_index;
+    int *const velocities[2] = {&row->delta_vel_a, &row->delta_vel_b};
+    int *const jacobians[2] = {&row->jac_a, &row->jac_b};
+    for (int part = 0; part < 2; part++) {
+        const int size = sides[part].body->num_dofs + 6;
+        *velocities[part] = velocity_index(sides[part].body, data);
+        *jacobians[part] = data->jacobians.size;
+        direction->jacobian[part] = append(&data->jacobians, size);
+        direction->unit[part] = append(&data->unit_impulses, size);
+    }
+}
+
 /* ---- a manifold ---------------------------------------------------------------- */
 
-static int is_simple_body(const struct link_collider *collider) {
+static int find_side(struct responses **responses, const struct link_collider *collider,
+                     struct side *side) {
     if (!(collider->base.internal_type & LINK_COLLIDER) ||
-        collider->base.has_anisotropic_friction || collider->link != -1)
+        collider->base.has_anisotropic_friction)
         return 0;
+    side->body = collider->body;
+    side->link = collider->link;
     const struct multi_body *body = collider->body;
-    return body->links.size == 0 && body->num_dofs == 0 &&
-           body->matrix_buffer.size == 1 && body->real_buffer.size >= 6 &&
-           finite_zero(body->matrix_buffer.data, 12) +
-                   finite_zero(body->real_buffer.data, 6) +
-                   finite_zero(&body->base_position.x, 3) ==
-               0.0;
+    if (body->num_dofs == 0) {
+        side->responses = NULL;
+        return body->links.size == 0 && side->link == -1 &&
+               body->matrix_buffer.size == 1 && body->real_buffer.size >= 6 &&
+               finite_zero(body->matrix_buffer.data, 12) +
+                       finite_zero(body->real_buffer.data, 6) +
+                       finite_zero(&body->base_position.x, 3) ==
+                   0.0;
+    }
+    side->responses = get_responses(responses, body);
+    if (side->responses == NULL || side->link < -1 || side->link >= body->links.size ||
+        finite_zero(&body->base_position.x, 3) + finite_zero(&body->base_rotation.x, 4) !=
+            0.0)
+        return 0;
+    const struct link *link = body->links.data;
+    for (int i = 0; i < body->links.size; i++, link++)
+        if (link->num_dofs && link->joint_type != REVOLUTE &&
+            link->joint_type != PRISMATIC)
+            return 0;
+    return 1;
 }
 
 static int is_simple_point(const struct contact_point *point) {
-    return !(point->flags & ~LATERAL_FRICTION_INITIALIZED) &&
-           !(point->rolling_friction > 0.0) &&
+    const int known = LATERAL_FRICTION_INITIALIZED | HAS_CFM | HAS_ERP |
+                      HAS_STIFFNESS_AND_DAMPING | FRICTION_ANCHOR;
+    return !(point->flags & ~known) && !(point->rolling_friction > 0.0) &&
            finite_zero(&point->position_b.x, 3) + finite_zero(&point->position_a.x, 3) +
                    finite_zero(&point->normal_b.x, 3) +
-                   finite_zero(&point->distance, 5) ==
+                   finite_zero(&point->distance, 5) +
+                   finite_zero(&point->cfm_or_stiffness, 2) ==
                0.0;
 }
 
-int convert_manifold(struct solver *solver, struct manifold *manifold,
-                     const struct solver_info *info) {
-    if (info->mode & (CACHED_FRICTION_DIRECTIONS | ARTICULATED_WARMSTARTING) ||
-        !is_simple_body(manifold->body_a) || !is_simple_body(manifold->body_b))
-        return 0;
+/* Creates the rows of a contact; returns 0 if a number is not finite. */
+static int convert_point(struct solver *solver, struct side *sides,
+                         struct contact_point *point, const struct solver_info *info) {
+    struct direction directions[MAX_ROWS];
+    int num_rows = 0;
+    const int normal_index = solver->multi_body_normal_rows.size;
+    const int friction_index = solver->multi_body_friction_rows.size;
+    const struct vector3 *normal = &point->normal_b;
+    sides[0].position = &point->position_a;
+    sides[1].position = &point->position_b;
+    set_directions(normal, &point->lateral_1, &point->lateral_2);
+
+    struct direction *next = directions;
+    *next = (struct direction){{ZERO, ZERO}, {*normal, negative(normal)}, {0}, {0}, NULL};
+    begin_row(solver, &solver->multi_body_normal_rows, friction_index, sides, point,
+              next++);
+    const int is_spinning = point->spinning_friction > 0.0;
+    if (is_spinning) {
+        *next =
+            (struct direction){{*normal, negative(normal)}, {ZERO, ZERO}, {0}, {0}, NULL};
+        begin_row(solver, &solver->multi_body_spinning_rows, normal_index, sides, point,
+                  next++);
+    }
+    const int num_directions = info->mode & TWO_FRICTION_DIRECTIONS ? 2 : 1;
+    for (int i = 0; i < num_directions; i++) {
+        const struct vector3 *lateral = i ? &point->lateral_2 : &point->lateral_1;
+        *next = (struct direction){
+            {ZERO, ZERO}, {*lateral, negative(lateral)}, {0}, {0}, NULL};
+        begin_row(solver, &solver->multi_body_friction_rows, normal_index, sides, point,
+                  next++);
+    }
+    num_rows = (int)(next - directions);
+
+    double zero = 0.0;
+    for (int part = 0; part < 2; part++) {
+        fill_jacobians(&sides[part], directions, num_rows, part);
+        fill_responses(&sides[part], directions, num_rows, part);
+        const int size = sides[part].body->num_dofs + 6;
+        for (int i = 0; i < num_rows; i++)
+            zero += finite_zero(directions[i].jacobian[part], size) +
+                    finite_zero(directions[i].unit[part], size);
+    }
+    if (zero != 0.0) return 0;
+    for (int i = 0; i < num_rows; i++) {
+        if (is_spinning && i == 1)
+            finish_spinning(sides, &directions[i], point, info);
+        else
+            finish_contact(sides, &directions[i], point, i > 0, info);
+    }
+    if (num_directions == 2 && info->mode & FIXED_FRICTION_DIRECTIONS)
+        point->flags |= LATERAL_FRICTION_INITIALIZED;
+    return 1;
+}
+
+int convert_manifold(struct responses **responses, struct solver *solver,
+                     struct manifold *manifold, const struct solver_info *info) {
+    struct side sides[2];
+    if (info->mode & (CACHED_FRICTION_DIRECTIONS | ARTICULATED_WARMSTARTING)) return 0;
     const int num_points = manifold->num_points;
     const int num_directions = info->mode & TWO_FRICTION_DIRECTIONS ? 2 : 1;
     int num_normal = 0, num_spinning = 0;
@@ -286,43 +475,44 @@ int convert_manifold(struct solver *solver, struct manifold *manifold,
         num_normal++;
         num_spinning += point->spinning_friction > 0.0;
     }
-    struct jacobian_data *data = &solver->data;
-    const int num_friction = num_normal * num_directions;
-    const int num_entries = 12 * (num_normal + num_spinning + num_friction);
-    if (data->jacobians.size != data->unit_impulses.size ||
-        !has_room(&solver->multi_body_normal_rows, num_normal) ||
-        !has_room(&solver->multi_body_spinning_rows, num_spinning) ||
-        !has_room(&solver->multi_body_friction_rows, num_friction) ||
-        !has_room(&data->jacobians, num_entries) ||
-        !has_room(&data->unit_impulses, num_entries) ||
-        !has_room(&data->delta_velocities, 12))
+    if (num_normal && (!find_side(responses, manifold->body_a, &sides[0]) ||
+                       !find_side(responses, manifold->body_b, &sides[1])))
         return 0;
+    struct jacobian_data *data = &solver->data;
+    struct array *const arrays[] = {&solver->multi_body_normal_rows,
+                                    &solver->multi_body_spinning_rows,
+                                    &solver->multi_body_friction_rows,
+                                    &data->jacobians,
+                                    &data->unit_impulses,
+                                    &data->delta_velocities};
+    const int num_friction = num_normal * num_directions;
+    const int size =
+        num_normal ? sides[0].body->num_dofs + sides[1].body->num_dofs + 12 : 0;
+    const int num_entries = size * (num_normal + num_spinning + num_friction);
+    const int needed[] = {num_normal,  num_spinning, num_friction,
+                          num_entries, num_entries,  size};
+    int before[6];
+    for (int i = 0; i < 6; i++) {
+        if (!has_room(arrays[i], needed[i])) return 0;
+        before[i] = arrays[i]->size;
+    }
+    if (data->jacobians.size != data->unit_impulses.size) return 0;
+    int companions[2] = {0, 0};
+    for (int part = 0; num_normal && part < 2; part++)
+        companions[part] = sides[part].body->companion_id;
 
     for (int i = 0; i < num_points; i++) {
         struct contact_point *point = &manifold->points[i];
         if (!(point->distance <= manifold->processing_threshold)) {
             point->impulse = 0.0;
             point->previous_rhs = 0.0;
-            continue;
+        } else if (!convert_point(solver, sides, point, info)) {
+            /* Back to the start: Bullet creates all rows of the manifold. */
+            for (int k = 0; k < 6; k++) arrays[k]->size = before[k];
+            for (int part = 0; part < 2; part++)
+                sides[part].body->companion_id = companions[part];
+            return 0;
         }
-        const int index = solver->multi_body_normal_rows.size;
-        struct constraint_row *row = expand(&solver->multi_body_normal_rows);
-        fill_contact_row(solver, row, manifold, point, &point->normal_b, 0, info);
-        row->friction_index = solver->multi_body_friction_rows.size;
-        set_directions(&point->normal_b, &point->lateral_1, &point->lateral_2);
-        if (point->spinning_friction > 0.0) {
-            row = expand(&solver->multi_body_spinning_rows);
-            fill_spinning_row(solver, row, manifold, point, info);
-            row->friction_index = index;
-        }
-        for (int k = 0; k < num_directions; k++) {
-            row = expand(&solver->multi_body_friction_rows);
-            fill_contact_row(solver, row, manifold, point,
-                             k ? &point->lateral_2 : &point->lateral_1, 1, info);
-            row->friction_index = index;
-        }
-        if (num_directions == 2 && info->mode & FIXED_FRICTION_DIRECTIONS)
-            point->flags |= LATERAL_FRICTION_INITIALIZED;
     }
     return 1;
 }

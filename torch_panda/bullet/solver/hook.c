@@ -13,7 +13,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { VERSION = 2 }; /* native.py refuses a library of another version */
+enum { VERSION = 3 }; /* native.py refuses a library of another version */
 
 /* The functions that are replaced, in the order of gate.py. */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, NUM_FUNCTIONS };
@@ -109,16 +109,16 @@ static void convert(struct solver *solver, struct manifold **manifolds,
         bullet_convert(solver, manifolds, num_manifolds, info);
         return;
     }
+    struct responses *list = NULL;
     const int num_constraints = solver->num_constraints;
     solver->num_constraints = 0;
     for (int i = 0; i < num_manifolds; i++) {
-        const int converted = convert_manifold(solver, manifolds[i], info);
+        const int converted = convert_manifold(&list, solver, manifolds[i], info);
         if (mode == SOLVE)
             *(converted ? &counts.converted : &counts.not_converted) += 1;
         if (!converted) bullet_convert(solver, manifolds + i, 1, info);
     }
     solver->num_constraints = num_constraints;
-    struct responses *list = NULL;
     responses = &list;
     bullet_convert(solver, manifolds, 0, info);
     responses = NULL;

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 # Version of the C sources, as in hook.c: the library must have been compiled from
 # sources of this version.
-VERSION = 2
+VERSION = 3
 
 # ``enum mode``
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)

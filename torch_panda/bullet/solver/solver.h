@@ -13,9 +13,27 @@
 int solve_group(struct solver *solver, struct collision_object **bodies, int num_bodies,
                 int num_manifolds, int num_constraints, const struct solver_info *info);
 
-/* Unit responses of bodies, as a list that one conversion of a group owns. */
-struct responses;
+enum { MAX_LINKS = 64 }; /* of a body whose responses are computed here */
+
+/* A body with joints: what unit impulses at its joints do. A list of a group's bodies. */
+struct responses {
+    struct responses *next;
+    const struct multi_body *body;
+    int is_known;               /* 0: the rows of this body are Bullet's */
+    char is_needed[MAX_LINKS];  /* links that have a joint, or move one that has */
+    double columns[];           /* (num_dofs, num_dofs), a row for each impulse */
+};
+
+/* The responses of a body, or NULL if its rows are Bullet's. */
+const struct responses *get_responses(struct responses **list,
+                                      const struct multi_body *body);
 void free_responses(struct responses *list);
+
+/*
+ * What two sets of impulses at the joints, (num_dofs,) each, do to the joints.
+ */
+void solve_pair(const struct responses *responses, const double *const impulses[2],
+                double *const results[2]);
 
 /*
  * The rows of a joint's motor, and of its limits.
@@ -35,8 +53,8 @@ int create_limit_rows(struct responses **responses, struct limit *limit,
  *
  * Returns as the functions above do.
  */
-int convert_manifold(struct solver *solver, struct manifold *manifold,
-                     const struct solver_info *info);
+int convert_manifold(struct responses **responses, struct solver *solver,
+                     struct manifold *manifold, const struct solver_info *info);
 
 /* What the layout probe knows of the scene that it looks at. */
 struct expectation {
