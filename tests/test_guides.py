@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
 FOLDERS += ("torch_panda/policies", "examples/results", "torch_panda/gymnasium_envs")
+FOLDERS += ("torch_panda/learning",)
 GUIDES = [ROOT / folder / "README.md" for folder in FOLDERS]
 MAX_LINES = 250
 

@@ -8,7 +8,6 @@ import time
 from contextlib import nullcontext
 from unittest.mock import Mock
 
-import gallery
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import pytest
 import torch_panda
 from torch_panda.commands import watch
 from torch_panda.experts import make_expert
-from torch_panda.policies import shipped_policies
 
 
 @pytest.mark.parametrize("policy", ["random", "expert"])
@@ -124,25 +122,3 @@ def test_an_episode_that_ends_at_success_is_one(monkeypatch, capsys):
         "episode 2 of 2: success",
     ]
     assert 2 < window.show.call_count < 50  # the ends of both episodes are shown
-
-
-def test_gallery(tmp_path):
-    gallery.main(gallery.Args(step=1, size=(60, 80), out=tmp_path / "gallery.png"))
-    picture = iio.imread(tmp_path / "gallery.png")
-    assert picture.shape == (180, 240, 3)  # 3 rows of 3
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
-
-
-def test_gallery_of_policies(tmp_path):
-    out = tmp_path / "policies.png"
-    box = tuple(shipped_policies().values())
-    gallery.main(gallery.Args(policies=box, size=(60, 80), out=out))
-    picture = iio.imread(out).astype(int)
-    assert picture.shape == (60 * len(box), 80 * len(gallery.COLUMNS), 3)
-    first, last = picture[:, :80], picture[:, -80:]
-    assert all(np.abs(first - last)[60 * k :][:60].max() > 100 for k in range(len(box)))
-
-
-def test_gallery_writes_pictures_only(tmp_path):
-    with pytest.raises(SystemExit, match=r"must end in .png or .gif, got 'a.jpg'"):
-        gallery.main(gallery.Args(out=tmp_path / "a.jpg"))

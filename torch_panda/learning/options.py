@@ -51,7 +51,7 @@ class Args(Hyperparameters):
     start_at_object: Ratio = 0.0
     """the ratio of training episodes that begin in the course of the task: with the
     hand at an object, or holding it, or, of Stack, with the first cube placed (see
-    examples/training/starts.py); episodes then last at most 50 steps"""
+    torch_panda/learning/starts.py); episodes then last at most 50 steps"""
     randomize: Factor = 1.0
     """masses and frictions of objects and table, drawn for every training episode, lie
     between the task's, divided and multiplied by this; 1: they are the task's"""

@@ -1,0 +1,141 @@
+"""The scripts that teach: each runs, and each is short enough to read."""
+
+import ast
+from pathlib import Path
+
+import custom_pipeline
+import dense_ppo
+import gallery
+import numpy as np
+import own_task
+import parallel
+import pixels
+import pytest
+import sb3
+import torch
+from PIL import Image
+from torchrl.envs.utils import check_env_specs
+
+import torch_panda
+from torch_panda.transforms import HindsightRelabel
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_a_script_has_fewer_than_100_lines(script):
+    assert len(script.read_text().splitlines()) < 100
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_a_script_imports_no_other_script(script):
+    tree = ast.parse(script.read_text())
+    modules = {
+        name.split(".")[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module]
+        )
+    }
+    assert modules.isdisjoint(path.stem for path in SCRIPTS)
+
+
+def test_the_guide_lists_every_script():
+    guide = (ROOT / "examples" / "README.md").read_text()
+    assert [x.name for x in SCRIPTS if f"]({x.name})" not in guide] == []
+
+
+def test_ppo_lowers_the_distance_from_the_goal(monkeypatch, capsys):
+    monkeypatch.setattr(dense_ppo, "TOTAL_STEPS", 8_000)
+    dense_ppo.main()
+    lines = [x for x in capsys.readouterr().out.splitlines() if "mean reward" in x]
+    rewards = [float(line.split()[4].rstrip(",")) for line in lines]
+    assert len(rewards) == 10
+    assert sum(rewards[-2:]) > 0.8 * sum(rewards[:2])  # rewards are negative
+
+
+def test_hindsight_learns_the_grid_and_plain_dqn_does_not(monkeypatch):
+    monkeypatch.setattr(custom_pipeline, "SIZE", 12)
+    monkeypatch.setitem(custom_pipeline.STEPS, "total_frames", 1_800)
+    assert custom_pipeline.main() > 0.6
+    monkeypatch.setattr(custom_pipeline, "HER_RATIO", 0.0)
+    assert custom_pipeline.main() < 0.4
+
+
+def test_the_policy_from_pixels_approaches_the_goal(monkeypatch):
+    monkeypatch.setitem(pixels.STEPS, "total_frames", 800)
+    monkeypatch.setattr(pixels, "UPDATES_PER_BATCH", 100)
+    before, after = pixels.main()
+    assert after < 0.8 * before
+
+
+def test_own_task_is_a_valid_environment():
+    with torch_panda.make("PushBall-v0", num_envs=2, seed=0) as env:
+        check_env_specs(env)
+        assert env.render(0, size=32).shape == (32, 32, 3)
+
+
+def test_the_arm_of_own_task_moves_the_balls():
+    assert (own_task.main() > 0.005).all()
+
+
+def test_the_guide_shows_the_code_of_own_task():
+    guide = (ROOT / "torch_panda" / "README.md").read_text()
+    source = Path(own_task.__file__).read_text()
+    parts = {
+        node.name: ast.get_source_segment(source, node)
+        for node in ast.parse(source).body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name != "main"
+    }
+    assert list(parts) == ["PushBall", "make_arm"]
+    assert [name for name, code in parts.items() if code not in guide] == []
+
+
+def test_workers_run_different_episodes():
+    goals = parallel.roll_out().reshape(-1, 3)
+    assert len(goals.unique(dim=0)) == parallel.NUM_WORKERS * parallel.NUM_ENVS
+
+
+def test_a_buffer_of_worker_processes_is_relabelled(monkeypatch):
+    monkeypatch.setattr(parallel, "TOTAL_STEPS", 800)
+    buffer = parallel.collect()
+    assert len(buffer) == 800
+    assert isinstance(buffer.transform[0], HindsightRelabel)
+    stored, batch = buffer.storage[:], buffer.sample()
+    goals = batch["desired_goal"], stored["desired_goal"][batch["index"]]
+    assert not torch.equal(*goals)
+
+
+def test_stable_baselines3_trains(monkeypatch, capsys):
+    monkeypatch.setattr(sb3, "TOTAL_STEPS", 800)
+    monkeypatch.setattr(sb3, "EPISODES", 4)
+    sb3.main()
+    output = capsys.readouterr().out
+    assert "actor_loss" in output and "success_rate" in output
+    assert "800 steps: success at the end of 4 episodes" in output
+
+
+def test_every_cell_of_the_gallery_succeeds(monkeypatch, tmp_path):
+    monkeypatch.setattr(gallery, "RENDERER", "tiny")
+    monkeypatch.setattr(gallery, "NUM_FRAMES", 2)
+    monkeypatch.setattr(gallery, "CELL", (60, 48))
+    path = tmp_path / "gallery.webp"
+    gallery.main(path)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 2
+        picture.seek(1)
+        pixels = np.asarray(picture.convert("RGB"))
+    assert pixels.shape == (2 * 48, 4 * 60, 3)
+    corners = pixels[1::48, 1::60].astype(int)  # of each cell's frame
+    assert (abs(corners - gallery.GREEN) < 20).all()
+
+
+def test_the_gallery_refuses_an_episode_that_fails(monkeypatch):
+    monkeypatch.setattr(gallery, "draw", lambda *_: None)
+    monkeypatch.setitem(gallery.SCENES, "Slide", (4, None))
+    with pytest.raises(ValueError, match="Slide fails with seed 4"):
+        gallery.play("Slide")
