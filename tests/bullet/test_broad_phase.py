@@ -137,3 +137,19 @@ def test_cubes_that_fly_apart_repeat_their_flight(seed):
                 client.set_base(cube, [0.3 * rng.random() for _ in range(3)])
             client.step(rng.randrange(1, 200))
     assert all(end == ends[0] for end in ends)
+
+
+def test_a_collision_filter_of_the_scene_is_kept():
+    with PhysicsClient() as client:
+        client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
+        cubes = [
+            client.create_box(CUBE, mass=1.0, position=(x, 0.0, 0.05)) for x in (0, 0.5)
+        ]
+        client.set_collision_filter(cubes[0], -1, 0, 0)
+        client.finish_building()
+        broad_phase = BroadPhase(client)
+        broad_phase.restore()
+        client.step(200)
+        heights = [client.state(cube).base_pose[2] for cube in cubes]
+    assert heights[0] < -0.1  # it touches nothing
+    assert heights[1] == pytest.approx(0.02, abs=1e-3)

@@ -71,6 +71,16 @@ class SetJoints:
 
 
 @dataclass(frozen=True)
+class SetCollisionFilter:
+    """Sets the collision group and mask of a link (-1 is the base)."""
+
+    body: int
+    link: int
+    group: int
+    mask: int
+
+
+@dataclass(frozen=True)
 class SetPhysics:
     """Changes physical numbers of a link or joint, which no renderer shows.
 
@@ -83,5 +93,5 @@ class SetPhysics:
     arguments: tuple[float | None, ...]
 
 
-Command = LoadURDF | CreateBody | SetBase | SetJoints | SetPhysics
+Command = LoadURDF | CreateBody | SetBase | SetJoints | SetCollisionFilter | SetPhysics
 Blueprint = tuple[Command, ...]

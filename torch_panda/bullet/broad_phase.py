@@ -19,6 +19,7 @@ from ctypes import pointer
 from typing import NamedTuple
 
 from torch_panda.bullet import capi, native
+from torch_panda.bullet.blueprint import Blueprint, SetCollisionFilter
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.rotations import rotate_vector
 
@@ -57,6 +58,7 @@ class BroadPhase:
         self._client = client
         self._num_detections = client.num_detections
         self._links: list[_Link] = []
+        self._filters = _read_filters(client.blueprint)
         bodies = {body: _read_poses(client, body) for body in client.bodies}
         # Loading a snapshot that has contacts would detect collisions.
         for body, poses in bodies.items():
@@ -129,8 +131,18 @@ class BroadPhase:
                 client.set_base(body, (x, y, z), base[3:])
                 snapshot = client.save()
             is_static = link == -1 and not client.mass(body)
-            group_mask = capi.FILTER_STATIC if is_static else capi.FILTER_DYNAMIC
+            default = capi.FILTER_STATIC if is_static else capi.FILTER_DYNAMIC
+            group_mask = self._filters.get((body, link), default)
             self._links.append(_Link(body, link, group_mask, snapshot))
+
+
+def _read_filters(blueprint: Blueprint) -> dict[tuple[int, int], tuple[int, int]]:
+    """Collision group and mask of the links, by body and link, that a scene sets."""
+    return {
+        (command.body, command.link): (command.group, command.mask)
+        for command in blueprint
+        if isinstance(command, SetCollisionFilter)
+    }
 
 
 def _read_poses(client: PhysicsClient, body: int) -> list[tuple[float, ...]]:

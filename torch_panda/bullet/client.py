@@ -15,6 +15,7 @@ from torch_panda.bullet.blueprint import (
     LoadURDF,
     Quaternion,
     SetBase,
+    SetCollisionFilter,
     SetJoints,
     SetPhysics,
     Vector,
@@ -150,7 +151,7 @@ class PhysicsClient:
             tool: A link to add.
 
         Raises:
-            FileNotFoundError: there is no such file.
+            FileNotFoundError: the file does not exist.
             ValueError: the URDF is broken, lacks a mesh, or sets collision groups,
                 which `BroadPhase` could not restore; see `urdf.check_urdf`.
             BulletError: Bullet cannot load the file. It prints the reason.
@@ -396,6 +397,8 @@ class PhysicsClient:
     def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
         """Set the collision group and mask of a link (-1 is the base).
 
+        Resets keep a filter that was set while the scene was built.
+
         Two links touch if the group of either has a bit of the other's mask. The link
         leaves Bullet's broad phase and enters it again as the last link, without its
         former overlaps and contacts.
@@ -403,6 +406,7 @@ class PhysicsClient:
         command = capi.filter_init(self.connection.handle)
         capi.filter_set_group_mask(command, body, link, group, mask)
         self._run(command, "set a collision filter")
+        self._record(SetCollisionFilter(body, link, group, mask))
 
     def enable_wrench_sensor(self, body: int, joint: int) -> None:
         """Make Bullet compute the forces through a joint in every step."""

@@ -99,8 +99,8 @@ class WorkerPool:
         done, so that no client remains in the middle of a step.
 
         Raises:
-            WorkerError: ``work`` raised for at least one index. It was called for all
-                indices nevertheless, and the error is that of the lowest index.
+            WorkerError: ``work`` raised for at least one index. All other calls were
+                completed, and the error names the lowest index.
         """
         self.wait()
         self._start()

@@ -221,8 +221,8 @@ class VectorSimulation:
         """Call ``work(env)`` for some environments in the simulation's threads.
 
         Raises:
-            WorkerError: ``work`` raised for at least one environment. It was called for
-                all others nevertheless.
+            WorkerError: ``work`` raised for at least one environment. The calls for all
+                others were completed.
         """
         self._pool.run(work, envs)
 

@@ -12,7 +12,7 @@ from torch_panda.checks import all_finite
 class SimulationState:
     """Tensors with the state of every client, which steps and resets overwrite.
 
-    All tensors are float64, on the CPU and in the world frame. Positions are those of
+    All tensors are float64, on the CPU and in the world frame. Positions refer to
     centres of mass.
 
     Args:

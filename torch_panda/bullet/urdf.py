@@ -68,7 +68,7 @@ def parse_urdf(file: str | Path) -> ElementTree.Element:
     Like Bullet's own parser, this ignores text before and after the element.
 
     Raises:
-        ValueError: the file has no such element, or is not XML.
+        ValueError: the file has no <robot> element, or is not XML.
     """
     text = Path(file).read_text(errors="replace")
     first, end = re.search(r"<robot\b", text), "</robot>"
@@ -182,9 +182,9 @@ def _check_shape(
         )
     geometry = shape.find("geometry/*")
     if geometry is None or geometry.tag not in _SIZES:
-        found = "nothing" if geometry is None else f"<{geometry.tag}>"
+        actual = "nothing" if geometry is None else f"<{geometry.tag}>"
         raise ValueError(
-            f"{owner} must have one of {sorted(_SIZES)} as its geometry, got {found}"
+            f"{owner} must have one of {sorted(_SIZES)} as its geometry, got {actual}"
         )
     for attribute in _SIZES[geometry.tag]:
         if geometry.get(attribute) is None:
