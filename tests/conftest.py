@@ -44,11 +44,15 @@ def make_demos(tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Evaluate few episodes, and restore signal handlers and threads afterwards."""
-    from torch_panda.learning import curve
+    """Evaluate few episodes and draw small videos.
+
+    Signal handlers and numbers of threads are restored afterwards.
+    """
+    from torch_panda.learning import curve, video
 
     monkeypatch.setattr(curve, "EPISODES", 8)
     monkeypatch.setattr(curve, "NUM_ENVS", 8)
+    monkeypatch.setattr(video, "CELL", (64, 80))
     handlers = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
     threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     yield
