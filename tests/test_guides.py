@@ -35,3 +35,11 @@ def test_links_of_a_guide(guide):
     links = re.findall(r"\]\(([^)#]+)\)", guide.read_text())
     files = [link for link in links if not link.startswith("http")]
     assert [link for link in files if not (guide.parent / link).exists()] == []
+
+
+def test_the_guides_own_task_is_the_script():
+    guide = (ROOT / "torch_panda" / "README.md").read_text()
+    section = guide.split("\n## Your own task\n")[1]
+    code = re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
+    assert "class PushBall" in code
+    assert code in (ROOT / "examples" / "own_task.py").read_text()
