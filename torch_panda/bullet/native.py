@@ -188,9 +188,12 @@ class Library:
     def __init__(self, path: str) -> None:
         library = ctypes.CDLL(path)
         self.path = path
-        self.version: int = 0  # a library that is older than the version numbers
-        if hasattr(library, "loop_version"):
-            self.version = library.loop_version()
+        try:
+            self.version: int = library.loop_version()
+        except AttributeError:
+            self.version = 0  # the library is older than the version numbers
+        if self.version != VERSION:
+            return  # `loop_name` refuses it, and its functions may be others
         self.create = library.loop_create
         self.create.restype = c_void_p
         self.create.argtypes = (POINTER(Batch), c_int)
