@@ -38,9 +38,7 @@ class Grid(gymnasium.Env):
         self.observation_space = spaces.Dict({key: position for key in keys})
         self.action_space = spaces.Discrete(len(MOVES))
 
-    def reset(
-        self, *, seed: int | None = None, options: dict | None = None
-    ) -> tuple[dict, dict]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
         """Draw the start and the goal."""
         super().reset(seed=seed)
         self.cell, self.goal = self.np_random.integers(SIZE, size=(2, 2))
@@ -73,7 +71,8 @@ def main() -> float:
     env = GymWrapper(TimeLimit(Grid(), max_episode_steps=2 * SIZE))
     env.set_seed(0)
     net = MLP(4, len(MOVES), depth=2, num_cells=256, activation_class=nn.ReLU)
-    actor = QValueActor(net, env.action_spec, ["observation", "desired_goal"])
+    keys = ["observation", "desired_goal"]
+    actor = QValueActor(net, in_keys=keys, spec=env.action_spec)
     explore = TensorDictSequential(actor, EGreedyModule(env.action_spec, 0.2, 0.2))
     loss = DQNLoss(actor, delay_value=True)
     loss.make_value_estimator(gamma=0.98)

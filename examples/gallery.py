@@ -88,13 +88,9 @@ def main(path: Path) -> None:
             frame.paste(cell, (column * CELL[0], row * CELL[1]))
     times = [FRAME_TIME] * (NUM_FRAMES - 1) + [LAST_FRAME_TIME]
     first, *others = frames
-    options: dict = {
-        "save_all": True,
-        "append_images": others,
-        "duration": times,
-        "loop": 0,
-    }
-    first.save(path, quality=85, **options)
+    first.save(
+        path, save_all=True, append_images=others, duration=times, loop=0, quality=85
+    )
     print(f"wrote {path}")
 
 
