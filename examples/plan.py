@@ -46,19 +46,19 @@ class Fork(EnvBase):
         return super().__new__(cls, _batch_locked=False)
 
     def __init__(self) -> None:
-        super().__init__(batch_size=[])
+        super().__init__(batch_size=())
         self.model = make_env(NUM_CANDIDATES)
         self.action_spec = Bounded(-1.0, 1.0, self.model.action_spec.shape[-1:])
-        self.observation_spec = Composite(index=Unbounded((1,), dtype=torch.int64))
-        self.reward_spec = Unbounded((1,))
+        self.observation_spec = Composite(index=Unbounded(1, dtype=torch.int64))
+        self.reward_spec = Unbounded(1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not tensordict["index"].any():
-            self.now = self.model.reset(tensordict["state"], set_state=True)
+            self.now = self.model.reset(tensordict.get("state"), set_state=True)
         reward = torch.zeros(*tensordict.batch_size, 1)
         for _ in range(HOLD):
             self.now["action"] = tensordict["action"]
-            self.now = self.model.step(self.now)["next"]
+            self.now = self.model.step(self.now)["next"]  # type: ignore[assignment]
             goal, cube = self.now["desired_goal"], self.now["achieved_goal"]
             distance = self.model.task.distance(cube, goal)
             hand_goal = cube - BEHIND * normalize(goal - cube)
@@ -69,7 +69,9 @@ class Fork(EnvBase):
         result = {"index": tensordict["index"] + 1, "reward": reward, "done": done}
         return TensorDict(result, tensordict.batch_size)
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, **kwargs: object
+    ) -> TensorDict:
         raise NotImplementedError("a Fork starts from the state in its input")
 
     def _set_seed(self, seed: int | None) -> None:
@@ -86,7 +88,7 @@ def solve(env: torch_panda.RobotTaskEnv, fork: Fork) -> TensorDictBase:
         action = planner(TensorDict(start))["action"]
         for _ in range(HOLD):
             if not td["done"]:
-                td = env.step(td.set("action", action))["next"]
+                td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
     return td
 
 
