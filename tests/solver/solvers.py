@@ -44,7 +44,7 @@ def simulate(build, num_steps, name):
             step(k)
             states.append(state())
         counts = library.counts()
-    return states, counts.solved, counts.left
+    return states, counts.groups, counts.bullet_groups
 
 
 def assert_same(build, num_steps, *, leaves_groups=False):

@@ -41,10 +41,6 @@ def reason():
     return status.reason
 
 
-def test_opens_here():
-    assert gate.activate() == gate.SolverStatus("packed")
-
-
 def test_variable_switches_it_off(closed, monkeypatch):
     monkeypatch.setenv(SOLVER_VARIABLE, "bullet")
     assert reason() == "TORCH_PANDA_SOLVER=bullet"
@@ -59,7 +55,9 @@ def test_unknown_solver_is_refused(closed, monkeypatch):
 def test_packed_can_be_demanded(closed, monkeypatch):
     monkeypatch.setenv(SOLVER_VARIABLE, "packed")
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    with pytest.raises(RuntimeError, match="=packed, but it needs x86-64 Linux"):
+    with pytest.raises(
+        RuntimeError, match="=packed, but the packed solver needs x86-64 Linux"
+    ):
         gate.activate()
 
 
@@ -75,12 +73,12 @@ def test_platform(closed, monkeypatch, system, machine):
 
 def test_version(closed, monkeypatch):
     monkeypatch.setattr(library, "SUPPORTED_VERSION", "3.2.6")
-    assert reason() == "it needs pybullet 3.2.6, and 3.2.7 is installed"
+    assert reason() == "the packed solver needs pybullet 3.2.6, and 3.2.7 is installed"
 
 
 def test_no_compiled_library(closed, monkeypatch):
     monkeypatch.setattr(gate, "_LIBRARY", "torch_panda.bullet.solver.missing")
-    assert "was installed without it" in reason()
+    assert "the packed solver is not compiled" in reason()
 
 
 @pytest.mark.parametrize("part", [0, 1])
@@ -167,19 +165,19 @@ def test_results_that_differ(closed, monkeypatch):
 
 def test_groups_that_are_left_to_bullet(closed, monkeypatch):
     monkeypatch.setattr(self_test, "SOLVE", native.LEAVE)
-    assert reason() == "it did not solve all groups of the self-test"
+    assert reason() == "the packed solver did not solve all groups of the self-test"
 
 
 def test_rows_that_are_left_to_bullet(closed, monkeypatch):
     counts = native.SolverLibrary.counts
 
-    def none_created(self):
+    def without_manifolds(self):
         result = counts(self)
-        result.converted = 0
+        result.manifolds = 0
         return result
 
-    monkeypatch.setattr(native.SolverLibrary, "counts", none_created)
-    assert reason() == "it did not create the rows of the self-test"
+    monkeypatch.setattr(native.SolverLibrary, "counts", without_manifolds)
+    assert reason() == "the packed solver did not create the rows of the self-test"
 
 
 def test_decides_once(monkeypatch):

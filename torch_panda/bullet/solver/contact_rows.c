@@ -21,8 +21,8 @@
  * other operations are Bullet's, in Bullet's order. responses.c says what is left out
  * where a body has links.
  *
- * Manifolds of bodies that are not as simple as assumed, with rolling or anisotropic
- * friction, or with numbers that are not finite, are Bullet's.
+ * Bullet converts manifolds of bodies that are not as simple as assumed, with rolling or
+ * anisotropic friction, or with numbers that are not finite.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"

@@ -154,16 +154,21 @@ def check_platform() -> None:
     """Check for x86-64 Linux."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         raise GateError(
-            f"it needs x86-64 Linux, and this is {sys.platform} on {platform.machine()}"
+            f"the packed solver needs x86-64 Linux, and this is {sys.platform} on "
+            f"{platform.machine()}"
         )
 
 
 def check_version() -> None:
     """Check for the supported version of pybullet."""
-    version = importlib.metadata.version("pybullet")
+    try:
+        version = importlib.metadata.version("pybullet")
+    except importlib.metadata.PackageNotFoundError:
+        version = "an unknown version"
     if version != library.SUPPORTED_VERSION:
         raise GateError(
-            f"it needs pybullet {library.SUPPORTED_VERSION}, and {version} is installed"
+            f"the packed solver needs pybullet {library.SUPPORTED_VERSION}, and "
+            f"{version} is installed"
         )
 
 
@@ -173,8 +178,8 @@ def load_library() -> SolverLibrary:
     spec = importlib.util.find_spec(_LIBRARY)
     if spec is None or spec.origin is None:
         raise GateError(
-            "torch_panda was installed without it: install torch_panda again where "
-            "there is a C compiler"
+            "the packed solver is not compiled: install torch_panda again where there "
+            "is a C compiler"
         )
     return SolverLibrary(spec.origin)
 

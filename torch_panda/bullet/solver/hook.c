@@ -1,5 +1,5 @@
 /*
- * Puts the solver into Bullet's tables of virtual functions.
+ * Replaces functions in Bullet's tables of virtual functions.
  *
  * Only pointers in data are replaced: no code is changed, and nothing on disk. The
  * tables lie in pages that the loader made read-only, so a page is writable for the
@@ -13,7 +13,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { VERSION = 3 }; /* native.py refuses a library of another version */
+enum { VERSION = 4 }; /* native.py refuses a library of another version */
 
 /* The functions that are replaced, in the order of gate.py. */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, NUM_FUNCTIONS };
@@ -39,16 +39,16 @@ enum mode {
 
 /* Counts of a thread that is not in mode FOLLOW. */
 struct counts {
-    int solved;      /* groups that this solver solved */
-    int left;        /* groups that it left to Bullet's function */
-    int created;     /* motors and limits whose rows it created */
-    int not_created; /* those that it left to Bullet's function */
-    int converted;   /* manifolds whose rows it created */
-    int not_converted;
-    int joint_rows; /* rows that it probed */
-    int contact_rows;
-    int spinning_rows;
-    const char *wrong; /* a field that is not laid out as declared */
+    int groups;           /* that this solver solved */
+    int bullet_groups;    /* that Bullet's function solved instead */
+    int joints;           /* motors and limits whose rows this solver created */
+    int bullet_joints;    /* motors and limits whose rows Bullet created instead */
+    int manifolds;        /* whose rows this solver created */
+    int bullet_manifolds; /* whose rows Bullet created instead */
+    int joint_rows;       /* that were probed */
+    int contact_rows;     /* that were probed */
+    int spinning_rows;    /* that were probed */
+    const char *mismatch; /* a field that is not laid out as declared */
 };
 
 static void *bullet[NUM_FUNCTIONS];
@@ -73,12 +73,12 @@ static double iterations(struct solver *solver, struct collision_object **bodies
     if (is_active()) {
         const int solved = solve_group(solver, bodies, num_bodies, num_manifolds,
                                        num_constraints, info);
-        if (own == SOLVE) *(solved ? &counts.solved : &counts.left) += 1;
+        if (own == SOLVE) *(solved ? &counts.groups : &counts.bullet_groups) += 1;
         if (solved) return 0.0;
     }
-    if (own == PROBE && counts.wrong == NULL) {
-        counts.wrong = probe_rows(solver, info, &expectation);
-        if (counts.wrong == NULL) {
+    if (own == PROBE && counts.mismatch == NULL) {
+        counts.mismatch = probe_rows(solver, info, &expectation);
+        if (counts.mismatch == NULL) {
             counts.joint_rows += solver->multi_body_joint_rows.size;
             counts.contact_rows += solver->multi_body_normal_rows.size;
             counts.spinning_rows += solver->multi_body_spinning_rows.size;
@@ -87,8 +87,8 @@ static double iterations(struct solver *solver, struct collision_object **bodies
     const double result = ((iterations_function *)bullet[ITERATIONS])(
         solver, bodies, num_bodies, manifolds, num_manifolds, constraints,
         num_constraints, info, drawer);
-    if (own == PROBE && counts.wrong == NULL)
-        counts.wrong = probe_result(solver, bodies, num_bodies, num_manifolds, info);
+    if (own == PROBE && counts.mismatch == NULL)
+        counts.mismatch = probe_result(solver, bodies, num_bodies, num_manifolds, info);
     return result;
 }
 
@@ -102,8 +102,8 @@ static double iterations(struct solver *solver, struct collision_object **bodies
 static void convert(struct solver *solver, struct manifold **manifolds,
                     int num_manifolds, const struct solver_info *info) {
     convert_function *bullet_convert = (convert_function *)bullet[CONVERT];
-    if (mode == PROBE && counts.wrong == NULL)
-        counts.wrong =
+    if (mode == PROBE && counts.mismatch == NULL)
+        counts.mismatch =
             probe_manifolds(solver, manifolds, num_manifolds, info, &expectation);
     if (!is_active()) {
         bullet_convert(solver, manifolds, num_manifolds, info);
@@ -115,7 +115,7 @@ static void convert(struct solver *solver, struct manifold **manifolds,
     for (int i = 0; i < num_manifolds; i++) {
         const int converted = convert_manifold(&list, solver, manifolds[i], info);
         if (mode == SOLVE)
-            *(converted ? &counts.converted : &counts.not_converted) += 1;
+            *(converted ? &counts.manifolds : &counts.bullet_manifolds) += 1;
         if (!converted) bullet_convert(solver, manifolds + i, 1, info);
     }
     solver->num_constraints = num_constraints;
@@ -130,7 +130,7 @@ static void motor_rows(void *motor, struct array *rows, struct jacobian_data *da
     struct responses **shared = responses;
     if (shared != NULL) {
         const int created = create_motor_rows(shared, motor, rows, data, info);
-        if (mode == SOLVE) *(created ? &counts.created : &counts.not_created) += 1;
+        if (mode == SOLVE) *(created ? &counts.joints : &counts.bullet_joints) += 1;
         if (created) return;
     }
     ((rows_function *)bullet[MOTOR_ROWS])(motor, rows, data, info);
@@ -141,7 +141,7 @@ static void limit_rows(void *limit, struct array *rows, struct jacobian_data *da
     struct responses **shared = responses;
     if (shared != NULL) {
         const int created = create_limit_rows(shared, limit, rows, data, info);
-        if (mode == SOLVE) *(created ? &counts.created : &counts.not_created) += 1;
+        if (mode == SOLVE) *(created ? &counts.joints : &counts.bullet_joints) += 1;
         if (created) return;
     }
     ((rows_function *)bullet[LIMIT_ROWS])(limit, rows, data, info);

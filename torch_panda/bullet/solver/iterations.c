@@ -26,10 +26,10 @@
  *    are finite. The sum starts at +0, a sum that starts at +0 never becomes -0, and
  *    adding a zero of either sign to any other number returns this number.
  * 2. Velocities whose unit response is exactly zero, for the same reason. Velocities
- *    start at +0 or as sums, so none is -0; one that is makes the group Bullet's.
+ *    start at +0 or as sums, so none is -0. Bullet solves a group that has a -0.
  * 3. The second accumulator. The solver's m_deltaVelocities and the body's m_deltaV
- *    begin equal and receive the same additions. One is computed and copied. If they
- *    do not begin equal, the group is Bullet's.
+ *    begin equal and receive the same additions. One is computed and copied.
+ *    Bullet solves a group in which they begin different.
  * 4. atan2, sin and cos where the friction limit is 0. They only scale this zero.
  *
  * The reasons hold for finite numbers. An infinite or undefined number in an impulse
@@ -37,9 +37,9 @@
  * finite. The result is therefore checked once, at the end. If it is not finite, it is
  * thrown away, and Bullet's function computes the group from the start.
  *
- * A group is Bullet's, too, if anything in it is not known here: rows of rigid bodies,
- * constraints of rigid bodies, rows of a body and the world, solver modes that the
- * multi-body rows do not have, and data that is not what Bullet's setup leaves.
+ * Bullet also solves groups with anything that is not implemented here: rows of rigid
+ * bodies, constraints of rigid bodies, rows between a body and the world, and data that
+ * Bullet's setup never leaves.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #define _GNU_SOURCE /* sincos, posix_memalign */
@@ -257,7 +257,7 @@ static inline int is_moderate(double number) {
     return fabs(number) < 1e300; /* false for undefined numbers */
 }
 
-/* Registers a row's body; returns 0 if the group is Bullet's. */
+/* Registers a row's body; returns 0 if Bullet has to solve the group. */
 static int add_body(struct group *group, const struct solver *solver,
                     struct multi_body *body, int first, int jacobian, int *body_at) {
     const struct jacobian_data *data = &solver->data;

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 # Version of the C sources, as in hook.c: the library must have been compiled from
 # sources of this version.
-VERSION = 3
+VERSION = 4
 
 # ``enum mode``
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
@@ -59,16 +59,16 @@ class Counts(Structure):
     """``struct counts``."""
 
     _fields_ = (
-        ("solved", c_int),
-        ("left", c_int),
-        ("created", c_int),
-        ("not_created", c_int),
-        ("converted", c_int),
-        ("not_converted", c_int),
+        ("groups", c_int),
+        ("bullet_groups", c_int),
+        ("joints", c_int),
+        ("bullet_joints", c_int),
+        ("manifolds", c_int),
+        ("bullet_manifolds", c_int),
         ("joint_rows", c_int),
         ("contact_rows", c_int),
         ("spinning_rows", c_int),
-        ("wrong", c_char_p),
+        ("mismatch", c_char_p),
     )
 
 

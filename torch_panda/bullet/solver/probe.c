@@ -42,12 +42,12 @@ static const char *probe_body(const struct solver *solver,
 static const char *probe_row(const struct solver *solver,
                              const struct constraint_row *row,
                              const struct expectation *expected) {
-    const char *wrong = probe_body(solver, row->multi_body_a, row->delta_vel_a,
+    const char *mismatch = probe_body(solver, row->multi_body_a, row->delta_vel_a,
                                    row->jac_a, expected);
-    if (wrong == NULL)
-        wrong = probe_body(solver, row->multi_body_b, row->delta_vel_b, row->jac_b,
+    if (mismatch == NULL)
+        mismatch = probe_body(solver, row->multi_body_b, row->delta_vel_b, row->jac_b,
                            expected);
-    if (wrong != NULL) return wrong;
+    if (mismatch != NULL) return mismatch;
     CHECK("a row's m_appliedImpulse", row->applied_impulse == 0.0);
     CHECK("a row's m_jacDiagABInv", row->jac_diag_inv >= 0.0);
     CHECK("a row's m_lowerLimit", row->lower_limit <= 0.0 && row->upper_limit >= 0.0);
@@ -140,8 +140,8 @@ const char *probe_manifolds(const struct solver *solver,
                   colliders[k]->link >= -1 &&
                       colliders[k]->link < expected->num_links);
             CHECK("btMultiBodyLinkCollider.m_multiBody", colliders[k]->body != NULL);
-            const char *wrong = probe_base(colliders[k]->body, expected);
-            if (wrong != NULL) return wrong;
+            const char *mismatch = probe_base(colliders[k]->body, expected);
+            if (mismatch != NULL) return mismatch;
         }
     }
     return NULL;
@@ -264,35 +264,35 @@ const char *probe_rows(const struct solver *solver, const struct solver_info *in
     const struct constraint_row *row = solver->multi_body_joint_rows.data;
     int num_motors = 0;
     for (int i = 0; i < num_joint_rows; i++, row++) {
-        const char *wrong = probe_row(solver, row, expected);
-        if (wrong != NULL) return wrong;
+        const char *mismatch = probe_row(solver, row, expected);
+        if (mismatch != NULL) return mismatch;
         CHECK("a joint's bodies", row->multi_body_a == row->multi_body_b &&
                                       row->multi_body_a->num_dofs > 0);
-        if (i == 0) wrong = probe_links(row->multi_body_a, expected);
-        if (wrong == NULL) wrong = probe_constraint(row, expected);
-        if (wrong != NULL) return wrong;
+        if (i == 0) mismatch = probe_links(row->multi_body_a, expected);
+        if (mismatch == NULL) mismatch = probe_constraint(row, expected);
+        if (mismatch != NULL) return mismatch;
         num_motors += row->constraint->vtable == expected->motor_table;
     }
     CHECK("number of motors", num_joint_rows == 0 || num_motors == expected->num_dofs);
 
     row = solver->multi_body_normal_rows.data;
     for (int i = 0; i < num_contacts; i++, row++) {
-        const char *wrong = probe_row(solver, row, expected);
-        if (wrong != NULL) return wrong;
+        const char *mismatch = probe_row(solver, row, expected);
+        if (mismatch != NULL) return mismatch;
         CHECK("a contact's m_friction", row->friction == expected->friction);
         CHECK("a contact's m_upperLimit", row->upper_limit == 1e10f);
         CHECK("a contact's m_frictionIndex", row->friction_index == 2 * i);
-        wrong = probe_point(row->contact_point,
+        mismatch = probe_point(row->contact_point,
                             (const struct constraint_row *)
                                     solver->multi_body_friction_rows.data +
                                 2 * i,
                             expected);
-        if (wrong != NULL) return wrong;
+        if (mismatch != NULL) return mismatch;
     }
     row = solver->multi_body_friction_rows.data;
     for (int i = 0; i < 2 * num_contacts; i++, row++) {
-        const char *wrong = probe_row(solver, row, expected);
-        if (wrong != NULL) return wrong;
+        const char *mismatch = probe_row(solver, row, expected);
+        if (mismatch != NULL) return mismatch;
         CHECK("a friction row's m_friction", row->friction == expected->friction);
         CHECK("a friction row's m_frictionIndex", row->friction_index == i / 2);
     }

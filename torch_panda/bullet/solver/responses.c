@@ -18,7 +18,7 @@
  * Such zeros may differ from Bullet's in their sign. This reaches no other bit: a zero
  * added to another number returns this number, and zeros in a response change no
  * velocity, as iterations.c explains. All numbers must be finite for this. If one is
- * not, or if the body is not as simple as assumed, the rows are Bullet's.
+ * not, or if the body is not as simple as assumed, Bullet creates the rows.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"

@@ -9,8 +9,10 @@ from ctypes import c_double, c_int
 from pathlib import Path
 
 from torch_panda.bullet import capi
+from torch_panda.bullet.blueprint import Vector
 from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState
-from torch_panda.bullet.connection import doubles
+from torch_panda.bullet.building import ORIGIN, create_body, load_urdf
+from torch_panda.bullet.connection import BulletError, Connection, connect, doubles
 from torch_panda.bullet.solver.native import (
     FIXED,
     FOLLOW,
@@ -22,6 +24,7 @@ from torch_panda.bullet.solver.native import (
     GateError,
     SolverLibrary,
 )
+from torch_panda.rotations import NO_ROTATION
 
 _URDF = Path(__file__).with_name("self_test.urdf")
 _NUM_STEPS = 60
@@ -70,21 +73,23 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         solver.set_mode(PROBE, expectation)
         expected = _simulate()
         counts = solver.counts()
-        if counts.wrong is not None:
-            raise GateError(f"Bullet's layout differs: {counts.wrong.decode()}")
+        if counts.mismatch is not None:
+            raise GateError(f"Bullet's layout differs: {counts.mismatch.decode()}")
         motors = _NUM_JOINTS * _NUM_STEPS
         if counts.joint_rows <= motors or not counts.contact_rows:
-            raise GateError("the self-test met no joint limit or no contact")
+            raise GateError(
+                "the scene of the self-test has no joint limit or no contact"
+            )
         solver.set_mode(SOLVE)
         states = _simulate()
         counts = solver.counts()
     finally:
         solver.set_mode(FOLLOW)
-    if counts.left or not counts.solved:
-        raise GateError("it did not solve all groups of the self-test")
+    if counts.bullet_groups or not counts.groups:
+        raise GateError("the packed solver did not solve all groups of the self-test")
     # Bullet creates the first rows of a joint, and those for which it makes room.
-    if counts.created <= counts.not_created or not counts.converted:
-        raise GateError("it did not create the rows of the self-test")
+    if counts.joints <= counts.bullet_joints or not counts.manifolds:
+        raise GateError("the packed solver did not create the rows of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
             raise GateError(f"the self-test differs from Bullet in step {step}")
@@ -92,96 +97,105 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
 
 def _simulate() -> list[bytes]:
     """Step the scene in a new client; return the bytes of its state per step."""
-    client = capi.connect_direct()
-    if not client:
-        raise GateError("the self-test could not create a client")
     try:
-        arm, *boxes = _build(client)
-        states = []
-        for step in range(_NUM_STEPS):
-            _drive(client, arm, step)
-            _submit(client, capi.step_init(client))
-            states.append(b"".join(_state(client, body) for body in (arm, *boxes)))
-        return states
-    finally:
-        capi.disconnect(client)
+        connection = connect()
+        try:
+            arm, *boxes = _build(connection)
+            states = []
+            for step in range(_NUM_STEPS):
+                _drive(connection, arm, step)
+                connection.submit(
+                    capi.step_init(connection.handle),
+                    capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED,
+                    "step",
+                )
+                bodies = (_state(connection, body) for body in (arm, *boxes))
+                states.append(b"".join(bodies))
+            return states
+        finally:
+            connection.close()
+    except BulletError as error:
+        raise GateError(f"the self-test failed: {error}") from None
 
 
-def _submit(client: int, command: int) -> int:
-    status = capi.submit(client, command)
-    if not status:
-        raise GateError("Bullet did not answer the self-test")
-    return int(status)
-
-
-def _build(client: int) -> list[int]:
-    command = capi.physics_init(client)
+def _build(connection: Connection) -> list[int]:
+    handle = connection.handle
+    command = capi.physics_init(handle)
     capi.physics_set_timestep(command, _TIME_STEP)
     capi.physics_set_gravity(command, 0.0, 0.0, -9.81)
     capi.physics_set_solver_iterations(command, _NUM_ITERATIONS)
     capi.physics_set_residual_threshold(command, _RESIDUAL_THRESHOLD)
-    _submit(client, command)
-    command = capi.urdf_init(client, str(_URDF).encode())
-    capi.urdf_set_fixed_base(command, 1)
-    capi.urdf_set_flags(command, capi.URDF_IGNORE_VISUAL_SHAPES)
-    status = _submit(client, command)
-    if capi.status_type(status) != capi.CMD_URDF_LOADING_COMPLETED:
-        raise GateError("the self-test could not load its URDF")
-    arm = capi.status_body(status)
-    table = _box(client, 0.0, (0.5, 0.5, 0.05), (0.0, 0.0, -0.05))
+    connection.submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+    arm = load_urdf(
+        connection,
+        str(_URDF),
+        ORIGIN,
+        NO_ROTATION,
+        fixed_base=True,
+        flags=capi.URDF_IGNORE_VISUAL_SHAPES,
+    )
+    table = _box(connection, 0.0, (0.5, 0.5, 0.05), (0.0, 0.0, -0.05))
     boxes = [
-        _box(client, _MASSES[0], (0.03, 0.03, 0.03), (0.44, 0.05, 0.03)),
-        _box(client, _MASSES[1], (0.02, 0.03, 0.02), (0.44, 0.05, 0.08)),
+        _box(connection, _MASSES[0], (0.03, 0.03, 0.03), (0.44, 0.05, 0.03)),
+        _box(connection, _MASSES[1], (0.02, 0.03, 0.02), (0.44, 0.05, 0.08)),
     ]
     for body in (arm, table, *boxes):
-        for link in range(-1, capi.joint_count(client, body)):
-            command = capi.dynamics_init(client)
+        for link in range(-1, capi.joint_count(handle, body)):
+            command = capi.dynamics_init(handle)
             capi.dynamics_set_lateral_friction(command, body, link, _FRICTION)
             capi.dynamics_set_spinning_friction(command, body, link, 0.1)
             capi.dynamics_set_restitution(command, body, link, _RESTITUTION)
-            _submit(client, command)
+            connection.submit(
+                command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
+            )
     return [arm, *boxes]
 
 
 def _box(
-    client: int,
-    mass: float,
-    half_extents: tuple[float, ...],
-    position: tuple[float, ...],
+    connection: Connection, mass: float, half_extents: Vector, position: Vector
 ) -> int:
-    command = capi.shape_init(client)
+    command = capi.shape_init(connection.handle)
     capi.shape_add_box(command, doubles(half_extents))
-    shape = capi.status_shape(_submit(client, command))
-    origin, rotation = doubles((0.0, 0.0, 0.0)), doubles((0.0, 0.0, 0.0, 1.0))
-    command = capi.body_init(client)
-    capi.body_set_base(
-        command, mass, shape, -1, doubles(position), rotation, origin, rotation
+    status = connection.submit(
+        command, capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
     )
-    return int(capi.status_body(_submit(client, command)))
+    shape = int(capi.status_shape(status))
+    return create_body(connection, position, mass=mass, collision_shape=shape)
 
 
-def _drive(client: int, arm: int, step: int) -> None:
+def _drive(connection: Connection, arm: int, step: int) -> None:
     """Send the joints to one end of their ranges, later to the other."""
     target = _JOINT_RANGE if step < _NUM_STEPS // 2 else -_JOINT_RANGE
-    command = capi.motor_init(client, arm, capi.CONTROL_MODE_POSITION_VELOCITY_PD)
+    command = capi.motor_init(
+        connection.handle, arm, capi.CONTROL_MODE_POSITION_VELOCITY_PD
+    )
     for joint in range(_NUM_JOINTS):
         capi.motor_set_position(command, Q_OFFSET + joint, target)
         capi.motor_set_velocity(command, U_OFFSET + joint, 0.0)
         capi.motor_set_kp(command, U_OFFSET + joint, _KP)
         capi.motor_set_kd(command, U_OFFSET + joint, _KD)
         capi.motor_set_force(command, U_OFFSET + joint, _FORCE)
-    _submit(client, command)
+    connection.submit(
+        command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
+    )
 
 
-def _state(client: int, body: int) -> bytes:
+def _state(connection: Connection, body: int) -> bytes:
     """Positions, velocities and forces of motors of a body."""
-    state = BodyState(_submit(client, capi.state_init(client, body)))
+    handle = connection.handle
+    state = BodyState(
+        connection.submit(
+            capi.state_init(handle, body),
+            capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED,
+            "report a state",
+        )
+    )
     parts = [
         state.base_pose,
         state.base_velocity,
         state.joint_positions,
         state.joint_velocities,
     ]
-    if capi.joint_count(client, body):
+    if capi.joint_count(handle, body):
         parts.append(state.motor_forces)
     return b"".join(part.tobytes() for part in parts)

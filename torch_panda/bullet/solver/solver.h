@@ -1,4 +1,4 @@
-/* What the files of the solver know of one another. */
+/* Functions that the files of the solver share. */
 #ifndef TORCH_PANDA_SOLVER_H
 #define TORCH_PANDA_SOLVER_H
 
@@ -19,12 +19,12 @@ enum { MAX_LINKS = 64 }; /* of a body whose responses are computed here */
 struct responses {
     struct responses *next;
     const struct multi_body *body;
-    int is_known;               /* 0: the rows of this body are Bullet's */
+    int is_known;               /* 0: Bullet creates the rows of this body */
     char is_needed[MAX_LINKS];  /* links that have a joint, or move one that has */
     double columns[];           /* (num_dofs, num_dofs), a row for each impulse */
 };
 
-/* The responses of a body, or NULL if its rows are Bullet's. */
+/* The responses of a body, or NULL if Bullet has to create its rows. */
 const struct responses *get_responses(struct responses **list,
                                       const struct multi_body *body);
 void free_responses(struct responses *list);
@@ -56,7 +56,7 @@ int create_limit_rows(struct responses **responses, struct limit *limit,
 int convert_manifold(struct responses **responses, struct solver *solver,
                      struct manifold *manifold, const struct solver_info *info);
 
-/* What the layout probe knows of the scene that it looks at. */
+/* Numbers of the self-test's scene, for the layout probe. */
 struct expectation {
     void **motor_table, **limit_table; /* of virtual functions */
     double time_step;

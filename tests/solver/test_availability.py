@@ -1,0 +1,21 @@
+"""Where the packed solver must run: the other tests are skipped without it."""
+
+import platform
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+from torch_panda.bullet.solver import SolverStatus, activate, gate
+
+HAS_WHEEL = (sys.platform, platform.machine(), sys.version_info[:2]) == (
+    "linux",
+    "x86_64",
+    (3, 11),
+)
+
+
+@pytest.mark.skipif(not HAS_WHEEL, reason="pybullet has no wheel here")
+@pytest.mark.skipif(find_spec(gate._LIBRARY) is None, reason="it is not compiled")
+def test_the_packed_solver_runs_with_the_wheel_of_pybullet():
+    assert activate() == SolverStatus("packed")
