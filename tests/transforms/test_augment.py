@@ -187,19 +187,6 @@ def test_default_device():
     check_batch(stored, stored, "future")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"k": 0}, "k must be"),
-        ({"k": 1.5}, "k must be an integer"),
-        ({"strategy": "random"}, "one episode at a time"),
-    ],
-)
-def test_bad_options_raise(options, message):
-    with pytest.raises(ValueError, match=message):
-        HindsightAugment(reward_fn, **options)
-
-
 def test_multi_step_and_environments_raise():
     rb = make_buffer()
     rb.append_transform(MultiStepTransform(n_steps=3, gamma=0.9))

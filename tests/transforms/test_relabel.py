@@ -71,7 +71,7 @@ def is_mixed(batch):
     capacity=st.integers(8, 400),
     layout=st.sampled_from(["env_first", "time_first", "none", "no_ids"]),
     sampler=st.sampled_from([None, SamplerWithoutReplacement]),
-    strategy=st.sampled_from(STRATEGIES),
+    strategy=st.sampled_from([*STRATEGIES, "current", "geometric"]),
     batch_size=st.sampled_from([1, 7, 64]),
     every=st.integers(1, 5),
     restart=st.sampled_from([None, 1, 2, 7]),
@@ -173,24 +173,6 @@ def test_share_and_position_of_relabelled_rows(her_ratio):
     assert (position <= 5 * error / len(mask) ** 0.5).all()
 
 
-@pytest.mark.parametrize("capacity", [0, 1.5, float("inf")])
-def test_capacity_is_a_number_of_rows(capacity):
-    with pytest.raises(ValueError, match="capacity must be a positive integer"):
-        HindsightRelabel(reward_fn, capacity=capacity)
-
-
-@pytest.mark.parametrize("transform", [HindsightRelabel, HindsightAugment])
-def test_reward_is_a_function(transform):
-    with pytest.raises(ValueError, match="reward_fn must be a function, got None"):
-        transform(None)
-
-
-@pytest.mark.parametrize("her_ratio", [-0.1, 1.1])
-def test_her_ratio_out_of_range_raises(her_ratio):
-    with pytest.raises(ValueError, match="her_ratio must be within"):
-        HindsightRelabel(reward_fn, her_ratio=her_ratio)
-
-
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("strategy", ["future", "episode"])
 def test_goals_are_uniform(finished, strategy):
@@ -258,10 +240,44 @@ def test_bad_strategy_of_the_user_raises(strategy, message):
         rb.sample()
 
 
-@pytest.mark.parametrize("strategy", ["past", None, 3])
-def test_unknown_strategy_raises(strategy):
-    with pytest.raises(ValueError, match=rf"must be one of.*{strategy!r}"):
-        HindsightRelabel(reward_fn, strategy=strategy)
+BAD_VALUES = [
+    *((HindsightRelabel, {"her_ratio": x}, "her_ratio must be with") for x in (-1, 2)),
+    *(
+        (HindsightRelabel, {"capacity": x}, "capacity must be a positive integer")
+        for x in (0, 1.5, float("inf"))
+    ),
+    *(
+        (HindsightRelabel, {"goal_parts": x}, "goal_parts must be positive sizes")
+        for x in ((), (0, 3))
+    ),
+    (HindsightRelabel, {"unit": "episode"}, 'unit must be "row" or "slice"'),
+    *(
+        (HindsightRelabel, {"strategy": x}, "strategy must be one of.*got")
+        for x in ("past", None, 3, {"past": 1})
+    ),
+    *(
+        (HindsightRelabel, {"strategy": x}, "strategy must")
+        for x in ({}, {"future": 0.0}, {"future": -1}, {"final": 1e999})
+    ),
+    (HindsightRelabel, {"discount": -0.1}, "discount must be within"),
+    *((HindsightAugment, {"k": x}, "k must be an integer") for x in (0, 1.5)),
+    *(
+        (HindsightAugment, {"strategy": x}, "one episode at a time")
+        for x in ("random", "desired", {"future": 1, "desired": 1})
+    ),
+]
+
+
+@pytest.mark.parametrize(("hindsight", "options", "message"), BAD_VALUES)
+def test_bad_values_are_refused(hindsight, options, message):
+    with pytest.raises(ValueError, match=message):
+        hindsight(reward_fn, **options)
+
+
+@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
+def test_reward_fn_must_be_a_function(hindsight):
+    with pytest.raises(ValueError, match="reward_fn must be a function, got None"):
+        hindsight(None)
 
 
 def test_terminated_and_done_are_rewritten():
@@ -766,6 +782,18 @@ def test_emptied_buffer(strategy, before):
     for _ in range(30):
         rb.extend(envs.chunk(4).reshape(-1))
         check_batch(rb.sample(), rb.storage[:], strategy)
+
+
+def test_the_memory_takes_few_bytes_per_transition():
+    capacity = 20_000
+    rb, envs = make_buffer(capacity), Envs(50, [50])
+    for _ in range(100):
+        rb.extend(envs.chunk(8).reshape(-1))
+        rb.sample()
+    state = rb.transform[0].get_extra_state()["memory"]
+    arrays = sum(x.nbytes for x in state.values() if isinstance(x, torch.Tensor))
+    serials = rb.storage[:]["hindsight_serial"].nbytes
+    assert (arrays + serials) / capacity <= 3 * 4 + 24  # a goal of 3 numbers
 
 
 def test_shared_buffer_raises():

@@ -10,7 +10,7 @@ from torchrl.envs import CatTensors, Compose, RewardScaling
 
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
-BOTH = pytest.mark.parametrize("kind", [HindsightRelabel, HindsightAugment])
+BOTH = pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
 BUFFERS = pytest.mark.parametrize("buffer", [ReplayBuffer, TensorDictReplayBuffer])
 
 
@@ -65,8 +65,8 @@ def test_lazy_stacks_are_augmented():
 
 
 @BOTH
-def test_a_step_of_many_environments_is_not_one_item(kind):
-    rb = make_buffer(kind(compute_reward))
+def test_a_step_of_many_environments_is_not_one_item(hindsight):
+    rb = make_buffer(hindsight(compute_reward))
     with pytest.raises((RuntimeError, ValueError), match="extend"):
         rb.add(episodes().reshape(6, 10)[:, 0])
 
@@ -147,10 +147,10 @@ def test_desired_goals_keep_their_precision(achieved_type):
 
 
 @BOTH
-def test_a_learned_reward_gets_no_gradient(kind):
+def test_a_learned_reward_gets_no_gradient(hindsight):
     network = torch.nn.Linear(2, 1)
     scale = torch.ones(1, requires_grad=True)
-    rb = make_buffer(kind(lambda a, d: network(torch.cat((a, d), -1))))
+    rb = make_buffer(hindsight(lambda a, d: network(torch.cat((a, d), -1))))
     with pytest.warns(UserWarning, match="other rewards"):
         rb.extend(episodes())
     for _ in range(2):
