@@ -91,7 +91,10 @@ class SampleTimeTransform(BufferTransform):
         # Other methods may return the storage itself, or a lazy stack.
         is_copy = method == "_sample" and type(tensordict) is TensorDict
         inplace = is_copy and tensordict.ndim == 1
-        return self._write(tensordict, drawn, inplace=inplace).exclude(SERIAL_KEY)
+        batch = self._write(tensordict, drawn, inplace=inplace)
+        if batch is tensordict and not inplace:
+            return batch.exclude(SERIAL_KEY)
+        return batch.del_(SERIAL_KEY)
 
     @abstractmethod
     def _draw(self, serials: Integers, batch: TensorDictBase) -> Any:  # noqa: ANN401
