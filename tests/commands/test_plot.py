@@ -164,7 +164,9 @@ def spoil_curve(folder):
 @pytest.mark.parametrize("spoil", [spoil_arguments, spoil_curve])
 def test_a_folder_that_holds_no_run_is_named(runs, tmp_path, spoil):
     spoil(runs / "1")
-    with pytest.raises(SystemExit, match=f"^cannot draw: {runs / '1'} holds no run: "):
+    with pytest.raises(
+        SystemExit, match=f"^cannot draw: cannot read the run {runs / '1'}: "
+    ):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
 
 

@@ -257,10 +257,10 @@ def test_at_most_30_options_in_whole_phrases(capsys):
             {"demos": Path("nofile.pt")},
             "there is no file or folder nofile.pt: ",
         ),
-        ({"pretrain_updates": 9}, "pretrain_updates needs demos to imitate"),
+        ({"pretrain_updates": 9}, "pretrain_updates needs demonstrations: pass"),
         ({"noise_eps": 0.0, "random_eps": (0.0, 0.0)}, "algo ddpg explores by"),
-        ({"her": "parts"}, "--her parts is for goals of several objects"),
-        ({"start_at_object": 0.5}, "starts at objects need"),
+        ({"her": "parts"}, "--her parts needs goals of several objects"),
+        ({"start_at_object": 0.5}, "start_at_object needs end-effector control"),
         ({"out": Path("/dev/null")}, "out must be a folder, got the file /dev/null"),
     ],
 )

@@ -1,9 +1,9 @@
-"""Scripted experts: they show that each task can be solved, and give demonstrations.
+"""Scripted experts, which solve the tasks and give demonstrations.
 
-An expert maps a batch of observations and goals to actions of end-effector control. It
-has no state and sees no simulator: what to do next follows from the observation alone,
-so experts serve rollouts and collectors of any batch size. Positions are in the world
-frame [m]; an action of 1 displaces the end-effector by 5 cm.
+An expert maps a batch of observations and goals to actions of end-effector control. Its
+action follows from the observation alone, without state and without access to the
+simulation, so experts serve rollouts and collectors of any batch size. Positions are in
+the world frame [m]. An action of 1 displaces the end-effector by 5 cm.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Quaternions xyzw, (..., 4), and the 24 ways in which a cube lies straight."""
+"""Orientations of a cube: quaternions xyzw (..., 4), and the 24 straight ones."""
 
 import math
 
@@ -9,12 +9,12 @@ from torch_panda.rotations import quaternion_product as compose
 
 
 def inverse(quaternion: Tensor) -> Tensor:
-    """The quaternion of turning back, (..., 4)."""
+    """Inverse rotations, (..., 4)."""
     return quaternion * quaternion.new_tensor((-1.0, -1.0, -1.0, 1.0))
 
 
 def to_matrix(quaternion: Tensor) -> Tensor:
-    """Rotation matrices, (..., 3, 3)."""
+    """Matrices of rotations, (..., 3, 3)."""
     x, y, z, w = quaternion.unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -25,19 +25,23 @@ def to_matrix(quaternion: Tensor) -> Tensor:
 
 
 def same_half(quaternion: Tensor) -> Tensor:
-    """Of the two quaternions of each orientation that with a positive w, (..., 4)."""
+    """The same orientations by quaternions with w >= 0, (..., 4)."""
     return quaternion * torch.where(quaternion[..., 3:] < 0, -1.0, 1.0)
 
 
 def turn(axis: int, angle: Tensor) -> Tensor:
-    """The quaternion of a turn about a world axis by an angle [rad], (..., 1)."""
+    """Rotations about a world axis by angles [rad] (..., 1), (..., 4)."""
     parts = [torch.zeros_like(angle)] * 3
     parts[axis] = (angle / 2).sin()
     return torch.cat((*parts, (angle / 2).cos()), -1)
 
 
 def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-    """The distance left after the best turn about y, and that turn [rad], (..., 1)."""
+    """Best rotation about y towards a goal.
+
+    Returns:
+        The distance that it leaves, and its angle [rad], (..., 1) each.
+    """
     half_turn = compose(start.new_tensor((0.0, 1.0, 0.0, 0.0)), start)
     cosine = (goal * start).sum(-1, keepdim=True)
     sine = (goal * half_turn).sum(-1, keepdim=True)
@@ -47,7 +51,7 @@ def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _straight_orientations() -> Tensor:
-    """Any face up, then any quarter turn about z: (24, 4)."""
+    """The 24 orientations in which a cube lies along the axes, (24, 4)."""
     quarters = torch.arange(4.0)[:, None] * math.pi / 2
     faces = torch.cat((turn(0, quarters), turn(1, quarters[1::2])))
     return compose(turn(2, quarters)[:, None], faces).flatten(0, 1)
@@ -57,6 +61,6 @@ STRAIGHT = _straight_orientations()
 
 
 def straighten(cube: Tensor) -> Tensor:
-    """The nearest orientation of a cube that lies along the axes, (..., 4)."""
+    """The nearest of the 24 straight orientations, (..., 4)."""
     straight = STRAIGHT.to(cube)
     return straight[(cube[..., None, :] * straight).sum(-1).abs().argmax(-1)]

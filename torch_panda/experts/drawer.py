@@ -5,12 +5,12 @@ from torch import Tensor
 
 from torch_panda.experts.moves import go_over, move
 
-BEHIND = 0.03  # [m] from the handle's bar to the middle between it and the front
-REACH = 0.025  # [m] from bar to front that the hand may be off that middle
-BESIDE = 0.045  # [m] along the bar, which ends farther from its middle
-LOW = 0.01  # [m] above the bar's middle, below which the fingers hook it
-PLAY = 0.015  # [m] that the fingers move until they touch bar or front
-DONE = 0.008  # [m] from the goal, where the drawer is left alone
+BEHIND = 0.03  # from the handle's bar to the middle between bar and front [m]
+REACH = 0.025  # distance from this middle at which the hand is still inside [m]
+BESIDE = 0.045  # the same along the bar, which is longer [m]
+LOW = 0.01  # height above the bar's middle below which the fingers hook it [m]
+GAP = 0.015  # distance between the fingers and the bar or the front [m]
+DONE = 0.008  # distance from the goal at which the hand stops [m]
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
@@ -21,6 +21,6 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     x, y, z = offset.split(1, -1)
     hooked = (x.abs() < REACH) & (y.abs() < BESIDE) & (z > -LOW)
     left = (desired_goal - handle)[..., :1]
-    slide = torch.where(left.abs() < DONE, 0.0, left + PLAY * left.sign())
+    slide = torch.where(left.abs() < DONE, 0.0, left + GAP * left.sign())
     along = move(torch.cat((slide, torch.zeros_like(y), z), -1))
     return torch.where(hooked, along, go_over(ee, middle, 0.05))

@@ -1,8 +1,8 @@
 """Fits the strike of Slide's scripted expert to strikes of random strength.
 
-    cd examples && python -m experts.fit_strike
+    python -m torch_panda.experts.fit_strike
 
-It prints the numbers that `slide.py` has, for the physics of PandaSlide-v1.
+It prints the numbers in `slide.py`, for the physics of PandaSlide-v1.
 """
 
 import torch
@@ -14,19 +14,19 @@ from torch_panda.experts.slide import DEVIATION, STRENGTH, strike, strike_terms
 from torch_panda.registry import make
 
 ENV_ID, NUM_ENVS, ROUNDS = "PandaSlide-v1", 64, 40
-STEPS = 70  # until every puck lies still
+STEPS = 70  # steps after which every puck lies still
 STRENGTHS = (0.4, 1.05)
-DISTANCES = (0.1, 0.95)  # [m], what the fit is for
+DISTANCES = (0.1, 0.95)  # range of distances for the fit [m]
 
 
 def strike_at_random(seed: int) -> Tensor:
-    """One strike an environment.
+    """Strike once in every environment.
 
     Returns:
-        Where the puck lay (3), the direction (2), how far it slid along it [m], the
-        strength, and the angle by which it left the direction to the left, or, of
-        strikes to the right, to the right [rad]: (strikes, 8). Strikes that missed or
-        went too far are left out.
+        Rows of 8 numbers, (strikes, 8): position of the puck (3), direction (2),
+        distance along the direction [m], strength, and the angle by which the puck left
+        the direction [rad], positive towards the side of the strike. Strikes that
+        missed or went too far are left out.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = STRENGTHS
@@ -55,12 +55,12 @@ def strike_at_random(seed: int) -> Tensor:
     deviation = across / along * aim[:, 1:].sign()
     low, high = DISTANCES
     used = struck & (puck[:, 2:] > 0) & (along > low) & (along < high)
-    found = torch.cat((start, aim, along, strength, deviation), 1)
-    return found[used.squeeze(1)].double()
+    strikes = torch.cat((start, aim, along, strength, deviation), 1)
+    return strikes[used.squeeze(1)].double()
 
 
 def fit(terms: Tensor, values: Tensor) -> Tensor:
-    """Least squares, with little weight for outliers: (terms,)."""
+    """Fit coefficients (terms,) by least squares with small weights for outliers."""
     weight = torch.ones_like(values)
     for _ in range(10):
         root = weight.sqrt()
@@ -70,11 +70,11 @@ def fit(terms: Tensor, values: Tensor) -> Tensor:
 
 
 def main() -> None:
-    """Strike, fit to four fifths of the strikes, test on the others, and print."""
+    """Fit to four fifths of the strikes, test on the others, and print."""
     strikes = torch.cat([strike_at_random(seed) for seed in tqdm(range(ROUNDS))])
     start, aim, distance, strength, deviation = strikes.split((3, 2, 1, 1, 1), 1)
     test = torch.arange(len(strikes)) % 5 == 0
-    # A strike that is stronger by 1 sends the puck about this much farther [m].
+    # Effect of an error of 1 on the puck's final position [m].
     for name, polynomial, values, effect in (
         ("STRENGTH", STRENGTH, strength, 2 * distance.sqrt() / 0.95),
         ("DEVIATION", DEVIATION, deviation, distance),

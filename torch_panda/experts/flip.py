@@ -1,11 +1,14 @@
-"""The scripted expert for Flip: taps, drops and swings, planned from the quaternion.
+"""The scripted expert for Flip: taps and swings that are planned from the quaternion.
 
-The hand cannot turn, so it turns the cube in two other ways. A tap: with the fingers
-open around it, one of them knocks a corner, and the cube spins about z until the
-fingers close. A swing: held beside its centre in a grasp that loosens, the cube swings
-about y, the axis from finger to finger. A swing that ends with the cube hanging down
-can be set down: another face is up then. Last comes a swing that is held where it is
-best, or nothing more.
+The hand cannot rotate, so it rotates the cube in two other ways.
+
+- A tap. The fingers are open around the cube, and one of them knocks a corner. The cube
+  spins about z until the fingers close.
+- A swing. The fingers hold the cube beside its centre and loosen the grasp. The cube
+  swings about y, the axis from finger to finger. When it hangs down, the hand can put
+  it down with another face up.
+
+The last move of a plan is a swing that stops at the best angle, or nothing.
 """
 
 import math
@@ -18,23 +21,23 @@ from torch_panda.experts.cube_orientations import best_pitch, compose, straighte
 from torch_panda.experts.moves import GAIN, norm, open_to
 from torch_panda.rotations import rotation_distance as distance
 
-# Widths of the fingers [m]: around the cube, closing on it, holding it as firmly as it
-# takes, and where it begins to slip; by what action they loosen and then stay so.
+# Distances between the fingers [m]: around the cube, closing on it, holding it firmly,
+# and at the beginning of slip.
 WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0395
-CATCH = 0.034  # while it swings: closing faster would squeeze it out
-LOOSEN, STAY = 0.0012, -0.001
-ASIDE = 0.014  # [m] beside the cube's centre, so that its weight turns it
-LAG = 0.004  # [m] by which the arm's first step upwards takes the grasp towards -x
-CLEAR, LIFTED = 0.035, 0.075  # [m], heights from which the grasp loosens, of the swing
-LOST = 0.025  # [m] below the fingers, where they hold the cube only just
-TILT = 0.15  # [rad] of a cube that need not be straightened before it is swung
-TAP_ASIDE = 0.025  # [m] beside the cube's centre, where a finger knocks its corner
-SUCCESS, DONE = 0.2, 0.17  # distances: the task's, and one to leave alone
-# Costs of a plan: of each quarter turn about y and z, of the last swing, and of the
-# distance that it leaves, above all of what exceeds `GOOD`; 1 if it cannot succeed.
+CATCH = 0.034  # distance that stops a swing; a smaller one squeezes the cube out [m]
+LOOSEN, STAY = 0.0012, -0.001  # actions that loosen the grasp and keep it loose
+ASIDE = 0.014  # offset of the grasp from the centre, so that the cube swings [m]
+LAG = 0.004  # shift of the grasp towards -x in the arm's first step upwards [m]
+CLEAR, LIFTED = 0.035, 0.075  # heights at which the grasp loosens, and of the swing [m]
+LOST = 0.025  # distance of the cube below the fingers at which it nearly falls [m]
+TILT = 0.15  # largest tilt of a cube that can swing without being straightened [rad]
+TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
+SUCCESS, DONE = 0.2, 0.17  # distances at which the task succeeds, and the hand stops
+# Costs of a plan: each quarter turn about y and z, the last swing, the distance that it
+# leaves, and the part of this distance above `GOOD`. A plan that fails costs 1 more.
 PITCH_COST, YAW_COST, SWING_COST, LEFT_COST, MISS_COST = 0.3, 0.15, 0.1, 0.2, 6.0
 GOOD, GOOD_LYING = 0.15, 0.13
-# Quarter turns about y, then about z: how many (16, 2), as quaternions (16, 4), costs.
+# Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
 QUARTERS = torch.cartesian_prod(*[torch.tensor((0.0, 1.0, -1.0, 2.0))] * 2)
 TURNS = compose(
     *(turn(axis, QUARTERS[:, k : k + 1] * math.pi / 2) for axis, k in ((2, 1), (1, 0)))
@@ -43,12 +46,12 @@ TURN_COSTS = QUARTERS.abs() @ torch.tensor(((PITCH_COST,), (YAW_COST,)))
 
 
 class Table(NamedTuple):
-    """How a cube spins on a table.
+    """Numbers of a spinning cube on a table.
 
     Attributes:
-        deceleration: of its spin after a tap [rad/s^2].
-        quarter: the action of a tap after which it turns by about a quarter.
-        half: by about a half.
+        deceleration: Deceleration of the spin after a tap [rad/s^2].
+        quarter: Action of a tap that rotates the cube by about 90 degrees.
+        half: Action of a tap that rotates the cube by about 180 degrees.
     """
 
     deceleration: float
@@ -61,14 +64,14 @@ ROUGH = Table(deceleration=60.0, quarter=0.45, half=0.6)  # 0.5, of -v3
 
 
 class Plan(NamedTuple):
-    """What to do with a cube, each (..., 1) but ``lying``.
+    """A plan for a cube.
 
     Attributes:
-        lying: the straight orientation in which it lies, or will, (..., 4).
-        pitch: quarter turns about y that come first, each set down again.
-        yaw: quarter turns about z that follow.
-        swing: whether a swing comes last.
-        stops: whether it lies so when it has stopped spinning, not on the way.
+        lying: Straight orientation in which the cube lies, or will lie, (..., 4).
+        pitch: Quarter turns about y, which come first, (..., 1).
+        yaw: Quarter turns about z, which follow, (..., 1).
+        swing: Whether a swing comes last, (..., 1).
+        stops: Whether the cube has ``lying`` after its spin, not during it, (..., 1).
     """
 
     lying: Tensor
@@ -79,19 +82,19 @@ class Plan(NamedTuple):
 
 
 def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
-    """The plan that comes close to a goal with little effort.
+    """Plan moves that come close to a goal with little effort.
 
     Args:
-        cube: its quaternion, (..., 4).
-        spin: of a cube that slides on the table, about z [rad/s], (..., 1).
-        goal: the quaternion wanted, (..., 4).
-        table: on which it spins.
+        cube: Quaternion of the cube, (..., 4).
+        spin: Velocity of the cube's spin about z on the table [rad/s], (..., 1).
+        goal: Quaternion of the goal, (..., 4).
+        table: Table on which the cube spins.
     """
-    # It may be caught now, on the way, or when it will have stopped: (..., 3, 4).
+    # The hand can catch the cube now, on the way, or after its spin: (..., 3, 4).
     ahead = (spin * spin.abs() / (2 * table.deceleration)).clamp(-2.0, 2.0)
     ahead = ahead[..., None, :] * ahead.new_tensor(((0.0,), (0.5,), (1.0,)))
     lying = straighten(compose(turn(2, ahead), cube[..., None, :]))
-    # Then turned by quarters, and left so or swung: (..., 3, 16, 2).
+    # Quarter turns follow, and then nothing or a swing: (..., 3, 16, 2).
     turned = compose(TURNS.to(cube), lying[..., None, :])
     goal = goal[..., None, None, :]
     left = torch.cat((distance(turned, goal), best_pitch(turned, goal)[0]), -1)
@@ -106,14 +109,14 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
 
 
 def descend(ee: Tensor, point: Tensor) -> Tensor:
-    """To a point with open fingers, beside which a cube may lie: from above."""
+    """Move with open fingers to a point from above, past a cube beside it."""
     offset = point - ee
-    # Along x the fingers pass the cube on both sides, along y they would hit it.
+    # Along x the fingers pass on both sides of the cube. Along y they would hit it.
     off = (offset[..., 1:2].abs() - 0.01).clamp(min=0.0)
     off = off + (offset[..., :1].abs() - 0.03).clamp(min=0.0)
     rise = offset[..., 2:] + (5 * (off - 0.006)).clamp(0.0, 0.06)
     free = (1 - rise / 0.03).clamp(0.0, 1.0)
-    # The outstretched arm covers a small part only of an offset along x.
+    # The outstretched arm covers only a small part of an offset along x.
     far = 1 + 30 * (ee[..., :1] - 0.03).clamp(min=0.0)
     return GAIN * torch.cat(
         (offset[..., :1] * far * free, offset[..., 1:2] * free, rise), -1
@@ -142,15 +145,15 @@ def grasp(
     position: Tensor,
     velocity: Tensor,
     aside: Tensor,
-    ripe: Tensor,
+    ready: Tensor,
 ) -> Tensor:
-    """Close the fingers ``aside`` of the cube's centre along x, once it is ``ripe``."""
+    """Close the fingers ``aside`` from the centre along x if the cube is ``ready``."""
     x, y, z = (position + 0.04 * velocity).split(1, -1)
     point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)
     error = (point - ee).abs()
     slides = norm(velocity[..., :2]) > 0.05
     near = (error < error.new_tensor((0.008, 0.02, 0.01))).all(-1, True)
-    near = near & (slides | (error[..., :1] < 0.006)) & ripe
+    near = near & (slides | (error[..., :1] < 0.006)) & ready
     fingers = torch.where(near, open_to(width, CLOSE), open_to(width, WIDE))
     return torch.cat((descend(ee, point), fingers), -1)
 
@@ -164,29 +167,29 @@ def swing(
     left: Tensor,
     last: Tensor,
 ) -> Tensor:
-    """Lift the cube, let it swing about y and hold it, or set it down again.
+    """Lift the cube, let it swing about y, and then hold it or set it down.
 
     Args:
-        ee: end-effector, (..., 3).
-        width: of the fingers, (..., 1).
-        offset: of the cube from it, (..., 3).
-        spin: of the cube [rad/s], (..., 3).
-        pitch: the turn about y that is wanted [rad], (..., 1).
-        left: distance to the goal, (..., 1).
-        last: whether the cube is to be held, not set down, (..., 1).
+        ee: Position of the end-effector, (..., 3).
+        width: Distance between the fingers, (..., 1).
+        offset: Offset of the cube from the end-effector, (..., 3).
+        spin: Angular velocity of the cube [rad/s], (..., 3).
+        pitch: Rotation about y that is left to do [rad], (..., 1).
+        left: Distance to the goal, (..., 1).
+        last: Whether to hold the cube after the swing, and not set it down, (..., 1).
     """
     height, rate, turning = ee[..., 2:] + offset[..., 2:], spin[..., 1:2], norm(spin)
     zero = torch.zeros_like(width)
     firmly = open_to(width, HOLD + (CATCH - HOLD) * (turning > 0.5))
     slipping = offset[..., 2:] < -LOST
-    there = (pitch.abs() < 0.2) | (pitch * (pitch - 0.04 * rate) < 0) | slipping
-    there = there | (left < DONE) | (ee[..., 2:] < CLEAR)
+    arrived = (pitch.abs() < 0.2) | (pitch * (pitch - 0.04 * rate) < 0) | slipping
+    arrived = arrived | (left < DONE) | (ee[..., 2:] < CLEAR)
     loosely = torch.where(rate.abs() < 1, LOOSEN, STAY)
     loosely = torch.where(width < SLIP, open_to(width, SLIP + 0.0003), loosely)
     lift = GAIN * (LIFTED - ee[..., 2:])
-    lift = torch.cat((zero, zero, lift, torch.where(there, firmly, loosely)), -1)
+    lift = torch.cat((zero, zero, lift, torch.where(arrived, firmly, loosely)), -1)
 
-    # Set down: where it should be, or where it hangs and will not swing on.
+    # Set the cube down if it has the wanted face up, or hangs without swinging.
     hangs = (offset[..., :1].abs() < 0.004) & (offset[..., 2:] < -0.006)
     over = (hangs | slipping) & (turning < 1) & (pitch.abs() > 0.5)
     over = over | ~last & (pitch.abs() < 0.4) & (turning < 3)
@@ -202,7 +205,7 @@ def act(
     desired_goal: Tensor,
     table: Table = SLIPPERY,
 ) -> Tensor:
-    """Turn the cube by quarters until one more swing, or nothing, is enough."""
+    """Rotate the cube by quarters, and then swing it if that is not enough."""
     ee, width, position = (observation[..., a:b] for a, b in ((0, 3), (6, 7), (7, 10)))
     velocity, spin = observation[..., 14:17], observation[..., 17:20]
     cube, goal, offset = achieved_goal, desired_goal, position - ee
@@ -221,25 +224,25 @@ def act(
     leave = ~swings & (plan.yaw == 0) & stays
     leave = leave | (left < DONE) & (turning < 0.5) & on_table
 
-    # The fingers straighten a cube that they close on at its centre; straight, it is
-    # grasped aside. One that spins is caught when it is nearly straight as planned.
+    # Fingers that close on the centre straighten the cube. A straight cube is grasped
+    # aside from its centre. A spinning cube is caught when it is nearly straight.
     now = straighten(cube)
     tilt = 2 * (cube * now).sum(-1, keepdim=True).abs().clamp(max=1.0).acos()
     slow, straight = spin_z.abs() < 1.5, tilt < TILT
     aside = LAG - ASIDE * pitch.sign()
     aside = torch.where(swings & straight & slow, aside, 0.0)
-    ripe = (tilt < 0.25) | (tilt < 0.65) & slow
-    ripe = ripe & (distance(plan.lying, now) < 0.05)
+    ready = (tilt < 0.25) | (tilt < 0.65) & slow
+    ready = ready & (distance(plan.lying, now) < 0.05)
 
     taps = (plan.pitch == 0) & (plan.yaw != 0)
-    action = grasp(ee, width, position, velocity, aside, ripe)
+    action = grasp(ee, width, position, velocity, aside, ready)
     action = torch.where(taps, tap(ee, width, position, plan.yaw, table), action)
     rise = (ee[..., 2:] < 0.12).to(ee.dtype)
     rise = torch.cat((zero, zero, rise, open_to(width, WIDE)), -1)
     action = torch.where(leave, rise, action)
 
-    # Just gripped on the table: crooked, the cube is squeezed at its centre; then the
-    # fingers open to grasp it aside.
+    # On the table, squeeze a crooked cube at its centre. Then open the fingers to grasp
+    # it aside from its centre.
     fresh = on_table & (offset[..., 2:].abs() < 0.012)
     centred = offset[..., :1].abs() < 0.008
     crooked = fresh & ~straight & centred

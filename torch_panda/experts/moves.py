@@ -1,61 +1,61 @@
-"""The moves that the scripted experts are made of.
+"""Moves that the scripted experts combine.
 
-Positions and offsets are in the world frame [m]; an action of 1 displaces the
+Positions and offsets are in the world frame [m]. An action of 1 displaces the
 end-effector by 5 cm.
 """
 
 import torch
 from torch import Tensor
 
-GAIN = 0.8 / 0.05  # actions per metre: the arm covers 0.8 of an offset in a step
-GRIPPER = 0.2  # [m] that an action of 1 opens the fingers
-OPEN = 0.075  # [m], fingers' width before a grasp
-CUBE = 0.04  # [m], edge length
-# Deceleration of a cube that slides where friction is 0.5 * 0.5, as on the table of
-# -v3; on that of -v1 the cubes of Stack, with 5 * 0.1, stop still sooner [m/s^2].
+GAIN = 0.8 / 0.05  # actions per metre, to cover 0.8 of an offset in one step
+GRIPPER = 0.2  # distance by which an action of 1 opens the fingers [m]
+OPEN = 0.075  # distance between the fingers before a grasp [m]
+CUBE = 0.04  # edge length of a cube [m]
+# Deceleration of a sliding cube for a friction of 0.5 * 0.5, as on the table of -v3
+# [m/s^2]. On the table of -v1 the cubes of Stack, with 5 * 0.1, stop sooner.
 ROUGH = 0.25 * 9.81
 
 
 def norm(vector: Tensor) -> Tensor:
-    """Length, (..., n) to (..., 1)."""
+    """Lengths of vectors (..., n), (..., 1)."""
     return torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
 
 
 def unit(vector: Tensor) -> Tensor:
-    """Direction, (..., n)."""
+    """Directions of vectors, (..., n)."""
     return vector / norm(vector).clamp(min=1e-6)
 
 
 def move(offset: Tensor, limit: float = 1.0) -> Tensor:
-    """The action that displaces by an offset [m], at most ``limit`` long."""
+    """The action for an offset [m], with a length of at most ``limit``."""
     action = GAIN * offset
     return action / (norm(action) / limit).clamp(min=1.0)
 
 
 def go_to(position: Tensor, point: Tensor, limit: float = 1.0) -> Tensor:
-    """Straight to a point."""
+    """Move straight to a point."""
     return move(point - position, limit)
 
 
 def go_over(
     position: Tensor, point: Tensor, clearance: float, limit: float = 1.0
 ) -> Tensor:
-    """To a point from above: rise by ``clearance`` first, descend when over it."""
+    """Move to a point from above: rise by ``clearance``, and descend over the point."""
     offset = point - position
     height = (2 * (norm(offset[..., :2]) - 0.01)).clamp(0.0, clearance)
     rise = offset[..., 2:] + height
-    free = (1 - rise / 0.05).clamp(0.0, 1.0)  # how high it is already
+    free = (1 - rise / 0.05).clamp(0.0, 1.0)  # 1 if it is high enough to pass
     return move(torch.cat((offset[..., :2] * free, rise), -1), limit)
 
 
 def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
-    """Get behind a cube, seen from the goal, and push until it will slide there.
+    """Go behind a cube, seen from the goal, and push until it will slide to the goal.
 
     Args:
-        ee: end-effector, (..., 3).
-        cube: its position, (..., 3).
-        velocity: of the cube along x and y [m/s], (..., 2).
-        goal: where to push it, (..., 3).
+        ee: Position of the end-effector, (..., 3).
+        cube: Position of the cube, (..., 3).
+        velocity: Velocity of the cube along x and y [m/s], (..., 2).
+        goal: Position to which the cube should go, (..., 3).
     """
     offset, beside, height = (goal - cube)[..., :2], (ee - cube)[..., :2], cube[..., 2:]
     distance, direction = norm(offset), unit(offset)
@@ -66,27 +66,27 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     left = distance - velocity.square().sum(-1, keepdim=True) / (2 * ROUGH)
     step = (0.5 * left).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
-    # A cube within 3 cm is left alone: another approach would disturb it.
+    # Leave a cube within 3 cm alone, because another approach would disturb it.
     done = (left < 0.01) | ~pushing & (distance < 0.03)
     action = torch.where(pushing, advance, go_over(ee, behind, 0.06))
     return torch.where(done, 0.0, action)
 
 
 def is_held(ee: Tensor, width: Tensor, cube: Tensor) -> Tensor:
-    """Whether the fingers hold a cube, turned or not; it may slide along y."""
+    """Whether the fingers hold a cube, rotated or not, anywhere along y."""
     offset = (cube - ee).abs() < ee.new_tensor((0.02, 0.04, 0.02))
     return (width > 0.02) & (width < 0.057) & offset.all(-1, keepdim=True)
 
 
 def open_to(width: Tensor, wanted: float | Tensor) -> Tensor:
-    """The gripper's action for a width [m]."""
+    """The gripper's action towards a distance between the fingers [m]."""
     return ((wanted - width) / GRIPPER).clamp(-1.0, 1.0)
 
 
 def carry(
     ee: Tensor, width: Tensor, cube: Tensor, goal: Tensor, clearance: float = 0.0
 ) -> Tensor:
-    """Grasp a cube and carry it to a point: the action with the gripper, (..., 4)."""
+    """Grasp a cube and carry it to a point; the action has 4 entries."""
     offset = cube - ee
     near = (norm(offset[..., :2]) < 0.015) & (offset[..., 2:].abs() < 0.01)
     held = is_held(ee, width, cube)

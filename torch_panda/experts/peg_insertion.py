@@ -5,21 +5,21 @@ from torch import Tensor
 
 from torch_panda.experts.moves import move, norm
 
-FITS = 0.0004  # [m] beside the hole's middle, where the peg's end goes down
-CLEAR = 0.034  # [m] above its goal, where the peg's end is out of the block
-INSIDE = 0.0285  # [m] above its goal, where it is in the hole
-SLOWLY = 0.005  # [m] a step, at which it goes down
-DONE = 0.002  # [m] above its goal, where it is left alone
+FITS = 0.0004  # distance from the hole's axis at which the peg goes down [m]
+CLEAR = 0.034  # height above the goal at which the peg is above the block [m]
+INSIDE = 0.0285  # height above the goal below which the peg is in the hole [m]
+SLOWLY = 0.005  # descent in one step [m]
+DONE = 0.002  # distance from the goal at which the hand stops [m]
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Bring the peg's end over the hole, and lower it once it fits."""
+    """Bring the peg over the hole, and lower it when it fits."""
     left = desired_goal - achieved_goal
     beside, rise = left[..., :2], left[..., 2:]
     inside = rise > -INSIDE
     goes_down = inside | (norm(beside) < FITS)
     down = torch.where(rise.abs() < DONE, 0.0, rise.clamp(min=-SLOWLY))
-    # In the hole its walls lead the peg: pressed against them it would turn.
+    # The walls lead the peg in the hole; pressing against them would rotate it.
     return move(
         torch.cat(
             (

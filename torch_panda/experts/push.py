@@ -1,17 +1,18 @@
-"""The scripted experts for Push: one for each friction of the table."""
+"""The scripted experts for Push, one for each friction of the table."""
 
 import torch
 from torch import Tensor
 
 from torch_panda.experts.moves import CUBE, go_over, norm, push_to
 
-ON_TOP = 0.01  # [m] above the cube's top: where the end-effector presses on it
+ON_TOP = 0.01  # height of the pressing end-effector above the cube's top [m]
 
 
 def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Press on the cube from above and drag it to the goal.
 
-    On the slippery table of -v1 it follows; struck, it would slide too far.
+    On the slippery table of -v1 the cube follows the fingers. A cube that was struck
+    would slide too far.
     """
     ee, cube = observation[..., :3], achieved_goal
     beside, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE / 2 + ON_TOP
@@ -24,6 +25,6 @@ def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Te
 
 
 def push(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Push the cube to the goal from behind: friction on the table of -v3 stops it."""
+    """Push the cube to the goal from behind; the rough table of -v3 stops it."""
     ee, velocity = observation[..., :3], observation[..., 12:14]
     return push_to(ee, achieved_goal, velocity, desired_goal)

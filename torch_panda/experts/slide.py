@@ -1,4 +1,4 @@
-"""The scripted expert for Slide: one strike, as strong as a fitted polynomial says."""
+"""The scripted expert for Slide: one strike, whose strength is a fitted polynomial."""
 
 from collections.abc import Iterable
 from math import prod
@@ -8,15 +8,15 @@ from torch import Tensor
 
 from torch_panda.experts.moves import go_over, norm, unit
 
-# How far the closed fingers reach along x and y from the end-effector, and the puck [m]
+# Reach of the closed fingers from the end-effector along x and y, and the puck [m].
 FINGERS_X, FINGERS_Y, PUCK_RADIUS = 0.008, 0.0217, 0.029
-STRIKE_GAP = 0.014  # [m] between fingers and puck before the strike
-STRIKE_HEIGHT = 0.02  # [m] of the end-effector
-# How strong a strike must be, and by how much the puck then leaves its direction [rad]:
-# polynomials in s, the root of the distance; x and y, the puck's place; n, the sine of
-# the direction ("sxn" is their product, "" is 1). Fits by fit_strike.py to strikes of
-# random strength: of others 90 % stop within 5 cm along the direction, 99 % across it.
-# The terms are those that a full cubic, of 35, could not spare.
+STRIKE_GAP = 0.014  # distance between fingers and puck before the strike [m]
+STRIKE_HEIGHT = 0.02  # height of the end-effector in the strike [m]
+# Polynomials of the strength of a strike, and of the angle by which the puck leaves its
+# direction [rad]. Their variables are s, the root of the distance; x and y, the puck's
+# position; n, the sine of the direction. "sxn" is a product and "" is 1. fit_strike.py
+# fits them to strikes of random strength. 90 % of other strikes end within 5 cm along
+# the direction, and 99 % across it. Terms of a full cubic without effect are left out.
 STRENGTH = {
     "": 0.3047, "s": 0.5741, "x": 0.8988, "ss": 0.2025, "sn": -0.1505, "xn": -2.9521,
     "yn": 0.6878, "sxx": 7.388, "sxn": 3.4006, "xxx": 22.7439,
@@ -25,23 +25,23 @@ DEVIATION = {
     "": -0.0092, "xx": 1.5458, "xy": -4.1378, "xn": 3.2703, "yy": 1.8564,
     "yn": -2.3399, "nn": 0.4009, "xyn": 8.9578, "xnn": -3.859, "ynn": 3.1839,
 }  # fmt: skip
-OVERSHOOT = 0.006  # [m], of such strikes at the median
+OVERSHOOT = 0.006  # median by which such strikes go too far [m]
 
 
 def strike_terms(
     terms: Iterable[str], puck: Tensor, distance: Tensor, aim: Tensor, side: Tensor
 ) -> Tensor:
-    """Terms of a polynomial for strikes, mirrored so that they go to the left.
+    """Terms of a polynomial for strikes, which are mirrored to go to the left.
 
     Args:
-        terms: the variables of each, see `STRENGTH`.
-        puck: its position, (..., 3).
-        distance: how far it should slide [m], (..., 1).
-        aim: the direction of the strike, (..., 2).
-        side: 1 to the left and -1 to the right, (..., 1).
+        terms: Variables of each term; see `STRENGTH`.
+        puck: Position of the puck, (..., 3).
+        distance: Distance that the puck should slide [m], (..., 1).
+        aim: Direction of the strike, (..., 2).
+        side: 1 for strikes to the left, -1 to the right, (..., 1).
 
     Returns:
-        (..., terms).
+        The terms, (..., number of terms).
     """
     values = {
         "s": distance.sqrt(),
@@ -56,10 +56,13 @@ def strike_terms(
 def strike(
     observation: Tensor, puck: Tensor, aim: Tensor, side: Tensor, strength: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The action that prepares a strike or does it, and whether it does, (..., 1).
+    """Prepare a strike, or strike.
 
-    A corner of the closed fingers strikes along ``aim``, from rest: then the speed at
-    which it meets the puck is always the same. For the others see `strike_terms`.
+    A corner of the closed fingers strikes along ``aim``. It starts from rest, so it
+    always meets the puck at the same speed. For the arguments see `strike_terms`.
+
+    Returns:
+        The action, and whether it is the strike, (..., 1).
     """
     ee, ee_velocity = observation[..., :3], observation[..., 3:6]
     corner = torch.cat((FINGERS_X + 0 * side, FINGERS_Y * side), -1)
@@ -73,9 +76,9 @@ def strike(
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Strike the puck once, with a corner of the fingers, so that it stops there.
+    """Strike the puck once with a corner of the fingers, so that it stops at the goal.
 
-    The puck leaves along the line from the corner to its centre, or nearly so.
+    The puck leaves nearly along the line from the corner to its centre.
     """
     puck, offset = achieved_goal, (desired_goal - achieved_goal)[..., :2]
     direction = unit(offset)
@@ -88,6 +91,6 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
         return (terms * terms.new_tensor([*polynomial.values()])).sum(-1, keepdim=True)
 
     aim = direction
-    for _ in range(3):  # until the puck, leaving its aim, goes to the goal
+    for _ in range(3):  # correct the aim until the puck goes to the goal
         aim = unit(direction - evaluate(DEVIATION, aim) * side * left)
     return strike(observation, puck, aim, side, evaluate(STRENGTH, aim))[0]

@@ -7,9 +7,10 @@ from torch_panda.experts.moves import CUBE, carry, is_held, norm, push_to
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Carry the lower cube to its goal, then the upper one onto it.
+    """Carry the lower cube to its goal, and then the upper cube onto it.
 
-    A cube that leaves the fingers no room beside the lower one is pushed aside first.
+    If the upper cube leaves no room for the fingers beside the lower cube, the hand
+    pushes it aside first.
     """
     ee, width = observation[..., :3], observation[..., 6:7]
     lower, upper = achieved_goal.split(3, -1)
@@ -25,13 +26,13 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     to_lower, to_upper = norm(ee - lower), norm(ee - upper)
     leave = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
     leave = leave | placed & stacked & (ee[..., 2:] < 0.15)
-    # Rising while the fingers open would take the cube along.
+    # Rise with closed or wide open fingers: opening ones would lift the cube.
     upwards = torch.where((width < 0.02) | (width > 0.06), 1.0, 0.0)
     rise = torch.cat((0 * ee[..., :2], upwards, 0.4 + 0 * width), -1)
     finish = torch.where(stacked, 0.0, carry(ee, width, upper, top, clearance=0.06))
     finish = torch.where(leave, rise, finish)
 
-    # The fingers need room beside the lower cube, where it lies and where it goes.
+    # The fingers need room beside the lower cube and beside its goal.
     room = upper.new_tensor((0.045, 0.085))
 
     def crowds(point: Tensor) -> Tensor:
@@ -40,7 +41,7 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     at = torch.where(crowds(lower) | placed, lower, goal)
     apart = (upper - at)[..., :2]
     along_x = apart[..., :1].abs() > apart[..., 1:].abs()
-    # `push_to` may leave it 3 cm short of there.
+    # `push_to` may leave the cube 3 cm short of this point.
     sign = torch.where(apart < 0, -1.0, 1.0)
     side = at[..., :2] + sign * apart.new_tensor((0.1, 0.125))
     x, y, z = upper.split(1, -1)
@@ -55,7 +56,7 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     blocked = crowds(at) & ~(lower_held | upper_held | placed & on_top)
     action = torch.where(placed, finish, carry(ee, width, lower, goal))
     action = torch.where(blocked, torch.where(leave, rise, clear), action)
-    # What is as it should be, held or not, is not touched again.
+    # Leave two cubes at their goals alone.
     done = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.03
     hold = torch.cat((0 * ee, torch.where(upper_held, -1.0, 0.0)), -1)
     return torch.where(done, hold, action)

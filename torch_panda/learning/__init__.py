@@ -1,1 +1,1 @@
-"""What a training needs beside the agent: buffers, demonstrations, starts, saving."""
+"""Learning: agents, replay buffers, training, evaluation and saved policies."""

@@ -1,7 +1,7 @@
-"""Data augmentation: transitions mirrored, moved over the table.
+"""Data augmentation: mirrors transitions and shifts them over the table.
 
-Such transitions are as possible as those that were seen, nearly: see Invariant
-Transform Experience Replay (arXiv 1909.10707) for mirrors.
+The scene is nearly symmetric, so the augmented transitions are nearly as likely as the
+observed ones. For mirrors see Invariant Transform Experience Replay (arXiv 1909.10707).
 """
 
 import torch
@@ -11,30 +11,30 @@ from torch_panda.learning.geometry import Geometry
 from torch_panda.learning.hyperparameters import AugmentationKind
 from torch_panda.learning.transitions import Transitions
 
-SHIFT = 0.15  # [m], at most, in x and y
+SHIFT = 0.15  # largest shift along x and y [m]
 
 
 class Augmentation:
-    """Changes some rows of a batch.
+    """Augments some rows of a batch.
 
     Args:
-        geometry: of the task.
-        kind: what to do.
+        geometry: Layout of observations, goals and actions.
+        kind: Which augmentation to use.
 
     Raises:
-        ValueError: the robot is not controlled by its end-effector.
+        ValueError: The robot is not under end-effector control.
     """
 
     def __init__(self, geometry: Geometry | None, kind: AugmentationKind) -> None:
         if geometry is not None and geometry.action is None and kind != "none":
             raise ValueError(
-                f"augmentation {kind!r} is for end-effector control: with joint "
-                "control pass --augmentation none"
+                f"augmentation {kind!r} needs end-effector control: for joint control "
+                "pass --augmentation none"
             )
         self.geometry, self.kind = geometry, kind
 
     def __call__(self, rows: Transitions) -> Transitions:
-        """Augment a batch; what was given stays as it is."""
+        """Return an augmented copy of a batch."""
         if self.geometry is not None and self.kind != "none":
             rows = mirror(rows, self.geometry)
             if self.kind == "mirror-shift":
@@ -60,9 +60,9 @@ def mirror(rows: Transitions, geometry: Geometry) -> Transitions:
 
 
 def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions:
-    """Move half of the rows, at random, each by up to ``distance`` in x and y [m].
+    """Shift a random half of the rows by up to ``distance`` along x and y [m].
 
-    Hand, objects and goals move together, as if the robot stood elsewhere.
+    Hand, objects and goals move together, as if the robot's base stood elsewhere.
     """
     offset = torch.empty_like(rows.goal[:, :2]).uniform_(-distance, distance)
     offset *= torch.rand_like(offset[:, :1]) < 0.5

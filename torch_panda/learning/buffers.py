@@ -1,4 +1,4 @@
-"""The replay buffer, and what goes into it."""
+"""Replay buffers with hindsight, and the choice of the episodes to store."""
 
 from typing import Literal
 
@@ -12,11 +12,13 @@ from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "augment", "none"]
 
-K = 4  # hindsight goals to each goal of one's own, as in the panda-gym paper
-BUFFER_SIZE = 1_000_000  # transitions of one's own, as in the panda-gym paper
-SETTLED = 4  # steps in which Slide's puck, which starts in the air, has fallen
-MOVED = 0.01  # [m], or of a quaternion's component
-POSITION = 3  # numbers of an object's part of a goal
+# From the panda-gym paper (arXiv 2106.13687): hindsight goals for each original goal,
+# and the capacity in original transitions.
+K = 4
+BUFFER_SIZE = 1_000_000
+SETTLED = 4  # steps after which Slide's puck, which starts in the air, has fallen
+MOVED = 0.01  # change of a goal that counts as motion: [m], or of a quaternion's entry
+POSITION = 3  # entries of each object in a goal
 STORED_KEYS: list[NestedKey] = [
     "observation",
     "desired_goal",
@@ -39,20 +41,20 @@ def make_buffer(
     desired_ratio: float = 0.0,
     seed: int | None = None,
 ) -> TensorDictReplayBuffer:
-    """The replay buffer with the chosen kind of hindsight, on the environment's device.
+    """Make a replay buffer with hindsight, on the device of the environment.
 
     Args:
-        env: whose transitions will be stored.
-        capacity: how many of them, at most BUFFER_SIZE.
-        her: relabel K of K + 1 sampled transitions ("relabel"), every object's part of
-            their goals on its own ("parts"), store K relabelled copies ("augment"), or
-            none.
-        desired_ratio: of those, the ratio that get the desired goal of another
-            transition; the others get one that their episode reached later.
-        seed: of the goals.
+        env: Environment whose transitions will be stored.
+        capacity: Number of transitions before relabelling, at most `BUFFER_SIZE`.
+        her: "relabel" gives K of K + 1 sampled transitions a hindsight goal. "parts"
+            does so for each object's part of a goal separately. "augment" stores K
+            relabelled copies of each transition. "none" uses the original goals.
+        desired_ratio: Fraction of the hindsight goals that are desired goals of other
+            transitions. The others were achieved later in the same episode.
+        seed: Seed of the choice of goals.
 
     Raises:
-        ValueError: the options do not fit each other or the task.
+        ValueError: ``her`` does not fit the task.
     """
     capacity = min(capacity, BUFFER_SIZE)
     weights = {"future": 1 - desired_ratio, "desired": desired_ratio}
@@ -67,7 +69,8 @@ def make_buffer(
         objects, rest = divmod(env.task.goal_dim, POSITION)
         if her == "parts" and (rest or objects < 2):
             raise ValueError(
-                "--her parts is for goals of several objects, such as Stack"
+                "--her parts needs goals of several objects, such as those of Stack: "
+                "pass --her relabel"
             )
         transform = HindsightRelabel.from_env(
             env,
@@ -81,10 +84,17 @@ def make_buffer(
     return TensorDictReplayBuffer(storage=storage, transform=transform)
 
 
-def moved(data: TensorDictBase) -> Tensor:
-    """Which episodes [num_envs, steps] saw their achieved goal change, (num_envs,).
+def find_motion(data: TensorDictBase) -> Tensor:
+    """Find the episodes in which the achieved goal changed.
 
-    Every hindsight goal of the others is reached without acting (arXiv 2012.08850).
+    Any action reaches the hindsight goals of the other episodes, so these teach little
+    (arXiv 2012.08850).
+
+    Args:
+        data: Episodes [num_envs, steps].
+
+    Returns:
+        Whether the goal changed, (num_envs,) bool.
     """
     goal = data["next", "achieved_goal"]
     goal = goal[:, min(SETTLED, goal.shape[1] // 2) :]
@@ -93,17 +103,20 @@ def moved(data: TensorDictBase) -> Tensor:
 
 
 def select_episodes(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase:
-    """What of whole episodes [num_envs, steps] is stored.
+    """Select the episodes and the entries to store.
 
     Args:
-        data: ends with the last steps that were taken.
-        keep_unmoved: of the episodes in which nothing moved, the ratio to keep.
+        data: Episodes [num_envs, steps].
+        keep_unmoved: Fraction to keep of the episodes in which nothing moved.
+
+    Returns:
+        Episodes [n, steps] with the entries `STORED_KEYS`.
     """
-    # The next batch begins with a reset: an episode that is not over is cut here.
+    # The next batch begins with a reset, so unfinished episodes end here.
     data["next", "done"][:, -1] = True
     data = data.select(*STORED_KEYS)
     if keep_unmoved == 1:
         return data
-    lucky = torch.rand(len(data)) < keep_unmoved
-    rows = moved(data) | lucky.to(data.device)
+    is_kept = torch.rand(len(data)) < keep_unmoved
+    rows = find_motion(data) | is_kept.to(data.device)
     return data[rows]  # type: ignore[return-value]  # a TensorDict

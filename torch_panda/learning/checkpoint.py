@@ -1,4 +1,4 @@
-"""Saving a run and going on with it, bit for bit."""
+"""Saves runs, and resumes them bit for bit."""
 
 import json
 import os
@@ -21,41 +21,44 @@ from torch_panda.learning.policy_files import save_policy
 from torch_panda.learning.recipes import find_changes
 
 LOCK = "run.lock"  # file that the process of a run keeps locked
-RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # what a run must not overwrite
-SAVE_INTERVAL = 20_000  # steps, or imitating gradient steps, from save to save
-# Options in which a run and its continuation may differ.
+RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # files that show a run
+SAVE_INTERVAL = 20_000  # environment steps, or imitation updates, between two saves
+# Options that may differ between a run and its continuation.
 FREE_OPTIONS = {"resume", "out", "video", "imports"}
 
 
 @dataclass
 class Progress:
-    """How far a run is."""
+    """Progress of a run.
+
+    Attributes:
+        steps: Environment steps so far.
+        pretrained: Imitation updates so far.
+        seconds: Time spent on stepping and learning, without evaluations.
+        curve: One row for each evaluation.
+    """
 
     steps: int = 0
-    """of the environments"""
     pretrained: int = 0
-    """gradient steps that only imitated"""
     seconds: float = 0.0
-    """spent on stepping and learning, without evaluations"""
     curve: list[dict[str, float]] = field(default_factory=list)
-    """a row an evaluation"""
 
     @property
     def success(self) -> str:
-        """The last success rate."""
+        """The last success rate in words."""
         return f"{self.curve[-1]['success']:.0%}" if self.curve else "unknown"
 
 
 @dataclass
 class Checkpoint:
-    """What changes in a run; between two iterations it is all that there is to know.
+    """The complete state of a run between two iterations.
 
     Attributes:
-        path: of the file.
-        args: the run's options, a dataclass.
-        agent: with its optimizer.
-        buffer: of the run's own transitions.
-        progress: of the run.
+        path: File of the state.
+        args: Options of the run, a dataclass.
+        agent: Agent with its optimizer.
+        buffer: Replay buffer with the transitions of the run.
+        progress: Progress of the run.
     """
 
     path: Path
@@ -65,7 +68,11 @@ class Checkpoint:
     progress: Progress
 
     def save(self) -> None:
-        """Write the state, and the policy as it is: also one that still imitates."""
+        """Write the state, and the current policy into checkpoint.pt.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
         state = {
             "args": fixed(self.args),
             "agent": self.agent.state_dict(),
@@ -81,10 +88,10 @@ class Checkpoint:
         save_policy(policy, self.agent, self.args.env_id)
 
     def load(self) -> None:
-        """Take what `save` wrote.
+        """Restore the state that `save` wrote.
 
         Raises:
-            ValueError: it is the state of a run with other options, or damaged.
+            ValueError: The file is damaged, or belongs to a run with other options.
         """
         keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
         finite = ("agent", "optimizer")
@@ -97,7 +104,8 @@ class Checkpoint:
         ]
         if differing:
             raise ValueError(
-                f"cannot resume {self.path.parent}: {'; '.join(differing)}"
+                f"cannot resume {self.path.parent} with other options: "
+                f"{'; '.join(differing)}"
             )
         self.agent.load_state_dict(state["agent"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
@@ -105,7 +113,7 @@ class Checkpoint:
         self.buffer.load_state_dict(state["buffer"])
         for name, value in state["progress"].items():
             setattr(self.progress, name, value)
-        # Last: nothing after this draws random numbers before the run goes on.
+        # Last, so that nothing draws random numbers before the run continues.
         torch.set_rng_state(state["random"])
         torch.cuda.set_rng_state_all(state["cuda_random"])
 
@@ -116,9 +124,9 @@ def crossed(interval: int, before: int, after: int) -> bool:
 
 
 def fixed(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
-    """The options that a continuation must share."""
-    every = json.loads(json.dumps(asdict(args), default=str))
-    return {key: value for key, value in every.items() if key not in FREE_OPTIONS}
+    """The options that must be the same when a run is resumed."""
+    options = json.loads(json.dumps(asdict(args), default=str))
+    return {key: value for key, value in options.items() if key not in FREE_OPTIONS}
 
 
 def write_options(
@@ -127,13 +135,16 @@ def write_options(
     default: Any,  # noqa: ANN401 (of the same)
     **more: str,
 ) -> None:
-    """Make a run's folder, with its options in args.json, for plots.
+    """Make the folder of a run and write its options into args.json, for plots.
 
     Args:
-        out: the folder.
-        args: the options.
-        default: what they are compared with, for ``changed``.
-        **more: what the folder is to say besides.
+        out: Folder of the run.
+        args: Options of the run.
+        default: Default options; the file lists the differences under ``changed``.
+        **more: Further entries of the file.
+
+    Raises:
+        OSError: The file cannot be written.
     """
     options = {**more, **asdict(args), "changed": find_changes(args, default)}
     out.mkdir(parents=True, exist_ok=True)
@@ -142,10 +153,10 @@ def write_options(
 
 
 def check_folder(out: Path, *, resume: bool) -> None:
-    """Refuse to overwrite a run, and to continue none.
+    """Check that a folder holds a run to resume, or no run if a new one starts.
 
     Raises:
-        ValueError: says what to do.
+        ValueError: The folder holds a run, or none, or another process uses it.
     """
     if out.exists() and not out.is_dir():
         raise ValueError(f"out must be a folder, got the file {out}")
@@ -153,7 +164,9 @@ def check_folder(out: Path, *, resume: bool) -> None:
         with lock_folder(out):
             pass  # no other process has the lock
     if resume and not (out / "resume.pt").exists():
-        raise ValueError(f"there is no run to resume in {out}")
+        raise ValueError(
+            f"there is no run to resume in {out}: start it without --resume"
+        )
     if not resume and any((out / name).exists() for name in RESULTS):
         raise ValueError(
             f"{out} holds a run: continue it with --resume, remove it, or choose "
@@ -190,7 +203,7 @@ def lock_folder(out: Path) -> Iterator[None]:
 
 
 class StopSignal:
-    """True after Ctrl-C or a SIGTERM; a second one ends the program as usual."""
+    """True after Ctrl-C or SIGTERM. The second signal ends the program as usual."""
 
     def __init__(self) -> None:
         self.received = False
@@ -200,10 +213,10 @@ class StopSignal:
     def _receive(self, number: int, frame: object) -> None:
         self.received = True
         self.release()
-        tqdm.write("stopping after this iteration; again to stop at once")
+        tqdm.write("stopping after this iteration; repeat to stop at once")
 
     def release(self) -> None:
-        """Let the signals act as usual."""
+        """Restore the usual effect of the signals."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 

@@ -1,4 +1,4 @@
-"""The evaluations of a run: a curve that is written, drawn and saved at every point."""
+"""Evaluates the agent of a run, and writes and draws its success curve."""
 
 import csv
 import io
@@ -15,18 +15,18 @@ from torch_panda.learning.plots import plot_curve
 from torch_panda.learning.policy_files import save_policy
 from torch_panda.registry import make
 
-EPISODES = 80  # of an evaluation, all fresh
-NUM_ENVS = 16  # that play them
+EPISODES = 80  # episodes of each evaluation
+NUM_ENVS = 16  # environments that play them in parallel
 
 
 class Curve:
-    """Evaluates an agent.
+    """The success curve of a run.
 
     Args:
-        env_id: the task.
-        agent: whose policy is evaluated.
-        out: the folder of curve.csv, curve.png and checkpoint.pt.
-        device: of the environments.
+        env_id: Id of the environment.
+        agent: Agent whose policy is evaluated.
+        out: Folder of curve.csv, curve.png and checkpoint.pt.
+        device: Device of the environments' outputs.
     """
 
     def __init__(self, env_id: str, agent: Agent, out: Path, *, device: str) -> None:
@@ -34,7 +34,15 @@ class Curve:
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
-        """Evaluate, add a row to the run's curve, write and draw it."""
+        """Evaluate the policy, add a row to the curve, and write and draw the curve.
+
+        Args:
+            progress: Progress of the run, whose curve gets the row.
+            losses: Mean losses since the last evaluation, further columns of the row.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
         reseed(self.env)
         result = evaluate_in(self.env, self.agent.policy, EPISODES)
         row = {
@@ -56,10 +64,10 @@ class Curve:
         save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
 
     def close(self) -> None:
-        """Free the environments."""
+        """Close the environments."""
         self.env.close()
 
 
 def reseed(env: RobotTaskEnv) -> None:
-    """Make the next episodes follow from torch's random state, which runs save."""
+    """Seed the next episodes from torch's global generator, which runs save."""
     env.set_seed(int(torch.randint(2**62, ())))

@@ -1,7 +1,8 @@
-"""What the fingers are told, on a scale where small numbers are far apart.
+"""Finger actions on the scale of cube roots.
 
-A gripper holds a cube more or less firmly by tenths of a millimetre, thousandths of its
-action: less than a network errs by. On the scale of cube roots they are tenths.
+A tenth of a millimetre decides how firmly the fingers hold a cube. That is a thousandth
+of their action, less than the error of a network. On the scale of cube roots it is a
+tenth.
 """
 
 import torch
@@ -9,11 +10,11 @@ from torch import Tensor
 
 
 def to_fine(action: Tensor) -> Tensor:
-    """The fingers' part of actions on the scale of cube roots, (..., n) both."""
+    """Replace the finger entry of actions (..., n) by its cube root."""
     rest, fingers = action[..., :-1], action[..., -1:]
     return torch.cat((rest, fingers.sign() * fingers.abs() ** (1 / 3)), -1)
 
 
 def from_fine(action: Tensor) -> Tensor:
-    """What the environment is given, (..., n) both."""
+    """Undo `to_fine` for actions (..., n)."""
     return torch.cat((action[..., :-1], action[..., -1:] ** 3), -1)

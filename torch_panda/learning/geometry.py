@@ -49,19 +49,20 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Geometry:
-    """Of a task, by the layout of its observations and goals.
+    """Layout and symmetry of observations, goals and actions.
 
     Attributes:
-        later: indices into (observation, goal), of each object and each goal.
-        earlier: of the end-effector for an object, of the object for its goal.
-        observation: factors that mirror an observation, (observation size,).
-        goal: factors that mirror a goal, (goal size,).
-        action: factors that mirror an action; None with joint control.
-        positions: where positions begin in an observation.
-        goal_positions: where they begin in a goal.
-        goal_height: at which goals are shown to networks that see differences of
-            positions [m]; None shows them where they are.
-        orientation: where the quaternion of the object begins in an observation, if
+        later: Indices into (observation, goal) of the positions of objects and goals.
+        earlier: Indices of the positions that are subtracted from them: those of the
+            end-effector for objects, and those of objects for their goals.
+        observation: Factors that mirror an observation, (observation size,).
+        goal: Factors that mirror a goal, (goal size,).
+        action: Factors that mirror an action, (action size,); None for joint control.
+        positions: Indices at which positions start in an observation.
+        goal_positions: Indices at which positions start in a goal.
+        goal_height: Height that replaces the height of all goals if the networks see
+            differences of positions [m]; None leaves the goals as they are.
+        orientation: Index at which the object's quaternion starts in an observation, if
             goals are orientations; else None.
     """
 
@@ -76,18 +77,19 @@ class Geometry:
     orientation: int | None
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Objects from the end-effector and goals from objects, (..., n) [m]."""
+        """Offsets of objects from the hand and of goals from objects, (..., n) [m]."""
         inputs = torch.cat((observation, goal), -1)
         return inputs[..., self.later] - inputs[..., self.earlier]
 
     def turns(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """Orientations as they are for a cube without colours, which has 24 equal ones.
+        """Orientations of a cube without colours, of which 24 look alike.
 
         Returns:
-            the observation with the smallest of the 24; the turn from the cube's
-            orientation to the goal's, a quaternion (..., 4), and its matrix (..., 9);
-            how like the 24 turns that lay a cube straight that from the nearest
-            straight orientation to the goal's is, from 0 to 1, (..., 24).
+            The observation, in which the smallest rotation of the 24 that look alike
+            replaces the cube's. The rotation from the cube to the goal, a quaternion
+            (..., 4). The matrix of this rotation, (..., 9). The similarity of the
+            rotation from the cube's nearest straight orientation to the goal with each
+            of the 24 straight orientations, from 0 to 1, (..., 24).
         """
         assert self.orientation is not None
         place = slice(self.orientation, self.orientation + 4)

@@ -1,6 +1,6 @@
-"""Which numbers the scripts accept: checked before a run starts, not hours into it.
+"""Limits of the commands' options, which are checked before a run starts.
 
-A limit is part of an option's type, such as ``batch_size: Positive``.
+A limit is part of the type of an option, such as ``batch_size: Positive``.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,7 +13,12 @@ import torch
 
 @dataclass(frozen=True)
 class Limit:
-    """What must hold for a number, in words and as a test."""
+    """A limit of a number.
+
+    Attributes:
+        description: The accepted numbers in words.
+        holds: Whether a number is accepted.
+    """
 
     description: str
     holds: Callable[[float], bool]
@@ -31,10 +36,10 @@ Discount = Annotated[float, Limit("above 0 and at most 1", lambda x: 0 < x <= 1)
 
 
 def check_limits(args: object) -> None:
-    """Check a script's options, those that are not None.
+    """Check the options of a command; None is always accepted.
 
     Raises:
-        ValueError: one is outside of what is accepted.
+        ValueError: An option is out of its limits.
     """
     for name, hint in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
@@ -47,7 +52,7 @@ def check_limits(args: object) -> None:
 
 
 def find_limits(hint: Any) -> Iterator[Limit]:  # noqa: ANN401 (any type)
-    """The limits in a type, which may be one in a union or a tuple."""
+    """The limits in a type, also inside a union or a tuple."""
     for part in get_args(hint):
         if isinstance(part, Limit):
             yield part
@@ -56,10 +61,10 @@ def find_limits(hint: Any) -> Iterator[Limit]:  # noqa: ANN401 (any type)
 
 
 def check_device(name: str) -> None:
-    """Try a device.
+    """Check that torch can use a device.
 
     Raises:
-        ValueError: torch cannot use it.
+        ValueError: It cannot.
     """
     try:
         torch.zeros(1, device=name).item()

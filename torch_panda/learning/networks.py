@@ -1,17 +1,17 @@
-"""What actors and critics are made of."""
+"""Networks of actors and critics."""
 
 from torch import nn
 from torchrl.modules import MLP
 
 from torch_panda.learning.hyperparameters import Network
 
-# Units of each of the three hidden layers: as in the panda-gym paper, and as many as a
-# file of 2 MB holds.
+# Units of each of the three hidden layers: the panda-gym paper's number, and the most
+# for which a policy's file stays below 2 MB.
 HIDDEN_SIZE, WIDE_SIZE = 256, 448
 
 
 def make_mlp(inputs: int, outputs: int, network: Network) -> MLP:
-    """Three hidden layers; several inputs, (..., n) each, are concatenated."""
+    """Make a network with three hidden layers that concatenates its inputs."""
     size = WIDE_SIZE if network == "wide" else HIDDEN_SIZE
     is_normalized = network != "paper"
     norm = {"normalized_shape": size}

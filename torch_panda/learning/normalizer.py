@@ -1,4 +1,4 @@
-"""What the networks see: observation and goal, standardised."""
+"""Inputs of the networks: observation and goal, standardised."""
 
 import torch
 from torch import Tensor, nn
@@ -6,9 +6,9 @@ from torch import Tensor, nn
 from torch_panda.learning.hyperparameters import RelativeInputs
 from torch_panda.learning.spaces import Spaces
 
-CLIP_OBSERVATION = 200.0  # the panda-gym paper
-CLIP_NORMALIZED = 5.0  # OpenAI Baselines' HER
-FINE = 0.03  # [m], where "fine" differences are clipped
+CLIP_OBSERVATION = 200.0  # from the panda-gym paper
+CLIP_NORMALIZED = 5.0  # from the HER of OpenAI Baselines
+FINE = 0.03  # limit at which "fine" differences are clipped [m]
 
 
 class Normalizer(nn.Module):
@@ -42,7 +42,7 @@ class Normalizer(nn.Module):
         self.register_buffer("std", torch.ones(size))
 
     def update(self, observation: Tensor, goal: Tensor) -> None:
-        """Take more rows, (..., size of each), into the statistics."""
+        """Add observations and goals, (..., size) each, to the statistics."""
         rows = self._inputs(observation, goal).flatten(0, -2).double()
         self.count += len(rows)
         self.total += rows.sum(0)
@@ -53,7 +53,7 @@ class Normalizer(nn.Module):
         self.std.copy_(variance.sqrt())
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Standardise (..., size of each) to (..., size)."""
+        """Standardise observations and goals, (..., size) each."""
         normalized = (self._inputs(observation, goal) - self.mean) / self.std
         return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 

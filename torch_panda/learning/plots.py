@@ -1,8 +1,8 @@
-"""Draws success curves: a panel a task, a line an algorithm and a way to train it.
+"""Draws success curves of runs: one panel per task, one line per way to train.
 
-Reads every folder below the given ones that holds a run (args.json and curve.csv).
-Draws the median and the interquartile range over the seeds, as the panda-gym paper. A
-panel has four lines at most: a task with more has a panel for each algorithm.
+A run is a folder with args.json and curve.csv. A line is the median over the seeds, and
+a band shows the interquartile range, as in the panda-gym paper. A panel has at most
+four lines. A task with more lines has a panel for each algorithm.
 """
 
 import csv
@@ -19,16 +19,17 @@ from torch_panda.learning import files
 
 Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
-LINES = 4  # of a panel, at most
-COLUMNS = 3  # of panels, at most
-LABEL_WIDTH = 56  # characters; longer labels are broken: a legend takes room
-# Okabe and Ito's, which can be told apart by everybody; then with other dashes.
+LINES = 4  # largest number of lines in a panel
+COLUMNS = 3  # largest number of panels side by side
+LABEL_WIDTH = 56  # characters after which a label is wrapped
+# Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 DASHES = ("-", "--", ":", "-.")
 
-Lines = dict[str, list[Curve]]  # of the seeds, by name
-# By way to train, within an algorithm, within a task.
+Lines = dict[str, list[Curve]]
+"""The curves of all seeds, by the label of the way to train."""
 Runs = dict[str, dict[str, Lines]]
+"""Lines by algorithm, by task."""
 
 
 def plot_curve(curve: Curve, title: str, path: Path) -> None:
@@ -55,9 +56,13 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     """Draw median and interquartile range over seeds.
 
     Args:
-        runs: the curves.
-        metric: the column to draw.
-        path: where to write the picture.
+        runs: Curves of the runs.
+        metric: Column of the curves to draw.
+        path: Picture to write.
+
+    Raises:
+        OSError: The picture cannot be written.
+        ValueError: The ending of its name is not a format.
     """
     panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
     names = sorted({name for _, lines in panels for name in lines})
@@ -76,28 +81,34 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
 
 
 def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
-    """The panels of a task: titles, and at most `LINES` lines in each.
+    """Distribute the lines of a task over panels.
 
-    All algorithms share one where they fit, else each has its own.
+    All algorithms share a panel if it has at most `LINES` lines. Otherwise each
+    algorithm has its own panels.
+
+    Returns:
+        Title and lines of each panel.
     """
-    own = {
+    by_algorithm = {
         algo: {f"{algo}, {way}": curves for way, curves in sorted(ways.items())}
         for algo, ways in sorted(algorithms.items())
     }
     together = {
-        name: curves for lines in own.values() for name, curves in lines.items()
+        name: curves
+        for lines in by_algorithm.values()
+        for name, curves in lines.items()
     }
     if len(together) <= LINES:
         return [(task, together)]
     return [
         (f"{task}, {algo}", dict(list(lines.items())[first : first + LINES]))
-        for algo, lines in own.items()
+        for algo, lines in by_algorithm.items()
         for first in range(0, len(lines), LINES)
     ]
 
 
 def next_look(number: int) -> dict[str, str]:
-    """Colour and dashes of a line: no two of the first 28 are alike."""
+    """Colour and dashes of a line; the first 28 lines differ."""
     dashes, color = divmod(number, len(COLORS))
     return {"color": COLORS[color], "linestyle": DASHES[dashes % len(DASHES)]}
 
@@ -108,9 +119,9 @@ def draw_panel(
     metric: Metric,
     looks: dict[str, dict[str, Any]],
 ) -> None:
-    """Draw lines, each with a band over its seeds."""
+    """Draw lines with a band over their seeds."""
     for name, curves in lines.items():
-        # Seeds that are still running end earlier: up to where all have come.
+        # Unfinished seeds are shorter, so use the steps that all seeds have.
         points = [{row["step"]: row[metric] for row in curve} for curve in curves]
         steps = sorted(set.intersection(*map(set, points)))
         values = np.array([[curve[step] for step in steps] for curve in points])
@@ -124,10 +135,10 @@ def draw_panel(
 
 
 def read_runs(folders: list[Path]) -> Runs:
-    """Read the curves below some folders.
+    """Read the curves of all runs below some folders.
 
     Raises:
-        ValueError: there is no run, or what one of them holds cannot be read.
+        ValueError: There is no run, or a run cannot be read.
     """
     runs: Runs = {}
     for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
@@ -143,18 +154,21 @@ def read_runs(folders: list[Path]) -> Runs:
                     for row in csv.DictReader(file)
                 ]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path.parent} holds no run: {error!r}") from None
+            raise ValueError(f"cannot read the run {path.parent}: {error!r}") from None
         if curve:
             lines = runs.setdefault(task, {}).setdefault(algo, {})
             lines.setdefault(line, []).append(curve)
     if not runs:
         names = ", ".join(map(str, folders))
-        raise ValueError(f"no run (args.json, curve.csv) below {names}")
+        raise ValueError(
+            f"there is no run below {names}: a run is a folder with args.json and "
+            "curve.csv"
+        )
     return runs
 
 
 def line_label(preset: str, changed: dict[str, object]) -> str:
-    """Name what sets a run apart from others of its task and algorithm."""
+    """Label of a way to train: its preset and the options that differ from it."""
     parts = [preset]
     for key, value in changed.items():
         name = key.replace("_", " ")

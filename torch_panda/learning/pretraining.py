@@ -1,4 +1,4 @@
-"""Gradient steps that only imitate demonstrations, before or without rewards."""
+"""Imitation of demonstrations by gradient steps, before or without rewards."""
 
 import time
 
@@ -10,7 +10,7 @@ from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint
 
 
 def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:
-    """A buffer that holds these transitions with their own goals."""
+    """Make a buffer that holds these transitions with their original goals."""
     storage = LazyTensorStorage(len(demos), device=demos.device or "cpu")
     buffer = TensorDictReplayBuffer(storage=storage)
     buffer.extend(demos)
@@ -26,15 +26,17 @@ def pretrain(
     learning_rate: float = 1.0,
     stop: object = False,
 ) -> None:
-    """Take gradient steps that only imitate, from where the run is, and save it.
+    """Imitate demonstrations, from the current progress of a run on, and save the run.
+
+    The learning rate falls linearly to 0.
 
     Args:
-        checkpoint: of the run.
-        demos: to imitate.
-        updates: gradient steps, over all.
-        batch_size: transitions per gradient step.
-        learning_rate: at first, of that of training; it falls to 0 meanwhile.
-        stop: ends this early when it is true.
+        checkpoint: State of the run.
+        demos: Demonstrations.
+        updates: Number of gradient steps, with those that the run has taken already.
+        batch_size: Transitions per gradient step.
+        learning_rate: Factor on the learning rate of training, at the first step.
+        stop: Ends the imitation early when it is true.
     """
     agent, progress = checkpoint.agent, checkpoint.progress
     bar = tqdm(

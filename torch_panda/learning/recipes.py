@@ -1,7 +1,7 @@
-"""The options of ``train.py --preset tuned``: what this library learned a task with.
+"""Recipes: the options of ``train --preset tuned`` for each task.
 
-What a recipe leaves out is as in the panda-gym paper, the default. Options given on the
-command line come before a recipe's.
+Options that a recipe leaves out have the default, which is the panda-gym paper's. An
+option on the command line overrides the recipe.
 """
 
 from dataclasses import asdict
@@ -20,7 +20,7 @@ from torch_panda.tasks import (
     Task,
 )
 
-# Every object task: hindsight about what moved, and symmetry.
+# Shared by all tasks with objects.
 OBJECT: dict[str, Any] = {
     "num_envs": 8,
     "gamma": 0.95,
@@ -29,21 +29,21 @@ OBJECT: dict[str, Any] = {
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
 }
-# What is no other way to train: other runs of the same line in a plot.
+# Options that do not make another way to train, so not another line in a plot.
 PLAIN_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
     *("out", "resume", "device", "video", "imports"),
 }
-# What joint control cannot do.
+# Options that need end-effector control.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
 RECIPES: dict[type[Task], dict[str, Any]] = {
     Reach: {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
-    # One environment takes no random actions, and the last one half: learned twice as
-    # soon as with 30 to 100 %.
+    # The first environment takes no random actions, and the last one half of them. The
+    # policy learns in half the steps that it needs with 30 to 100 %.
     Push: {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
-    # Goals out of reach are seldom achieved: some of the batch get them all the same.
-    # One environment takes no random actions: where the puck stops depends on the whole
-    # strike, and no strike of which a third is random shows where a clean one leads.
+    # Goals out of reach are rarely achieved, so half of the hindsight goals are desired
+    # goals of other transitions. The first environment takes no random actions: the
+    # whole strike decides where the puck stops, and random actions spoil most strikes.
     Slide: {
         "num_envs": 8,
         "gamma": 0.98,
@@ -60,7 +60,8 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 1_000_000,
         "eval_interval": 25_000,
     },
-    # Seldom lifted by chance: half of the episodes begin with the cube in the hand.
+    # Random actions rarely lift the cube, so half of the episodes start with the cube
+    # in the hand.
     PickAndPlace: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -69,8 +70,8 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 200_000,
         "eval_interval": 10_000,
     },
-    # A stack is many steps, and seldom done by a hand that acts at random: most
-    # episodes begin in its course, and each cube has a hindsight of its own.
+    # Random actions rarely stack cubes, so most episodes start in the middle of the
+    # task, and each cube gets hindsight goals of its own.
     Stack: {
         **OBJECT,
         "gamma": 0.98,
@@ -82,8 +83,8 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 1_000_000,
         "eval_interval": 20_000,
     },
-    # By imitation; not yet learned from rewards. A firm grasp and one in which the cube
-    # swings are tenths of a millimetre apart.
+    # For imitation; rewards alone have not solved the task. Tenths of a millimetre
+    # separate a firm grasp from one in which the cube swings.
     Flip: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -92,7 +93,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 1_000_000,
     },
     Drawer: {**OBJECT, "anneal_lr": True, "total_steps": 20_000},
-    # By imitation; not yet known to work without demonstrations.
+    # For imitation; not tested without demonstrations.
     PegInsertion: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -117,9 +118,9 @@ def find_recipe(env_id: str) -> dict[str, Any]:
 
 
 def find_changes(args: Any, default: Any) -> dict[str, Any]:  # noqa: ANN401 (dataclasses)
-    """The options that make another way to train of a preset's, for plots' labels."""
-    ours, others = asdict(args), asdict(default)
+    """The options that differ from the default, for the labels of plots."""
+    options, defaults = asdict(args), asdict(default)
     plain = PLAIN_OPTIONS
-    if ours.get("anneal_lr"):  # by when the learning rate has fallen
+    if options.get("anneal_lr"):  # then the learning rate depends on the total steps
         plain = plain - {"total_steps"}
-    return {k: x for k, x in ours.items() if x != others[k] and k not in plain}
+    return {k: x for k, x in options.items() if x != defaults[k] and k not in plain}

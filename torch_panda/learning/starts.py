@@ -1,9 +1,9 @@
-"""Training episodes that begin in the course of their task.
+"""Training episodes that start in the middle of their task.
 
-As long as nothing moves an object, hindsight goals teach nothing about it. The authors
-of HER began half of the episodes of pick-and-place in one state in which the box is
-grasped (arXiv 1707.01495, section 4.1), Lanier et al. stacks with some blocks in place
-(arXiv 1906.03710). Here a scripted hand makes such states.
+Hindsight goals teach nothing about an object until something moves it. The authors of
+HER started half of the episodes of pick-and-place with the box in the hand (arXiv
+1707.01495, section 4.1). Lanier et al. started with some blocks stacked (arXiv
+1906.03710). Here a scripted hand makes such states.
 """
 
 from math import pi
@@ -17,36 +17,36 @@ from torch_panda.learning.geometry import read_geometry
 from torch_panda.registry import make
 from torch_panda.tasks import Flip, Push, Slide, Stack
 
-APPROACH = 45  # steps
-# How far beside an object a hand that cannot grasp stops, between the centres [m]: the
-# fingers, at most 2.3 cm long and wide, do not touch a cube or puck there.
+APPROACH = 45  # steps that the scripted hand takes
+# Distance at which a hand with a blocked gripper stops beside an object, between the
+# centres [m]. The fingers, at most 2.3 cm long and wide, do not touch the object there.
 GAP = (0.055, 0.08)
-# How high an object is held, of several the last, when the first is placed below [m].
+# Height at which the hand holds the last of several objects above the first [m].
 LIFTED = (0.12, 0.2)
-ROOM = 0.08  # [m] between the centres of two objects
-OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # the action of a hand that waits
+ROOM = 0.08  # smallest distance between the centres of two objects [m]
+OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # action of a hand that waits
 PHYSICAL = ["joint_position", "joint_velocity", "object_pose", "object_velocity"]
 
 
 def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict:
-    """States in which the hand holds an object, or is beside one if it cannot grasp.
+    """Make states in which the hand holds an object, or is beside it.
 
-    Where there are two objects they take turns; in half of the states the first can be
-    put anywhere, and the last one is held up, or lies there yet.
+    With two objects, the states take them in turn. In half of these states the first
+    object can be placed anywhere, and the last one is held up or lies on the table.
 
     Args:
-        env_id: one of torch_panda.ENV_IDS.
-        seed: of the objects' positions and of the hand's side.
-        number: how many to try.
+        env_id: Id of the environment.
+        seed: Seed of the objects' positions and of the side on which the hand stops.
+        number: Number of attempts.
 
     Returns:
-        What `RobotTaskEnv.get_state` says of robot and objects, and whether the first
-        object can be ``placed``, (n,), n at most ``number``: approaches that failed are
-        left out.
+        States (n,) of robot and objects as in `RobotTaskEnv.get_state`, and whether the
+        first object can be ``placed``. Failed attempts are left out, so n is at most
+        ``number``.
 
     Raises:
-        ValueError: the task has no objects on the table, or control is not of the
-            end-effector.
+        ValueError: The task has no objects on the table, or the robot is not under
+            end-effector control.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -55,11 +55,12 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
 
     with make(env_id, num_envs=number, seed=seed) as env, torch.no_grad():
         geometry = read_geometry(env)
-        lies = isinstance(env.task, Push | Slide | Stack | Flip)
-        if geometry is None or geometry.action is None or not lies:
+        has_objects = isinstance(env.task, Push | Slide | Stack | Flip)
+        if geometry is None or geometry.action is None or not has_objects:
             raise ValueError(
-                "starts at objects need end-effector control and a task with objects "
-                f"on the table, got {env_id}"
+                "start_at_object needs end-effector control and one of the tasks Push, "
+                f"PickAndPlace, Slide, Stack and Flip, got {env_id}: pass "
+                "--start-at-object 0"
             )
         _, *objects = geometry.positions
         last = objects[-1]
@@ -92,11 +93,11 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
 
 
 class StartFrom(Transform):
-    """Lets some episodes begin in one of these states, with their own goals.
+    """Starts some episodes in given states, with the goals that the episodes have.
 
     Args:
-        states: of `states_at_objects`, (n,).
-        ratio: of the episodes that begin so, chosen at random by torch's generator.
+        states: States (n,) of `states_at_objects`.
+        ratio: Fraction of the episodes; torch's global generator chooses them.
     """
 
     def __init__(self, states: TensorDict, ratio: float) -> None:
@@ -120,18 +121,18 @@ class StartFrom(Transform):
         state = self.states[drawn].clone()  # type: ignore[assignment]  # a TensorDict
         placed: torch.Tensor = state.pop("placed")
         placed = placed.squeeze(-1)
-        if placed.any():  # the first object is where the episode's goal has it
+        if placed.any():  # put the first object at the goal of its episode
             goal = tensordict_reset["desired_goal"].to(state["object_pose"])
             rest = goal.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goal), 4)
             pose, last = torch.cat((goal[:, :3], rest), 1), state["object_pose"][:, -1]
-            # There it must not meet the other one.
+            # It must not touch the other object there.
             free = (pose - last)[:, :3].norm(dim=1) > ROOM
             chosen &= (free | ~placed).unsqueeze(-1)
             if not chosen.any():
                 return tensordict_reset
             state["object_pose"][placed, 0] = pose[placed]
             state["object_velocity"][placed, 0] = 0.0
-        # With what was observed: torchrl takes it where nothing is reset again.
+        # Keep the observations of environments that are not reset again.
         start = tensordict_reset.copy().update(state.to(env.device))
         start = env.reset(start.set("_reset", chosen.to(env.device)), set_state=True)
         return start.select(*tensordict_reset.keys(True, True))

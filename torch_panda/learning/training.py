@@ -1,9 +1,9 @@
 """The training loop: episodes of parallel environments, then gradient steps.
 
-An iteration is one episode of every environment, then the gradient steps due for it, so
-that between two iterations a run is its weights, its buffer and its random numbers, and
-`--resume` continues it bit for bit. Gradient steps use as many threads as
-OMP_NUM_THREADS says, or one.
+An iteration is one episode of every environment and the gradient steps that are due
+after it. Between two iterations, the state of a run is its weights, its buffer and its
+random generators, so `--resume` continues it bit for bit. Gradient steps use
+OMP_NUM_THREADS threads, by default one.
 """
 
 import os
@@ -34,22 +34,23 @@ from torch_panda.learning.pretraining import make_demo_buffer, pretrain
 from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
-DEMO_RATIO = 0.25  # of each batch: what is drawn from the demonstrations, if any
-STARTED_STEPS = 50  # of an episode at most, where some begin in the course of the task
-KEEP_UNMOVED = 0.1  # --preset tuned: of the episodes in which nothing moved
+DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
+STARTED_STEPS = 50  # longest episode if some start in the middle of the task
+# Fraction of the episodes in which nothing moved that --preset tuned keeps.
+KEEP_UNMOVED = 0.1
 
 
 class Run:
-    """A training: what it is made of, and the algorithm.
+    """A training with its environments, agent and replay buffer.
 
     Args:
-        args: the options.
-        out: the folder of the results.
-        demos: transitions (n,) to learn from beside the run's own; see
-            `torch_panda.datasets.read_demos`.
+        args: Options of the training.
+        out: Folder of the results.
+        demos: Demonstrations (n,) of `torch_panda.datasets.read_demos`, from which the
+            agent learns too.
 
     Raises:
-        ValueError: options do not fit each other, the task or the files.
+        ValueError: Options do not fit each other, the task or the files.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class Run:
     ) -> None:
         self.args, self.out = args, out
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-        # Permits bfloat16; on CPUs with AVX-512 it selects oneDNN, up to twice as fast.
+        # On CPUs with AVX-512 this selects oneDNN, which is up to twice as fast.
         torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
         randomize = None
@@ -84,7 +85,7 @@ class Run:
             desired_ratio=args.desired_ratio,
             seed=args.seed,
         )
-        self.num_demos = 0  # of each batch
+        self.num_demos = 0  # demonstrations in each batch
         if demos is not None:
             demos = demos.to(self.env.device)
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
@@ -94,7 +95,7 @@ class Run:
         if args.start_at_object:
             states = states_at_objects(args.env_id, seed=args.seed)
             env = TransformedEnv(env, StartFrom(states, args.start_at_object))
-        # Whole episodes of all environments, one batch [num_envs, steps] each time.
+        # Each batch [num_envs, steps] has one whole episode of every environment.
         self.collector = Collector(
             env,
             self.agent.explore,
@@ -114,14 +115,17 @@ class Run:
             self.checkpoint.load()
 
     def train(self, stop: object = False) -> bool:
-        """Learn until the last step, or until ``stop`` is true after an iteration.
+        """Train until the last step, or until ``stop`` is true after an iteration.
 
         Returns:
-            whether the last step was reached.
+            Whether the training reached the last step.
+
+        Raises:
+            OSError: A file cannot be written.
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if not progress.curve:
-            # A run that is killed before its first evaluation can be resumed, too.
+            # Save first, so that a run killed in this evaluation can be resumed.
             checkpoint.save()
             self.curve.add(progress)  # the untrained policy
             checkpoint.save()
@@ -131,7 +135,7 @@ class Run:
             if progress.pretrained < count:
                 return False
         if args.pretrain_updates and len(progress.curve) == 1:
-            self.curve.add(progress)  # what was imitated
+            self.curve.add(progress)  # the policy after imitation
             checkpoint.save()
 
         bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
@@ -159,12 +163,12 @@ class Run:
         return finished
 
     def store(self, data: TensorDictBase) -> None:
-        """Put episodes [num_envs, steps] into the buffer and into the statistics."""
+        """Add episodes [num_envs, steps] to the buffer and to the normaliser."""
         keep_unmoved = KEEP_UNMOVED if self.args.preset == "tuned" else 1.0
         data = select_episodes(data, keep_unmoved)
         if len(data):
             stored = self.buffer[self.buffer.extend(data.reshape(-1))]
-            # As in Baselines, the statistics are of relabelled episodes.
+            # As in Baselines, the statistics include the hindsight goals.
             normalizer = self.agent.normalizer
             normalizer.update(stored["observation"], stored["desired_goal"])
 
@@ -172,7 +176,7 @@ class Run:
         """Take the gradient steps that are due.
 
         Returns:
-            the mean of each loss.
+            The mean of each loss.
         """
         args, agent = self.args, self.agent
         losses: dict[str, list[Tensor]] = defaultdict(list)
@@ -189,6 +193,6 @@ class Run:
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
 
     def close(self) -> None:
-        """Free the environments."""
+        """Close the environments."""
         self.collector.shutdown()
         self.curve.close()

@@ -1,4 +1,4 @@
-"""A batch of transitions, as plain tensors: cheaper to pass on than TensorDicts."""
+"""Batches of transitions as plain tensors, which cost less time than TensorDicts."""
 
 from typing import NamedTuple
 
@@ -7,15 +7,15 @@ from torch import Tensor
 
 
 class Transitions(NamedTuple):
-    """Of n rows, as sampled from a replay buffer.
+    """n transitions from a replay buffer.
 
     Attributes:
-        observation: (n, observation size).
-        goal: desired before and after the step, (n, goal size).
-        action: (n, action size).
-        reward: (n, 1).
-        terminated: whether no return follows, (n, 1) bool.
-        next_observation: (n, observation size).
+        observation: Observations before the step, (n, observation size).
+        goal: Desired goals before and after the step, (n, goal size).
+        action: Actions, (n, action size).
+        reward: Rewards, (n, 1).
+        terminated: Whether the step ends the return, (n, 1) bool.
+        next_observation: Observations after the step, (n, observation size).
     """
 
     observation: Tensor
@@ -27,7 +27,7 @@ class Transitions(NamedTuple):
 
     @classmethod
     def from_tensordict(cls, batch: TensorDictBase) -> "Transitions":
-        """Take what an agent learns from out of a batch with torchrl's keys."""
+        """Read the transitions from a batch with torchrl's keys."""
         following = batch.get("next")
         return cls(
             batch.get("observation"),

@@ -1,6 +1,6 @@
 """Videos of a policy in several environments side by side.
 
-Goals are drawn translucent; every cell says its step and turns green on success.
+Goals are translucent. Every cell shows its step, and its frame turns green on success.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.files import prepare
 
 CELL = (240, 320)  # height and width [pixels]
-FPS = 25  # real time: the control frequency
+FPS = 25  # frames per second, in real time: the control frequency
 BORDER = 4  # [pixels]
 GREEN, GREY = (40, 170, 70), (120, 120, 120)
 
@@ -30,13 +30,13 @@ def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
     """Write one episode of each environment into a video.
 
     Args:
-        env: batched environment.
-        policy: gives ``action``; run without exploration noise.
-        path: an .mp4 or .gif file.
+        env: Batch of environments.
+        policy: Policy that writes ``action``; it runs without exploration noise.
+        path: An .mp4 or .gif file.
 
     Raises:
-        ValueError: the file's name ends otherwise.
-        OSError: the file could not be written.
+        ValueError: The name of the file has another ending.
+        OSError: The file cannot be written.
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"a video's name must end in .mp4 or .gif, got {path.name!r}")
@@ -54,7 +54,7 @@ def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
 
 
 def play(env: RobotTaskEnv, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
-    """Run an episode: what it starts with, and what every step leads to."""
+    """Run one episode, and yield its start and the result of every step."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
         yield state
@@ -64,7 +64,7 @@ def play(env: RobotTaskEnv, policy: TensorDictModuleBase) -> Iterator[TensorDict
 
 
 def draw(env: RobotTaskEnv, state: TensorDictBase, step: int) -> npt.NDArray[np.uint8]:
-    """All environments in one picture, with step and success, (height, width, 3)."""
+    """Draw all environments into one picture, (height, width, 3)."""
     cells = []
     for pixels, success in zip(env.render(size=CELL), state["success"], strict=True):
         cell = Image.fromarray(pixels.cpu().numpy())
@@ -78,7 +78,7 @@ def draw(env: RobotTaskEnv, state: TensorDictBase, step: int) -> npt.NDArray[np.
 
 
 def tile(cells: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
-    """Lay pictures of one size out in rows, about as many as columns."""
+    """Join pictures of one size to a grid, about as wide as high."""
     columns = int(np.ceil(np.sqrt(len(cells))))
     rows = int(np.ceil(len(cells) / columns))
     empty = np.full_like(cells[0], 255)

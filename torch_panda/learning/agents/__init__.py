@@ -1,4 +1,4 @@
-"""DDPG, TD3, SAC and TQC for goal-conditioned tasks: a class an algorithm."""
+"""Agents for goal-conditioned tasks: DDPG, TD3, SAC and TQC."""
 
 import torch
 
@@ -17,6 +17,14 @@ __all__ = ["AGENTS", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
 
 
 def make_agent(env: RobotTaskEnv, hp: Hyperparameters) -> Agent:
-    """An untrained agent on the environment's device."""
+    """Make an untrained agent on the device of an environment.
+
+    Args:
+        env: Environments in which the agent will explore.
+        hp: Hyperparameters.
+
+    Raises:
+        ValueError: The hyperparameters do not fit the environment.
+    """
     with torch.device(env.device or "cpu"):
         return AGENTS[hp.algo](read_spaces(env), hp)

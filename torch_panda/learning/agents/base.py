@@ -1,4 +1,4 @@
-"""What all agents share: inputs, exploration, gradient steps and target networks."""
+"""Base class of the agents: inputs, exploration, gradient steps, target networks."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -18,24 +18,29 @@ from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
 STATE_KEYS: list[NestedKey] = ["observation", "desired_goal"]
-LEARNING_RATE = 1e-3  # the panda-gym paper, for actor and critic
-TAU = 0.05  # how far a target network moves towards its network (Polyak 0.95)
+LEARNING_RATE = 1e-3  # of actor and critic, from the panda-gym paper
+TAU = 0.05  # fraction that target networks move towards their networks
 
 
 class Agent(nn.Module, ABC):
-    """A policy, how it explores, and how it learns.
+    """A policy with its exploration and its learning algorithm.
 
     Args:
         spaces: Sizes and layout of observations, goals and actions.
         hp: Hyperparameters.
 
     Attributes:
-        normalizer: standardises observation and goal.
-        policy: TensorDictModule from ``observation`` and ``desired_goal`` to
-            ``action``; deterministic under ``ExplorationType.DETERMINISTIC``.
-        explore: the policy with the algorithm's exploration noise.
-        optimizer: of all networks that learn.
-        updates: gradient steps so far.
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
+        normalizer: Standardises observations and goals.
+        policy: Module from ``observation`` and ``desired_goal`` to ``action``, which is
+            deterministic under ``ExplorationType.DETERMINISTIC``.
+        explore: The policy with the exploration noise of the algorithm.
+        optimizer: Optimizer of all networks that learn.
+        updates: Number of gradient steps so far.
+
+    Raises:
+        ValueError: The hyperparameters do not fit the spaces.
     """
 
     policy: TensorDictModuleBase
@@ -58,12 +63,12 @@ class Agent(nn.Module, ABC):
         noise: Sequence[TensorDictModuleBase],
         trained: Sequence[Tensor],
     ) -> None:
-        """Put together what an algorithm has made, at the end of its constructor.
+        """Assemble policy, exploration and optimizer; a constructor ends with it.
 
         Args:
-            actor: from ``normalized`` to ``action``.
-            noise: modules that change ``action`` to explore.
-            trained: the parameters of the optimizer.
+            actor: Module from ``normalized`` to ``action``.
+            noise: Modules that change ``action`` for exploration.
+            trained: Parameters that the optimizer changes.
         """
         normalize = TensorDictModule(self.normalizer, STATE_KEYS, ["normalized"])
         last: list[TensorDictModuleBase] = []
@@ -93,10 +98,10 @@ class Agent(nn.Module, ABC):
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None
     ) -> dict[str, Tensor]:
-        """One gradient step on a batch of transitions, and one of demonstrations.
+        """Take one gradient step on a batch of transitions and demonstrations.
 
         Returns:
-            the losses, scalars without gradients.
+            The losses, scalars without gradients.
         """
         rows = Transitions.from_tensordict(batch)
         num_demos = 0
@@ -122,13 +127,13 @@ class Agent(nn.Module, ABC):
         """Compute the losses and their gradients.
 
         Args:
-            state: what the networks see of each row, (n, state size).
-            next_state: the same after the step, (n, state size).
-            rows: the transitions.
-            num_demos: how many of them are demonstrations, the last ones.
+            state: Inputs of the networks before the step, (n, state size).
+            next_state: Inputs of the networks after the step, (n, state size).
+            rows: The transitions; demonstrations are the last rows.
+            num_demos: Number of demonstrations.
 
         Returns:
-            the losses, scalars.
+            The losses, scalars.
         """
 
     @abstractmethod
@@ -136,14 +141,14 @@ class Agent(nn.Module, ABC):
         """Move the target networks towards their networks, by TAU."""
 
     def imitate(self, demos: TensorDictBase) -> Tensor:
-        """One gradient step of the policy alone, towards actions of demonstrations.
+        """Take one gradient step of the policy towards demonstrated actions.
 
-        Differences are absolute, as in ACT (arXiv 2304.13705): where a demonstrator
-        does one of two things, what differs least from both is the more frequent one.
-        The least squares are between the two, where it does neither.
+        The loss is the mean absolute difference, as in ACT (arXiv 2304.13705). If a
+        demonstrator does one of two things, this loss leads to the more frequent one. A
+        squared loss would lead to an action between the two.
 
         Returns:
-            the mean absolute difference, a scalar.
+            The loss, a scalar without gradients.
         """
         rows = self._prepare(Transitions.from_tensordict(demos))
         states = dict(zip(STATE_KEYS, (rows.observation, rows.goal), strict=True))
@@ -158,14 +163,14 @@ class Agent(nn.Module, ABC):
         return loss.detach()
 
     def _prepare(self, rows: Transitions) -> Transitions:
-        """Augment a batch, and scale its actions as networks see them."""
+        """Augment a batch, and scale its actions as the networks do."""
         rows = self.augmentation(rows)
         if self.hp.fine_fingers:
             rows = rows._replace(action=to_fine(rows.action))
         return rows
 
     def set_learning_rate(self, factor: float) -> None:
-        """Let the next gradient steps have so much of the learning rate."""
+        """Multiply the learning rate of the next gradient steps by a factor."""
         for group in self.optimizer.param_groups:
             group["lr"] = factor * LEARNING_RATE
 

@@ -19,16 +19,16 @@ from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
-# Weight of the squares of what enters the actor's tanh: where tanh is flat no gradient
-# is left, and policies of Slide were lost so (arXiv 1707.01495, appendix A).
+# Weight of the squared inputs of the actor's tanh. Large inputs make gradients vanish,
+# which ruined policies of Slide (arXiv 1707.01495, appendix A).
 SATURATION_L2 = 0.01
 
 
 class DDPG(Agent):
-    """One critic, whose gradient by the action trains a deterministic actor."""
+    """A critic, and a deterministic actor that ascends the critic's value."""
 
     num_critics = 1
-    actor_interval = 1  # gradient steps of the critics to one of the actor
+    actor_interval = 1  # gradient steps of the critics for each one of the actor
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
@@ -51,7 +51,7 @@ class DDPG(Agent):
             random_action = self.random_points()
         else:
             random_action = EGreedyModule(action_spec)
-            # (num_envs,): compared with one random number per environment.
+            # (num_envs,), so each environment has a probability of its own.
             random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
         self.actor_parameters = list(self.actor.parameters())
         self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
@@ -66,13 +66,13 @@ class DDPG(Agent):
         )
 
     def target_action(self, next_state: Tensor) -> Tensor:
-        """The action whose value is the target's, (n, action size)."""
+        """Action in the target of the critics, (n, action size)."""
         return self.target_actor(next_state)
 
     def backward(
         self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
-        """Regress the critics to their target, and let the actor ascend the first."""
+        """Regress the critics to their target, and let the actor ascend one of them."""
         with torch.no_grad():
             action = self.target_action(next_state)
             values = [critic(next_state, action) for critic in self.target_critics]
@@ -98,7 +98,7 @@ class DDPG(Agent):
             actor_loss = actor_loss + imitation_loss(
                 action[demos], rows.action[demos], value[demos], values[0][demos]
             )
-        actor_loss.backward(inputs=self.actor_parameters)  # and of the critics none
+        actor_loss.backward(inputs=self.actor_parameters)
         return {"critic_loss": critic_loss, "actor_loss": actor_loss}
 
     def move_targets(self) -> None:

@@ -14,11 +14,11 @@ from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
-ALPHA = 0.2  # the entropy coefficient, which stays
+ALPHA = 0.2  # the entropy coefficient, a constant
 
 
 class SAC(Agent):
-    """A policy that draws its actions, rewarded for its entropy."""
+    """A stochastic policy that is rewarded for its entropy."""
 
     critic_outputs = 1
 
@@ -47,7 +47,7 @@ class SAC(Agent):
             action_spec=spaces.action_spec(),
         )
         self.loss.make_value_estimator(gamma=self.gamma)
-        # A buffer, but only once it was asked for: in the states that runs save.
+        # Create this lazy buffer now, so that it is in every saved state.
         _ = self.loss.target_entropy
         self.soft_update = SoftUpdate(self.loss, tau=TAU)
         noise = [self.random_points()] if hp.exploration == "points" else []
@@ -59,13 +59,13 @@ class SAC(Agent):
         critic: TensorDictModule,
         **options: Any,  # noqa: ANN401 (options of the loss)
     ) -> LossModule:
-        """The losses of actor and critics."""
+        """Make the losses of actor and critics."""
         return SACLoss(actor, critic, loss_function="l2", **options)
 
     def backward(
         self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
-        """Descend torchrl's losses; demonstrations are transitions as any others."""
+        """Descend torchrl's losses, with demonstrations as ordinary transitions."""
         flags = {"terminated": rows.terminated, "done": rows.terminated}
         following = {"normalized": next_state, "reward": rows.reward, **flags}
         batch = {"normalized": state, "action": rows.action, "next": following}

@@ -8,7 +8,7 @@ from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.spaces import Spaces
 
 POLICY_NOISE = 0.2  # standard deviation of the noise on target actions
-NOISE_CLIP = 0.5
+NOISE_CLIP = 0.5  # limit of this noise
 
 
 class TD3(DDPG):

@@ -8,12 +8,12 @@ from torchrl.objectives import LossModule, TQCLoss
 
 from torch_panda.learning.agents.sac import SAC
 
-NUM_QUANTILES = 25  # of each critic
-DROPPED = 2  # of them, the highest, in the target
+NUM_QUANTILES = 25  # quantiles of each critic
+DROPPED = 2  # highest quantiles of each critic that the target leaves out
 
 
 class TQC(SAC):
-    """SAC whose critics learn the return's distribution, and mistrust its top."""
+    """SAC whose critics learn quantiles of the return; targets drop the highest."""
 
     critic_outputs = NUM_QUANTILES
 
@@ -23,6 +23,6 @@ class TQC(SAC):
         critic: TensorDictModule,
         **options: Any,  # noqa: ANN401 (options of the loss)
     ) -> LossModule:
-        """The losses of actor and critics."""
+        """Make the losses of actor and critics."""
         dropped = DROPPED if self.hp.double_q else 0
         return TQCLoss(actor, critic, top_quantiles_to_drop_per_net=dropped, **options)
