@@ -29,12 +29,12 @@ def loop(request, monkeypatch):
 @pytest.fixture
 def make_demos(tmp_path):
     """Write random episodes in the format in which an expert's are written."""
-    from tests.learning.episodes import play
+    from tests.learning.episodes import play_randomly
     from torch_panda.learning.buffers import STORED_KEYS
 
     def make(env_id="PandaPush-v1", episodes=4):
         with torch_panda.make(env_id, num_envs=episodes, seed=0) as env:
-            data = play(env).select(*STORED_KEYS).reshape(-1)
+            data = play_randomly(env).select(*STORED_KEYS).reshape(-1)
         path = tmp_path / "demos.pt"
         torch.save(data.to_dict(), path)
         return path

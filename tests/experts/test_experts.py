@@ -1,4 +1,4 @@
-"""The scripted experts: they solve their tasks, from observations alone."""
+"""Scripted experts solve their tasks from observations alone."""
 
 import pytest
 import torch
@@ -10,14 +10,14 @@ from torch_panda.commands import record as record_demos
 
 
 def successes(env_id, episodes, seed):
-    """Success at the end of each episode, and the episodes."""
+    """Whether each episode ends with success, and the episodes."""
     with torch_panda.make(env_id, num_envs=episodes, seed=seed) as env:
         episodes = record_demos.play(env, experts.make_expert(env_id))
     return [bool(episode["next", "success"][-1]) for episode in episodes], episodes
 
 
-# Bounds that the measured rates miss less than once in 1,000 draws of so many episodes.
-# Random actions succeed at the end of one Push episode in nine, and more rarely else.
+# An expert with the measured success rate misses these bounds once in 1,000 samples.
+# Random actions succeed in one of nine episodes of Push, and more rarely elsewhere.
 @pytest.mark.parametrize(
     ("env_id", "episodes", "least"),
     [
@@ -73,7 +73,7 @@ def test_collectors_take_an_expert():
     collector = Collector(env, expert, frames_per_batch=400, total_frames=400)
     (data,) = list(collector)
     collector.shutdown()
-    # The episodes' last steps: 100 steps are two episodes of each environment.
+    # The last steps of the two episodes of each environment.
     assert data["next", "success"][:, [49, 99]].all()
 
 

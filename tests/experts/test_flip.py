@@ -1,4 +1,4 @@
-"""Flip's expert: its rotations, and the plans that it makes of them."""
+"""Flip's expert: its rotations and its plans."""
 
 import math
 
@@ -94,7 +94,7 @@ def test_any_turn_about_y_is_a_swing(angle):
 
 
 def test_plans_lead_to_their_goal():
-    """99.7 % of all orientations are within reach of some plan."""
+    """Plans reach 99.7 % of all orientations."""
     goal = orientations(2000)
     lying, pitch, yaw, swing, _ = make_plan(
         UPRIGHT.expand(2000, 4), STILL.expand(2000, 1), goal, SLIPPERY
@@ -118,6 +118,6 @@ def test_a_cube_that_will_spin_to_its_goal_needs_no_tap(table, spin, quarters):
 
 @pytest.mark.parametrize(("spin", "stops"), [(5.5, True), (7.0, False)])
 def test_a_cube_that_spins_past_its_goal_must_be_caught(spin, stops):
-    """5.5 rad/s end after 1.0 rad, nearest to a quarter; 7 rad/s pass it."""
+    """A spin of 5.5 rad/s ends after 1.0 rad, near a quarter; 7 rad/s goes past it."""
     plan = make_plan(UPRIGHT, angles(spin), turn(2, angles(math.pi / 2)), SLIPPERY)
     assert (plan.yaw.item(), plan.stops.item()) == (0, stops)

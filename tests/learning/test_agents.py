@@ -1,4 +1,4 @@
-"""The algorithms: their losses, what a gradient step changes, and how they explore."""
+"""Agents: losses, effects of gradient steps, and exploration."""
 
 import copy
 import math
@@ -48,7 +48,7 @@ def critics_of(agent):
 
 
 def normalized(agent, batch):
-    """The batch with the networks' inputs, as torchrl's losses take it."""
+    """Add the networks' inputs to a batch, for torchrl's losses."""
     for part in (batch, batch["next"]):
         part["normalized"] = agent.normalizer(part["observation"], part["desired_goal"])
     return batch
@@ -61,7 +61,7 @@ def as_modules(agent):
 
 
 def saturation(agent, batch):
-    """What our actor's loss has beside torchrl's, where there is no action L2."""
+    """The term of our actor's loss that torchrl's lacks, without the action penalty."""
     state = agent.normalizer(batch["observation"], batch["desired_goal"])
     return SATURATION_L2 * agent.actor[0](state).square().mean().detach()
 
@@ -99,7 +99,7 @@ def test_td3_has_torchrls_losses(env, double_q):
     )
     loss.make_value_estimator(gamma=agent.gamma)
     torch.manual_seed(1)
-    # They draw the targets' noise first, too.
+    # torchrl draws the noise of the targets first, too.
     theirs = loss.value_loss(normalized(agent, batch.clone()))[0]
     policy_loss = loss.actor_loss(normalized(agent, batch.clone()))[0]
     penalty = saturation(agent, batch)
@@ -111,7 +111,7 @@ def test_td3_has_torchrls_losses(env, double_q):
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])
 def test_targets_are_possible_returns(env, algo):
-    """Of -1 and 0: a critic far off is pulled to an end of their range."""
+    """A critic with an impossible value is pulled to an end of the possible returns."""
     agent = make(env, algo, gamma=0.5, action_l2=0.0)
     batch = make_transitions(env, 64)
     for value, end in ((1000.0, 0.0), (-1000.0, -2.0)):
@@ -127,14 +127,14 @@ def test_targets_are_possible_returns(env, algo):
 
 
 class PushForOne(torch_panda.Push):
-    """A reward of 1 for success, and else of 0."""
+    """Rewards success with 1 and all else with 0."""
 
     def compute_reward(self, achieved_goal, desired_goal):
         return self.is_success(achieved_goal, desired_goal).float()
 
 
 class PushGently(torch_panda.Push):
-    """Beside the sparse reward, one for small actions."""
+    """Adds a penalty on large actions to the sparse reward."""
 
     def reward(self, simulation, action, achieved_goal, desired_goal):
         sparse = super().reward(simulation, action, achieved_goal, desired_goal)
@@ -249,8 +249,8 @@ def test_policies_are_deterministic_in_evaluations(env, algo):
 
 @pytest.mark.parametrize("algo", ALGOS)
 def test_fine_fingers(algo):
-    """Networks see cube roots of the fingers' actions, environments the actions."""
-    seen, given = [], []
+    """Networks choose cube roots of finger actions; environments get the actions."""
+    seen, executed = [], []
     with torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as env:
         agent = make(env, algo, fine_fingers=True, random_eps=(0.0, 0.0))
         plain = make(env, algo, random_eps=(0.0, 0.0))
@@ -260,17 +260,17 @@ def test_fine_fingers(algo):
             torch.manual_seed(1)
             seen.append(getattr(plain, policy)(td.clone())["action"])
             torch.manual_seed(1)
-            given.append(getattr(agent, policy)(td.clone())["action"])
-    seen, given = torch.stack(seen), torch.stack(given)
-    assert torch.equal(given[..., :3], seen[..., :3])
-    torch.testing.assert_close(given[..., 3], seen[..., 3] ** 3)
+            executed.append(getattr(agent, policy)(td.clone())["action"])
+    seen, executed = torch.stack(seen), torch.stack(executed)
+    assert torch.equal(executed[..., :3], seen[..., :3])
+    torch.testing.assert_close(executed[..., 3], seen[..., 3] ** 3)
     roots, fingers = batch.clone(), batch["action"][:, 3]
     roots["action"][:, 3] = fingers.sign() * fingers.abs() ** (1 / 3)
     for learn in ("update", "imitate"):
         torch.manual_seed(2)
-        found = getattr(agent, learn)(batch.clone())
+        result = getattr(agent, learn)(batch.clone())
         torch.manual_seed(2)
-        torch.testing.assert_close(found, getattr(plain, learn)(roots.clone()))
+        torch.testing.assert_close(result, getattr(plain, learn)(roots.clone()))
 
 
 def test_fine_fingers_need_fingers(env):
@@ -284,7 +284,7 @@ def test_fine_fingers_need_fingers(env):
 def test_learning_rate(env, algo):
     agent = make(env, algo)
     agent.set_learning_rate(0.0)
-    agent.hp.target_interval = 2  # they would move to where their networks are
+    agent.hp.target_interval = 2  # otherwise the target networks would move
     before = [x.clone() for x in agent.parameters()]
     agent.update(make_transitions(env, 16))
     assert all(map(torch.equal, before, agent.parameters()))

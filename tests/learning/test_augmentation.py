@@ -1,4 +1,4 @@
-"""Transitions that are mirrored and moved: which rows, and how."""
+"""Data augmentation: which rows are mirrored and shifted, and how."""
 
 import pytest
 import torch
@@ -22,16 +22,16 @@ def transitions(env):
 def test_every_second_row_is_mirrored(env):
     geometry = read_geometry(env)
     rows = transitions(env)
-    found = mirror(rows, geometry)
+    result = mirror(rows, geometry)
     names = ("observation", "goal", "action", "next_observation")
     for name in names:
         factors = getattr(geometry, name.removeprefix("next_"))
-        now, was = getattr(found, name), getattr(rows, name)
+        now, was = getattr(result, name), getattr(rows, name)
         assert (now[1::2] == was[1::2]).all()
         torch.testing.assert_close(now[::2], was[::2] * torch.tensor(factors))
         assert (now[::2] != was[::2]).any()
-    assert found.reward is rows.reward
-    twice = mirror(found, geometry)
+    assert result.reward is rows.reward
+    twice = mirror(result, geometry)
     assert all(torch.equal(getattr(twice, x), getattr(rows, x)) for x in names)
 
 
@@ -58,16 +58,16 @@ def test_shift(env):
         torch.testing.assert_close((now - was)[:, :3], moved[:, :3])
 
 
-@pytest.mark.parametrize("kind", ["none", "mirror", "mirror-shift"])
-def test_kinds(env, kind):
+@pytest.mark.parametrize("mode", ["none", "mirror", "mirror-shift"])
+def test_modes(env, mode):
     geometry, rows = read_geometry(env), transitions(env)
     torch.manual_seed(0)
-    found = Augmentation(geometry, kind)(rows)
-    expected = rows if kind == "none" else mirror(rows, geometry)
+    result = Augmentation(geometry, mode)(rows)
+    expected = rows if mode == "none" else mirror(rows, geometry)
     torch.manual_seed(0)
-    if kind == "mirror-shift":
+    if mode == "mirror-shift":
         expected = shift(expected, geometry, SHIFT)
-    assert all(map(torch.equal, found, expected))
+    assert all(map(torch.equal, result, expected))
 
 
 def test_joint_control_has_no_mirror():

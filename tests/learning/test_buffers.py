@@ -1,10 +1,10 @@
-"""What is stored, and which goals it gets."""
+"""Replay buffers: the episodes that they store, and their hindsight goals."""
 
 import pytest
 import torch
 
 import torch_panda
-from tests.learning.episodes import play
+from tests.learning.episodes import play_randomly
 from torch_panda.learning import buffers
 from torch_panda.learning.buffers import find_motion, make_buffer, select_episodes
 
@@ -16,7 +16,7 @@ def stack():
 
 
 def relabelled(batch, own):
-    """Which rows have another goal than their episode was given, by object."""
+    """Whether the goal differs from the episode's original goal, by row and object."""
     goal = batch["desired_goal"].unflatten(-1, (2, 3))
     episode = batch["collector", "traj_ids"]
     return (goal != own[episode].unflatten(-1, (2, 3))).any(-1)
@@ -31,20 +31,20 @@ def relabelled(batch, own):
     ],
 )
 def test_kinds_of_hindsight(stack, her, expected):
-    """Of the rows: the first object alone, the second alone, both."""
-    data = play(stack)
+    """Fractions of rows: first object relabelled, second relabelled, both."""
+    data = play_randomly(stack)
     own = data["desired_goal"][:, 0]
     buffer = make_buffer(stack, 1000, her=her, seed=0)
     buffer.extend(select_episodes(data, 1.0).reshape(-1))
     first, second = relabelled(buffer.sample(4000), own).T
-    found = [first & ~second, second & ~first, first & second]
-    # Goals that are reached without acting equal the achieved ones, never the own.
-    found = [float(x.double().mean()) for x in found]
-    assert found == pytest.approx(expected, abs=0.03)
+    result = [first & ~second, second & ~first, first & second]
+    # Hindsight goals equal achieved goals, which never equal the original ones here.
+    result = [float(x.double().mean()) for x in result]
+    assert result == pytest.approx(expected, abs=0.03)
 
 
 def test_desired_goals_of_others(stack):
-    data = play(stack)
+    data = play_randomly(stack)
     own = data["desired_goal"][:, 0]
     buffer = make_buffer(stack, 1000, desired_ratio=0.5, seed=0)
     buffer.extend(select_episodes(data, 1.0).reshape(-1))
@@ -52,7 +52,7 @@ def test_desired_goals_of_others(stack):
     goal, episode = batch["desired_goal"], batch["collector", "traj_ids"]
     is_desired = (goal[:, None] == own).all(-1)
     others = is_desired.any(1) & ~is_desired.gather(1, episode[:, None])[:, 0]
-    # A quarter of the goals that are drawn are those that the rows have already.
+    # A quarter of the drawn goals are those that the rows have already.
     assert abs(others.double().mean() - 0.4 * 0.75) < 0.04
     reward = stack.compute_reward(batch["next", "achieved_goal"], goal)
     torch.testing.assert_close(batch["next", "reward"], reward)
@@ -60,7 +60,7 @@ def test_desired_goals_of_others(stack):
 
 def test_stored_copies(stack):
     buffer = make_buffer(stack, 400, her="augment")
-    buffer.extend(select_episodes(play(stack), 1.0).reshape(-1))
+    buffer.extend(select_episodes(play_randomly(stack), 1.0).reshape(-1))
     assert len(buffer) == 5 * 400
 
 
@@ -79,7 +79,7 @@ def test_capacity(stack, monkeypatch):
 
 
 def test_episodes_in_which_nothing_moved(stack):
-    data = play(stack)
+    data = play_randomly(stack)
     goal = data["next", "achieved_goal"]
     goal[:] = goal[:, :1]
     goal[1, 60:, 4] += 0.02
@@ -93,7 +93,7 @@ def test_episodes_in_which_nothing_moved(stack):
 
 
 def test_short_episodes_in_which_something_moved(stack):
-    data = play(stack)[:, :3]
+    data = play_randomly(stack)[:, :3]
     goal = data["next", "achieved_goal"]
     goal[:] = goal[:, :1]
     goal[1, 2, 4] += 0.02

@@ -1,4 +1,4 @@
-"""What the agents assume about the tasks holds in their physics."""
+"""Layout and symmetry that agents assume hold in the physics of the tasks."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ TASKS = ["Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip"]
 
 @pytest.mark.parametrize("task", [*TASKS, "Drawer", "PegInsertion"])
 def test_mirrored_starts_and_actions_give_mirrored_episodes(task):
-    """Of an arm that moves, and of objects that tumble through the air above it."""
+    """The arm moves, and the objects tumble through the air above it."""
     generator = torch.Generator().manual_seed(0)
     with torch_panda.make(f"Panda{task}-v1", num_envs=2, seed=3) as env:
         geometry = read_geometry(env)
@@ -52,8 +52,8 @@ def test_mirrored_starts_and_actions_give_mirrored_episodes(task):
             if task == "Flip":  # a quaternion and its negative are one orientation
                 quaternion = slice(arm + 3, arm + 7)
                 one[quaternion] *= (one[quaternion] @ mirrored[quaternion]).sign()
-            # The hand is 0.3 degrees off the plane, and moves differently by so much
-            # [m, m/s] where it moves at up to 0.5 m/s.
+            # The hand is rotated by 0.3 degrees out of the plane, which causes these
+            # errors [m, m/s] at velocities of up to 0.5 m/s.
             error = (mirrored - one).abs()
             assert error[:3].max() < 0.01
             assert error[:arm].max() < 0.05
@@ -65,12 +65,12 @@ def test_mirrored_starts_and_actions_give_mirrored_episodes(task):
 def test_differences(task):
     with torch_panda.make(f"Panda{task}-v1", num_envs=3, seed=0) as env:
         td = env.reset()
-        found = read_geometry(env).differences(td["observation"], td["desired_goal"])
+        result = read_geometry(env).differences(td["observation"], td["desired_goal"])
         objects = td["achieved_goal"].unflatten(-1, (-1, 3))
         goals = td["desired_goal"].unflatten(-1, (-1, 3))
         from_hand = objects - td["observation"][:, None, :3]
         expected = torch.cat((from_hand, goals - objects), 1).flatten(1)
-        torch.testing.assert_close(found, expected)
+        torch.testing.assert_close(result, expected)
 
 
 def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
@@ -82,14 +82,14 @@ def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
     goal = normalize(torch.randn(20, 4, generator=generator), dim=-1)
     cube = observation[:, place] = normalize(observation[:, place], dim=-1)
     seen, turn, matrix, likeness = geometry.turns(observation, goal)
-    # It leads from the cube to the goal, and no other of the 24 is nearer.
+    # The rotation leads from the cube to the goal, and none of the 24 is smaller.
     torch.testing.assert_close(matrix, to_matrix(turn).flatten(-2))
     torch.testing.assert_close(
         matrix.view(20, 3, 3) @ to_matrix(cube), to_matrix(goal), atol=1e-5, rtol=0
     )
     others = compose(cube[:, None], STRAIGHT)
     torch.testing.assert_close(seen[:, place][:, 3], others[..., 3].abs().amax(1))
-    # As like one of the 24 as the cube's straight orientation, so turned, is the goal.
+    # Similarity of the goal with each rotation of the cube's straight orientation.
     turned = compose(STRAIGHT, straighten(cube)[:, None])
     left = rotation_distance(turned, goal[:, None]).squeeze(-1)
     torch.testing.assert_close(likeness, 1 - left)
@@ -102,7 +102,7 @@ def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
 
 
 class PushAndTell(torch_panda.Push):
-    """Observes one number more."""
+    """Observes one more number than its layout has."""
 
     observation_dim = 13
 
@@ -114,7 +114,7 @@ class PushAndTell(torch_panda.Push):
 @pytest.mark.parametrize(
     "options", [{"relative_inputs": "coarse"}, {"augmentation": "mirror-shift"}]
 )
-def test_other_layouts_are_not_guessed(options):
+def test_unknown_layouts_need_no_relative_inputs_and_no_augmentation(options):
     scene = {"robot": torch_panda.Panda(block_gripper=True), "task": PushAndTell()}
     with torch_panda.RobotTaskEnv(**scene, num_envs=2) as env:
         with pytest.raises(

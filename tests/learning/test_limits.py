@@ -1,4 +1,4 @@
-"""The numbers that the scripts accept: others are refused before a run starts."""
+"""Limits of the commands' options, which are checked before a run starts."""
 
 import importlib
 import re
@@ -14,7 +14,7 @@ from torch_panda.learning.limits import check_limits, find_limits
 
 
 def numbers(hint):
-    """Whether a type has numbers."""
+    """Whether a type contains numbers."""
     parts = get_args(hint)
     return any(map(numbers, parts)) if parts else hint in (int, float)
 
@@ -34,7 +34,7 @@ def test_every_number_has_a_limit(script):
 
 
 def refused(script, message, **options):
-    """The script ends with one line, this one."""
+    """The command ends with one line that matches the message."""
     with pytest.raises(SystemExit, match=f"^{message}$") as stop:
         script.main(script.Args(**options))
     assert "\n" not in str(stop.value)
@@ -83,7 +83,7 @@ def test_devices_that_do_not_work(tmp_path, device):
         *((watch, "port", 0), (watch, "port", 65536)),
     ],
 )
-def test_others_refuse(tmp_path, script, option, value):
+def test_other_commands_refuse(tmp_path, script, option, value):
     (tmp_path / "checkpoint.pt").touch()
     options = {option: value} | ({"run": tmp_path} if script is evaluate else {})
     refused(script, f"{option} must be .*, got {value}", **options)

@@ -1,4 +1,4 @@
-"""What the networks see."""
+"""Inputs of the networks."""
 
 import pytest
 import torch
@@ -18,7 +18,8 @@ def test_relative_inputs():
         td = env.reset()
         observation, goal = td["observation"], td["desired_goal"]
         plain, coarse, fine = (
-            make(env, kind)(observation, goal) for kind in ("none", "coarse", "fine")
+            make(env, relative_inputs)(observation, goal)
+            for relative_inputs in ("none", "coarse", "fine")
         )
         differences = read_geometry(env).differences(observation, goal)
     torch.testing.assert_close(plain, torch.cat((observation, goal), -1))
@@ -48,9 +49,9 @@ def test_statistics():
         part = slice(rows, rows + 50)
         normalizer.update(observation[part], goal[part])
     assert normalizer.count == 200
-    every = torch.cat((observation, goal), -1)
-    torch.testing.assert_close(normalizer.mean, every.mean(0))
-    torch.testing.assert_close(normalizer.std, every.std(0, unbiased=False))
+    inputs = torch.cat((observation, goal), -1)
+    torch.testing.assert_close(normalizer.mean, inputs.mean(0))
+    torch.testing.assert_close(normalizer.std, inputs.std(0, unbiased=False))
     seen = normalizer(observation, goal)
     torch.testing.assert_close(seen.mean(0), torch.zeros(9), atol=1e-5, rtol=0)
     far = normalizer(observation + 100, goal)

@@ -54,9 +54,9 @@ def test_a_loaded_policy_acts_as_the_saved_agent(env, tmp_path, algo, options):
     td = inputs(policy.spaces, 16)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         expected = agent.policy(td.clone())["action"]
-    found = policy(td)
-    assert torch.equal(found["action"], expected)
-    assert set(found.keys()) == {"observation", "desired_goal", "action"}
+    result = policy(td)
+    assert torch.equal(result["action"], expected)
+    assert set(result.keys()) == {"observation", "desired_goal", "action"}
 
 
 @pytest.mark.parametrize("exploration", [None, *ExplorationType])
@@ -66,9 +66,9 @@ def test_actions_are_the_same_under_any_exploration_type(env, tmp_path, explorat
     td = inputs(policy.spaces, 16)
     expected = policy(td.clone())["action"]
     with set_exploration_type(exploration) if exploration else nullcontext():
-        found = policy(td.clone())["action"]
-    assert torch.equal(found, expected)
-    assert not found.requires_grad
+        result = policy(td.clone())["action"]
+    assert torch.equal(result, expected)
+    assert not result.requires_grad
 
 
 @pytest.mark.parametrize("env_id", shipped_policies())

@@ -1,4 +1,4 @@
-"""The recipes of --preset tuned."""
+"""Recipes of --preset tuned."""
 
 from dataclasses import replace
 from functools import partial
@@ -65,7 +65,7 @@ def test_the_paper_has_no_recipes():
 
 
 @pytest.mark.parametrize(("ratio", "steps"), [(0.0, 100), (0.5, 50)])
-def test_episodes_that_begin_in_the_course_of_the_task_are_shorter(
+def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(
     ratio, steps, tmp_path
 ):
     args = default_args("tuned", "PandaStack-v1")

@@ -1,4 +1,4 @@
-"""Training episodes that begin with the hand at an object."""
+"""Training episodes that start with the hand at an object."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ def states():
 
 
 def place(env, states):
-    """Let the first environments start from these states."""
+    """Start the first environments in these states."""
     return env.reset(states[: env.num_envs].exclude("placed"), set_state=True)
 
 
@@ -51,14 +51,16 @@ def test_hand_holds_an_object(task, number):
     placed = states["placed"][:20, 0]
     assert placed.any() == (task == "Stack")
     assert (raised[~placed].sum(1) == 1).all()
-    assert raised.any(0).all()  # each object in some states
+    assert raised.any(0).all()  # every object is held in some state
     assert not raised[placed][:, :-1].any()
     if placed.any():
-        assert 0.3 < raised[placed, -1].double().mean() < 0.7  # the others lie there
+        assert (
+            0.3 < raised[placed, -1].double().mean() < 0.7
+        )
 
 
 def test_lower_cube_of_a_stack_can_be_at_its_goal():
-    """In half of the states, and it stays there: the upper one is held up, or lies."""
+    """The lower cube is at its goal in half of the states, and it stays there."""
     states = states_at_objects("PandaStack-v1", seed=0, number=64)
     placed = states[states["placed"][:, 0]]
     assert 0.4 < len(placed) / len(states) < 0.6
@@ -69,7 +71,7 @@ def test_lower_cube_of_a_stack_can_be_at_its_goal():
         lower, upper = td["achieved_goal"].split(3, -1)
         goal = td["desired_goal"][:, :3]
         begun = (lower - goal).norm(dim=1) < 1e-3
-        # The others had no room: they begin as the task does.
+        # The other environments had no room and start as usual.
         assert begun.sum() >= NUM_ENVS / 2
         held = upper[:, 2] > 0.1
         assert (begun & held).any()
@@ -83,7 +85,7 @@ def test_lower_cube_of_a_stack_can_be_at_its_goal():
         assert len(goal.unique(dim=0)) == NUM_ENVS
 
 
-def test_where_no_object_has_room_episodes_begin_as_the_task_does():
+def test_without_room_for_the_object_an_episode_starts_as_usual():
     states = states_at_objects("PandaStack-v1", seed=0)
     lies = states["placed"][:, 0] & (states["object_pose"][:, -1, 2] < 0.1)
     with torch_panda.make("PandaStack-v1", num_envs=1, seed=0) as base:
@@ -97,7 +99,7 @@ def test_where_no_object_has_room_episodes_begin_as_the_task_does():
 
 
 def test_ratio_of_the_episodes(states):
-    # Hands that start in the neutral position are 20 cm high.
+    # In the neutral position the hand is 20 cm high.
     with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
         env = TransformedEnv(base, StartFrom(states, 0.3))
         torch.manual_seed(0)
@@ -139,6 +141,6 @@ def test_partial_reset_leaves_the_others_alone(states):
 
 
 @pytest.mark.parametrize("env_id", ["PandaReach-v1", "PandaPushJoints-v1"])
-def test_tasks_that_cannot_start_so(env_id):
+def test_tasks_without_such_states(env_id):
     with pytest.raises(ValueError, match=f"end-effector .* got {env_id}"):
         states_at_objects(env_id, seed=0)

@@ -1,11 +1,11 @@
-"""Transitions to learn from, without an environment's physics."""
+"""Random transitions, made without physics."""
 
 import torch
 from tensordict import TensorDict
 
 
 def make_transitions(env, number):
-    """Random ones with torchrl's keys, of the sizes of an environment's."""
+    """Random transitions with torchrl's keys and the sizes of an environment."""
     spec = env.observation_spec_unbatched
 
     def observation():

@@ -19,25 +19,25 @@ class Augmentation:
 
     Args:
         geometry: Layout of observations, goals and actions.
-        kind: Which augmentation to use.
+        mode: Which augmentation to use.
 
     Raises:
         ValueError: The robot is not under end-effector control.
     """
 
-    def __init__(self, geometry: Geometry | None, kind: AugmentationKind) -> None:
-        if geometry is not None and geometry.action is None and kind != "none":
+    def __init__(self, geometry: Geometry | None, mode: AugmentationKind) -> None:
+        if geometry is not None and geometry.action is None and mode != "none":
             raise ValueError(
-                f"augmentation {kind!r} needs end-effector control: for joint control "
+                f"augmentation {mode!r} needs end-effector control: for joint control "
                 "pass --augmentation none"
             )
-        self.geometry, self.kind = geometry, kind
+        self.geometry, self.mode = geometry, mode
 
     def __call__(self, rows: Transitions) -> Transitions:
         """Return an augmented copy of a batch."""
-        if self.geometry is not None and self.kind != "none":
+        if self.geometry is not None and self.mode != "none":
             rows = mirror(rows, self.geometry)
-            if self.kind == "mirror-shift":
+            if self.mode == "mirror-shift":
                 rows = shift(rows, self.geometry, SHIFT)
         return rows
 

@@ -52,8 +52,8 @@ class Geometry:
     """Layout and symmetry of observations, goals and actions.
 
     Attributes:
-        later: Indices into (observation, goal) of the positions of objects and goals.
-        earlier: Indices of the positions that are subtracted from them: those of the
+        points: Indices into (observation, goal) of the positions of objects and goals.
+        origins: Indices of the positions that are subtracted from them: those of the
             end-effector for objects, and those of objects for their goals.
         observation: Factors that mirror an observation, (observation size,).
         goal: Factors that mirror a goal, (goal size,).
@@ -66,8 +66,8 @@ class Geometry:
             goals are orientations; else None.
     """
 
-    later: tuple[int, ...]
-    earlier: tuple[int, ...]
+    points: tuple[int, ...]
+    origins: tuple[int, ...]
     observation: tuple[float, ...]
     goal: tuple[float, ...]
     action: tuple[float, ...] | None
@@ -79,7 +79,7 @@ class Geometry:
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Offsets of objects from the hand and of goals from objects, (..., n) [m]."""
         inputs = torch.cat((observation, goal), -1)
-        return inputs[..., self.later] - inputs[..., self.earlier]
+        return inputs[..., self.points] - inputs[..., self.origins]
 
     def turns(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """Orientations of a cube without colours, of which 24 look alike.
@@ -119,12 +119,12 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
     _, *objects = (part.start for part in parts if part.quantity == "position")
     positions = [goal for goal in goals if goal[0].quantity == "position"]
     rotations = [goal for goal in goals if goal[0].quantity == "quaternion"]
-    # An object is seen from the hand, and a goal from the object that should go there.
+    # An object is seen from the hand, and a goal from the object that should go to it.
     pairs = [(0, start) for start in objects]
     pairs += [(part.start, size + start) for part, start in positions]
     return Geometry(
-        later=tuple(there + axis for _, there in pairs for axis in range(3)),
-        earlier=tuple(here + axis for here, _ in pairs for axis in range(3)),
+        points=tuple(point + axis for _, point in pairs for axis in range(3)),
+        origins=tuple(origin + axis for origin, _ in pairs for axis in range(3)),
         observation=tuple(x for part in parts for x in _MIRROR[part.quantity]),
         goal=tuple(x for part, _ in goals for x in _MIRROR[part.quantity]),
         action=(*_MIRROR["position"], *(1.0 for _ in fingers))

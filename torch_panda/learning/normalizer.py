@@ -31,7 +31,7 @@ class Normalizer(nn.Module):
         size = spaces.observation_size + spaces.goal_size
         if geometry is not None:
             num_parts = ("none", "coarse", "fine").index(relative_inputs)
-            size += len(geometry.later) * num_parts
+            size += len(geometry.points) * num_parts
             if num_parts and geometry.orientation is not None:
                 size += 9 + 24  # the turn's matrix and likenesses
         self.geometry, self.relative_inputs = geometry, relative_inputs

@@ -19,7 +19,7 @@ from torch_panda.tasks import Flip, Push, Slide, Stack
 
 APPROACH = 45  # steps that the scripted hand takes
 # Distance at which a hand with a blocked gripper stops beside an object, between the
-# centres [m]. The fingers, at most 2.3 cm long and wide, do not touch the object there.
+# centres [m]. The fingers, at most 2.3 cm long and wide, do not touch it then.
 GAP = (0.055, 0.08)
 # Height at which the hand holds the last of several objects above the first [m].
 LIFTED = (0.12, 0.2)
@@ -78,18 +78,18 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
             item = observation.gather(1, place)
             if blocked:
                 action = go_over(hand, item + beside, 0.1, limit=0.6)
-                there = norm(item + beside - hand) < 0.01
+                arrived = norm(item + beside - hand) < 0.01
             else:
                 height = torch.where(placed, lift, item[:, 2:])
                 goal = torch.cat((item[:, :2], height), 1)
                 action = carry(hand, width, item, goal)
-                there = is_held(hand, width, item) & (norm(goal - item) < 0.02)
-                there = there | waits
+                arrived = is_held(hand, width, item) & (norm(goal - item) < 0.02)
+                arrived = arrived | waits
                 action = torch.where(waits, torch.tensor(OPEN_HAND), action)
             td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
         state = env.get_state().select(*PHYSICAL).set("placed", placed)
     speed = state["object_velocity"].abs().flatten(1).amax(1, keepdim=True)
-    return state[(there & (speed < 0.1)).squeeze(1)]
+    return state[(arrived & (speed < 0.1)).squeeze(1)]
 
 
 class StartFrom(Transform):
@@ -125,7 +125,7 @@ class StartFrom(Transform):
             goal = tensordict_reset["desired_goal"].to(state["object_pose"])
             rest = goal.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goal), 4)
             pose, last = torch.cat((goal[:, :3], rest), 1), state["object_pose"][:, -1]
-            # It must not touch the other object there.
+            # It must not touch the other object.
             free = (pose - last)[:, :3].norm(dim=1) > ROOM
             chosen &= (free | ~placed).unsqueeze(-1)
             if not chosen.any():
