@@ -74,7 +74,7 @@ class Checkpoint:
             OSError: A file cannot be written.
         """
         state = {
-            "args": fixed(self.args),
+            "args": fixed_options(self.args),
             "agent": self.agent.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
             "updates": self.agent.updates,
@@ -96,11 +96,11 @@ class Checkpoint:
         keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
         finite = ("agent", "optimizer")
         state = files.read(self.path, "the state of a run", keys, finite=finite)
-        theirs = state["args"]
+        saved = state["args"]
         differing = [
-            f"{key} was {theirs.get(key)!r}, is {value!r}"
-            for key, value in fixed(self.args).items()
-            if theirs.get(key) != value
+            f"{key} was {saved.get(key)!r}, is {value!r}"
+            for key, value in fixed_options(self.args).items()
+            if saved.get(key) != value
         ]
         if differing:
             raise ValueError(
@@ -123,7 +123,7 @@ def crossed(interval: int, before: int, after: int) -> bool:
     return before // interval < after // interval
 
 
-def fixed(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
+def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
     """The options that must be the same when a run is resumed."""
     options = json.loads(json.dumps(asdict(args), default=str))
     return {key: value for key, value in options.items() if key not in FREE_OPTIONS}
