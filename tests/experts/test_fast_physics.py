@@ -24,9 +24,7 @@ def success(task, physics, episodes):
 
 # Slide and Flip are sensitive, so their rates need more episodes. Slide needs the exact
 # 20 substeps.
-STRIKES = pytest.mark.xfail(
-    strict=True, reason="strikes need exact physics"
-)
+STRIKES = pytest.mark.xfail(strict=True, reason="strikes need exact physics")
 EARLY_END = {"residual_threshold": 1e-3}  # the solver stops early, all else is exact
 
 
