@@ -1,10 +1,9 @@
-"""DDPG with hindsight on Reach in plain torchrl: at 100 % success in about a minute.
+"""DDPG with hindsight in plain torchrl: Reach succeeds in 100 % after half a minute.
 
 python examples/first_steps.py
 """
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
@@ -21,42 +20,41 @@ test_env = torch_panda.make("PandaReach-v1", num_envs=50, seed=1)
 
 
 class Net(MLP):
-    """Sees the goal beside the observation, in decimetres: of the size of actions."""
+    """An MLP of observation, goal and action. Positions enter in decimetres."""
 
-    def forward(self, observation: Tensor, goal: Tensor, *action: Tensor) -> Tensor:  # type: ignore[override]
-        """Concatenate the inputs, (..., 6), (..., 3) and, if given, (..., 3)."""
-        inputs = 10 * observation, 10 * goal, *action
-        return super().forward(*inputs)  # type: ignore[arg-type]
+    def forward(self, observation: Tensor, goal: Tensor, *action: Tensor) -> Tensor:
+        """(..., 6), (..., 3) and, for the critic, (..., 3) to (..., 3) or (..., 1)."""
+        return super().forward(10 * observation, 10 * goal, *action)
 
 
-inputs: list[NestedKey] = ["observation", "desired_goal"]
+inputs = ["observation", "desired_goal"]
 net = Net(9, 3, depth=2, num_cells=256, activation_class=nn.ReLU)
 policy = TensorDictModule(net, inputs, ["action"])
-actor = TensorDictSequential(policy, TanhModule(in_keys=["action"]))  # type: ignore[call-overload]
+actor = TensorDictSequential(policy, TanhModule(in_keys=["action"]))
 value = Net(12, 1, depth=2, num_cells=256, activation_class=nn.ReLU)
 critic = TensorDictModule(value, [*inputs, "action"], ["state_action_value"])
 noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
 
 loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
 loss.make_value_estimator(gamma=0.98)
-follow = SoftUpdate(loss, tau=0.05)  # the target networks
+target_update = SoftUpdate(loss, tau=0.05)
 optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-# 80 % of the rows that are sampled get a goal that their episode reached later.
+# 80 % of the sampled rows get a goal that their episode reached later.
 relabel = HindsightRelabel.from_env(env, her_ratio=0.8)
 storage = LazyTensorStorage(100_000)
 buffer = TensorDictReplayBuffer(storage=storage, transform=relabel, batch_size=256)
-explore = TensorDictSequential(actor, noise)  # type: ignore[call-overload]
+explore = TensorDictSequential(actor, noise)
 for data in Collector(env, explore, frames_per_batch=400, total_frames=2_400):
     buffer.extend(data.reshape(-1))
     for _ in range(200):
         batch = buffer.sample()
         losses = loss(batch)
-        # Small actions are as good as large ones, but do not saturate the tanh.
+        # Keeps actions small, because the tanh saturates at large ones.
         penalty = actor(batch.select(*inputs))["action"].square().mean()
         optimizer.zero_grad()
         (losses["loss_actor"] + losses["loss_value"] + penalty).backward()
         optimizer.step()
-        follow.step()
+        target_update.step()
     with torch.no_grad():
         success = test_env.rollout(50, actor)["next", "success"][:, -1].float().mean()
     print(f"{len(buffer)} steps: success at the end of 50 episodes {success:.0%}")
