@@ -81,7 +81,7 @@ def goals_of_others(buffer, true_ids):
     return ~(reached & own).any(-1)[relabelled]
 
 
-def test_workers_fill_one_buffer(distributed, start, tmp_path):
+def test_workers_fill_one_buffer(start, tmp_path):
     learner = start(total_steps=800, steps_per_batch=20, updates_per_step=0.1)
     # One CPU each and none left: the workers are on different nodes.
     assert len(ray.nodes()) == 2
@@ -134,14 +134,14 @@ def test_a_dead_worker_is_an_error(start, tmp_path):
         learner.train()
 
 
-def test_too_small_a_cluster_is_an_error(distributed, address):
-    with pytest.raises(ValueError, match="room for 0 workers of 2 CPUs, not for 2"):
+def test_too_small_a_cluster_is_an_error(address):
+    with pytest.raises(ValueError, match="CPUs for 0 workers with 2 CPUs each, not for 2"):
         distributed.connect(distributed.Args(address=address, cpus_per_worker=2))
     ray.shutdown()
 
 
 @pytest.mark.parametrize("name", ["curve.csv", "checkpoint.pt"])
-def test_another_run_is_not_overwritten(distributed, tmp_path, monkeypatch, name):
+def test_another_run_is_not_overwritten(tmp_path, monkeypatch, name):
     monkeypatch.setattr(distributed, "connect", pytest.fail)
     (tmp_path / name).write_text("theirs")
     with pytest.raises(SystemExit, match=f"^{tmp_path} holds a run: "):
@@ -150,7 +150,7 @@ def test_another_run_is_not_overwritten(distributed, tmp_path, monkeypatch, name
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])
-def test_something_must_explore(distributed, tmp_path, monkeypatch, algo):
+def test_something_must_explore(tmp_path, monkeypatch, algo):
     monkeypatch.setattr(distributed, "connect", pytest.fail)
     args = distributed.Args(
         algo=algo, noise_eps=0.0, random_eps=(0.0, 0.0), out=tmp_path / "run"
@@ -161,7 +161,7 @@ def test_something_must_explore(distributed, tmp_path, monkeypatch, algo):
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_run_is_drawn(distributed, address, tmp_path):
+def test_a_run_is_drawn(address, tmp_path):
     args = distributed.Args(
         address=address,
         num_envs=4,
