@@ -39,8 +39,8 @@ class BufferTransform(envs.Transform):
 
     Args:
         reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
-            (n, 1). Row i of the reward depends on row i of the goals only. The
-            rewards of the first batches are compared with it.
+            (n, 1). Row i of the reward depends on row i of the goals only. The first
+            stored rewards are checked against it.
         strategy: Name of a strategy, a function `(step, first, end, generator) -> goal
             step` (see `strategies`), or a mapping of these to weights.
         discount: Discount per step of the strategy "geometric".
@@ -112,7 +112,7 @@ class BufferTransform(envs.Transform):
 
     @classmethod
     def _explain_unknown(cls, name: str, value: Any) -> str:  # noqa: ANN401
-        """Returns an error message for an unknown argument, with ours."""
+        """Returns an error message for an unknown argument, naming the likely one."""
         accepted: list[str] = []
         for base in cls.__mro__[: cls.__mro__.index(BufferTransform) + 1]:
             names = inspect.signature(base).parameters
@@ -141,11 +141,11 @@ class BufferTransform(envs.Transform):
 
         The environment's `compute_reward` becomes `reward_fn`, and its `is_success`
         becomes `success_fn`. If the environment is `terminate_on_success`, `is_success`
-        also becomes `terminated_fn`. A worker of a `ParallelEnv` or `SerialEnv` is made
-        for a moment to read these.
+        also becomes `terminated_fn`. A worker of a `ParallelEnv` or `SerialEnv` is
+        created and closed again.
 
         Args:
-            env: The environment. Its transforms may be left out.
+            env: The environment. Either the transformed environment or its base.
             **options: Arguments of the transform. They replace what the environment
                 has.
 
@@ -235,7 +235,7 @@ class BufferTransform(envs.Transform):
         return [self._mixture]
 
     def _claim(self, buffer: ReplayBuffer | None) -> None:
-        """Makes the buffer the only one whose transitions are remembered.
+        """Binds the transform to the buffer.
 
         Raises:
             RuntimeError: the transform belongs to another buffer.
@@ -317,7 +317,7 @@ class BufferTransform(envs.Transform):
             self._memory.end_trajectories()
 
     def empty(self) -> None:
-        """Forgets all transitions and the buffer, which does not call this itself."""
+        """Forgets all transitions and the buffer; `buffer.empty()` does not call it."""
         with self._lock:
             self._forget()
 

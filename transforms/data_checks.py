@@ -58,7 +58,7 @@ class DataCheck:
     Args:
         rewriter: Functions and keys of the transform.
         ignored: Keys of entries that are not computed from goals, such as ids.
-        warned: Warnings that were given already. The checks of a transform share it.
+        warned: Warnings that were given already, shared by the checks of a transform.
 
     Attributes:
         shapes: Entries of the environment without its transforms, and their shapes; or
@@ -135,7 +135,7 @@ class DataCheck:
     def _check_copies(self, rows: TensorDictBase) -> None:
         """Refuses entries of which some columns are always the desired goal."""
         achieved, desired = self._goals(rows)
-        # Where the goal is achieved, an observation contains it rightly.
+        # Skip achieved goals: the observation equals the goal there anyway.
         is_open = (achieved != desired).any(1)
         desired = desired[is_open]
         goal_dim = desired.shape[1]
@@ -162,14 +162,14 @@ class DataCheck:
         An entry is suspect if the environment without its transforms does not have it
         in the same shape. A column passes if the achieved goal alone reproduces it, or
         if it belongs to a copy of one of the environment's own entries, which may
-        contain constants of an episode. More goals are needed than an affine function
-        has coefficients, so that other constants of an episode fit none.
+        contain constants of an episode. Such constants could fit by chance, so the check
+        needs more different goals than an affine function has coefficients.
 
         Returns:
             Whether the rows have enough different goals to tell.
 
         Raises:
-            ValueError: the environment is known, and a suspect depends on the goal. If
+            ValueError: The environment is known, and a suspect depends on the goal. If
                 it is not known, this is a warning.
         """
         both = torch.cat(self._goals(rows), 1).double()
@@ -206,7 +206,7 @@ class DataCheck:
         return True
 
     def _check_rewards(self, rows: TensorDictBase) -> None:
-        """Refuses rewards that are `reward_fn`'s, times a factor plus a constant."""
+        """Refuses rewards of `reward_fn` that were scaled or shifted."""
         keys = self._rewriter
         stored, goals = rows.get(keys.reward_key), rows.get(keys.goal_key)
         achieved = rows.get(keys.next_achieved_key)
@@ -214,8 +214,8 @@ class DataCheck:
         stored, expected = stored.flatten().double(), expected.flatten().double()
         low, high = expected.min(), expected.max()
         groups = expected == low, expected == high, stored == stored.max()
-        # Goals may have been more precise: 1 / 1000 may differ, or 5 % of the rows, but
-        # not most rows of a group, because successes may be few.
+        # Rounded goals may change single rewards (5 % of the rows), but not most of the
+        # rarer ones.
         precision = 1e-3 * float(expected.abs().max()) + 1e-6
 
         def find_wrong(factor: float, constant: float) -> Tensor:
@@ -231,7 +231,7 @@ class DataCheck:
             return
         at_low, at_high = (stored[group].median() for group in groups[:2])
         factor = float((at_high - at_low) / (high - low).clamp(min=1e-12))
-        if low == high:  # nothing succeeds yet: a factor is likelier than a constant
+        if low == high:  # with one reward value, assume a factor and no constant
             factor = float(at_low / low) if low else 0.0
         constant = float(at_low) - factor * float(low)
         if factor and not differs(factor, constant):

@@ -48,12 +48,13 @@ class GoalMemory:
     - a ring has the trajectory and step of every remembered transition;
     - a table has a row for every remembered trajectory, see `_TRAJECTORY`;
     - `_goals` has a contiguous region for each trajectory, one row per step. A full
-      region is copied into one of twice the size.
+      region is copied into a larger one.
 
-    A row extends the open trajectory with its id, unless that trajectory's last
-    achieved goal differs from the row's root goal: then a new collector reuses the id.
-    In some data, root goals never equal the goals achieved before them. They are
-    ignored until two of them are equal.
+    The root goal of a row is the achieved goal before its step. A row extends the open
+    trajectory with its id, unless that trajectory's last achieved goal differs from the
+    row's root goal: then a new collector reuses the id. Some data have root goals that
+    never equal the goals achieved before them, so root goals are ignored until two of
+    them are equal.
     """
 
     def __init__(self) -> None:
@@ -173,7 +174,7 @@ class GoalMemory:
         if end - self.oldest <= size:
             return
         self.forget(self.count - stored)
-        needed = end - self.oldest + size // 64  # so that the ring is rarely full
+        needed = end - self.oldest + size // 64  # so that the ring rarely grows
         if needed > size:
             serials = np.arange(self.oldest, self.count)
             positions = self._ring.take(serials % size)

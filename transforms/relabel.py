@@ -60,7 +60,7 @@ class HindsightRelabel(SampleTimeTransform):
         self.her_ratio, self.goal_parts = her_ratio, goal_parts
 
     def _draw(self, serials: Integers, batch: TensorDictBase) -> tuple[Integers, Goals]:
-        """Draws which rows to relabel, (n,), and their goals, (n, *goal)."""
+        """Draws which m rows to relabel, (m,), and their goals, (m, *goal)."""
         last_rows, units = self._find_units(serials)
         if self.goal_parts is None:
             return self._draw_once(serials, last_rows, units)
@@ -84,7 +84,7 @@ class HindsightRelabel(SampleTimeTransform):
         """
         u = draw_uniform(len(last_rows), self._generator)
         is_chosen = u < self.her_ratio
-        # Rows that were overwritten since they were sampled have left the memory.
+        # Another thread may have overwritten a sampled row: it keeps its goal.
         is_forgotten = serials < self._memory.oldest
         is_chosen[is_forgotten if units is None else units[is_forgotten]] = False
         chosen = is_chosen.nonzero()[0]

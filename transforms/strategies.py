@@ -25,7 +25,7 @@ Strategy = str | StrategyFunction
 StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
 RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
-# A stored transition's later steps are stored too, so these never need older steps.
+# They need only later steps, which are stored as long as the transition is.
 LOOKING_AHEAD = ("current", "future", "geometric", "final")
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 

@@ -135,7 +135,9 @@ def test_a_dead_worker_is_an_error(start, tmp_path):
 
 
 def test_too_small_a_cluster_is_an_error(address):
-    with pytest.raises(ValueError, match="CPUs for 0 workers with 2 CPUs each, not for 2"):
+    with pytest.raises(
+        ValueError, match="CPUs for 0 workers with 2 CPUs each, not for 2"
+    ):
         distributed.connect(distributed.Args(address=address, cpus_per_worker=2))
     ray.shutdown()
 

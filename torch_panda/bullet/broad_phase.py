@@ -60,7 +60,8 @@ class BroadPhase:
         self._links: list[_Link] = []
         self._filters = _read_filters(client.blueprint)
         bodies = {body: _read_poses(client, body) for body in client.bodies}
-        # Loading a snapshot that has contacts would detect collisions.
+        # Filter out all contacts first, because loading a snapshot with contacts would
+        # detect collisions.
         for body, poses in bodies.items():
             for link in range(-1, len(poses) - 1):
                 client.set_collision_filter(body, link, *_NO_CONTACTS)
@@ -83,7 +84,7 @@ class BroadPhase:
         """
         client = self._client
         client.load(self._away)
-        # Far away the links overlap too, so they must touch nothing.
+        # All links wait at one place and overlap there, so filter their pairs out.
         for body, link, _, _ in self._links:
             client.set_collision_filter(body, link, *_NO_CONTACTS)
         # A detection that finds a single pair moves the cursor to the first pair.
@@ -114,7 +115,7 @@ class BroadPhase:
         )
 
     def _read_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
-        """Find out how the importer added a body's base and links to the broad phase.
+        """Append a body's base and links, each as it entered the broad phase.
 
         The importer adds every link with its centre of mass at the origin of the link's
         frame. In the end it moves the links to their poses, but not their AABBs. It

@@ -41,7 +41,7 @@ from torch_panda.bullet.urdf import (
 from torch_panda.checks import check_not_negative, check_quaternion
 from torch_panda.rotations import NO_ROTATION
 
-# pybullet's default for setJointMotorControlArray(POSITION_CONTROL).
+# pybullet's default velocityGain in setJointMotorControlArray.
 VELOCITY_GAIN = 1.0
 
 
@@ -320,7 +320,7 @@ class PhysicsClient:
         lateral: float | None = None,
         spinning: float | None = None,
     ) -> None:
-        """Set friction coefficients of a link (-1 is the base); None keeps one.
+        """Set friction coefficients of a link (-1 is the base); None changes nothing.
 
         Raises:
             ValueError: a coefficient is negative or not finite.
@@ -397,7 +397,7 @@ class PhysicsClient:
     def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
         """Set the collision group and mask of a link (-1 is the base).
 
-        Resets keep a filter that was set while the scene was built.
+        Resets restore the filter that was set while the scene was built.
 
         Two links touch if the group of either has a bit of the other's mask. The link
         leaves Bullet's broad phase and enters it again as the last link, without its
@@ -484,7 +484,7 @@ class PhysicsClient:
         return int(capi.status_snapshot(status))
 
     def load(self, snapshot: int) -> None:
-        """Move everything to where it was in a snapshot that has no contacts.
+        """Restore a snapshot, which must have been taken without contacts.
 
         Unlike `set_base`, this does not update the AABBs from which Bullet's broad
         phase finds overlaps: the next collision detection does.
@@ -649,7 +649,7 @@ class PhysicsClient:
         )
 
     def _run(self, command: int, action: str) -> None:
-        """Submit a command whose answer is only that it was carried out."""
+        """Submit a command that returns nothing but its success."""
         self.connection.submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, action)
 
 

@@ -21,8 +21,9 @@ ArmMode = Literal["position", "velocity", "torque"]
 class MotorControl:
     """Drives all movable joints of a robot.
 
-    It is a `Control`, and because it is data, the native loop carries it out without
-    Python. The arm's joints are the first joints. A setpoint is a row of numbers:
+    It is a `Control` that consists of numbers only, so the native loop carries it out
+    without Python. The arm's joints are the first joints. A setpoint is a row of
+    numbers:
 
     * for the arm's joints, by ``arm_mode``: positions [rad], velocities [rad/s] or
       torques [N m];
@@ -35,7 +36,8 @@ class MotorControl:
         forces: Maximum force of every joint's motor [N m] or [N]. Torques of
             ``arm_mode="torque"`` are not limited.
         ik_link: Link for which inverse kinematics find the arm's joint positions; None
-            means that setpoints contain the arm's joints.
+            means that setpoints contain the arm's joints. It needs ``arm_mode``
+            "position" and ``num_arm_joints``.
         ik_orientation: Orientation that this link keeps, quaternion xyzw in the world
             frame; None means that setpoints contain it.
         num_arm_joints: Number of the arm's joints.
@@ -57,7 +59,7 @@ class MotorControl:
 
     @property
     def num_free_joints(self) -> int:
-        """Number of joints, the first ones, that are not driven to positions."""
+        """Number of the first joints, which are driven by velocity or torque."""
         return 0 if self.arm_mode == "position" else self.num_arm_joints
 
     @property
@@ -73,8 +75,13 @@ class MotorControl:
             num_joints: Number of movable joints of a robot.
 
         Raises:
-            ValueError: the number of forces or the shape of the setpoints is wrong.
+            ValueError: The number of forces or the shape of the setpoints is wrong, or
+                ``ik_link`` is used with velocities or torques.
         """
+        if self.ik_link is not None and self.arm_mode != "position":
+            raise ValueError(
+                f'ik_link needs arm_mode "position", got "{self.arm_mode}"'
+            )
         if len(self.forces) != num_joints:
             raise ValueError(
                 f"a MotorControl needs a force for each of {num_joints} movable "

@@ -24,8 +24,8 @@ class VectorSimulation:
     """Steps ``num_envs`` clients of one scene in parallel threads.
 
     Args:
-        build: Builds the scene in a client. It is called once per client, in one
-            thread, and must build the same scene every time.
+        build: Builds the scene in a client. It is called once per client, one after
+            another, and must build the same scene every time.
         num_envs: Number of clients.
         num_threads: Number of threads; None means one per core, at most ``num_envs``.
         physics: Parameters of the integration.

@@ -193,7 +193,7 @@ class Episodes:
             start_state = None if state is None else self._read_state(state, envs)
             # If anything below raises, these environments need another reset.
             self._needs_reset.update(envs)
-            # A step that raised did not report which clients diverged, so check now.
+            # If the last step raised, clients may have diverged without being rebuilt.
             for env in set(envs).intersection(self.simulation.diverged()):
                 self.simulation.rebuild(env)
             for env in envs:
@@ -208,7 +208,8 @@ class Episodes:
             self._needs_reset.difference_update(envs)
             observed = self._observe()
             if start_state is not None:
-                # The state may be the last of its episode. The next step ends it again.
+                # A start is never an end, even if the given state was the last of its
+                # episode.
                 for key in ("terminated", "truncated", "done"):
                     observed[key][envs] = False
             return observed
@@ -291,7 +292,10 @@ class Episodes:
         """
         exists = check_integer("an index", env) in range(self.num_envs)
         if not exists or env in self._needs_reset:
-            raise ValueError(f"there is no environment {env} that was reset")
+            raise ValueError(
+                f"there is no environment {env} that was reset: an index must be from "
+                f"0 to {self.num_envs - 1}, and the environment must have been reset"
+            )
 
     def close(self) -> None:
         """Free all clients and threads. Closing again does nothing."""

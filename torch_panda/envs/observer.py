@@ -14,8 +14,8 @@ from torch_panda.robots import Robot
 from torch_panda.sensors import Entry, JointState, Observer, Sensor, join_entries
 from torch_panda.tasks import Task
 
-# Number of observations, of all environments at once, whose numbers are checked. The
-# check is too expensive for every step.
+# Number of the first observations that are checked for NaN and infinity. The check is
+# too expensive for every step.
 _NUM_CHECKED = 20
 
 Observed = dict[str, Tensor]

@@ -30,7 +30,8 @@ PARAMETERS = (
     "joint_damping",
     "gravity",
 )
-# Parameters whose drawn number is the value itself where the nominal value is 0.
+# A factor on 0 has no effect. If the nominal value of these is 0, the drawn number is
+# the value itself.
 _ABSOLUTE_AT_ZERO = ("object_restitution", "joint_damping")
 
 # Entries of a state that determine the physics of an episode.
@@ -58,12 +59,14 @@ class Randomization:
         table_friction: Lateral friction of the table and all other fixed bodies.
         finger_friction: Lateral friction of the robot's ``finger_links``.
         object_restitution: Restitution of all objects. Where the nominal value is 0,
-            Bullet's default, the drawn number is the restitution itself. The table
-            then gets a restitution of 1, because Bullet multiplies both.
+            Bullet's default, the drawn number is the restitution itself. With this
+            range the table and all other fixed bodies get a restitution of 1, because
+            Bullet multiplies both.
         joint_damping: Damping of the robot's joints. Where the nominal value is 0, as
             in the Panda, the drawn number is the damping itself [N m s/rad].
         gravity: Gravity of the world.
-        joint_position: The arm's joints start up to this far from neutral [rad].
+        joint_position: Largest offset of the arm's joints from neutral at the start
+            [rad].
         observe: Observe ``physics_parameters``, float32 (*batch, k): the drawn
             factors, in the order above.
 

@@ -253,11 +253,12 @@ class RobotTaskEnv(EnvBase):
                 tensordict holds observations and a state. torchrl's `TransformedEnv`
                 and `ParallelEnv` do not pass states on.
         """
-        # torchrl also resets within a rollout, with observations, and says so.
+        # In a rollout torchrl passes the last observations and `select_reset_only`,
+        # which is no state.
         if set_state is None and not kwargs.get("select_reset_only", False):
             set_state = is_state(tensordict, self.episodes.entries)
         if set_state and tensordict is not None:
-            # torchrl writes the observations into it, the goal as float32.
+            # Copy it, because torchrl would overwrite the caller's float64 goal.
             tensordict = tensordict.copy()
         start = super().reset(tensordict, set_state=set_state, **kwargs)
         return start.exclude(*EXACT_KEYS) if set_state else start
@@ -276,7 +277,7 @@ class RobotTaskEnv(EnvBase):
         is_plain = tensordict.batch_size == self.batch_size
         if not is_plain or "_step" in keys or "next" in keys:
             return super().step(tensordict)
-        # torchrl's own step would complete and reshape the result, which is complete.
+        # The result is complete already, so skip the checks of torchrl's own step.
         return tensordict.set("next", self._step(tensordict))
 
     def rollout(
@@ -533,7 +534,7 @@ class RobotTaskEnv(EnvBase):
         return STATE_KEY in set(wrapper.state_spec.keys())
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
-        """Whether a tensordict holds a state; `TransformedEnv` asks this."""
+        """Whether a tensordict has a state under "state"; `TransformedEnv` asks."""
         return tensordict is not None and unpack_state(tensordict) is not tensordict
 
     def _set_seed(self, seed: int | None) -> None:

@@ -27,7 +27,7 @@ PHYSICAL = (
 STATE = (*PHYSICAL, "desired_goal", "step_count", *PHYSICS)
 # Key under which `StateTransform` carries a whole state.
 STATE_KEY = "state"
-# Entries of an exact state beside those of a state.
+# Entries that only an exact state has.
 EXACT_KEYS = (*(START + key for key in STATE), ACTIONS, NUM_ACTIONS)
 
 

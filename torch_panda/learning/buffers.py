@@ -12,8 +12,8 @@ from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "augment", "none"]
 
-# From the panda-gym paper (arXiv 2106.13687): hindsight goals for each original goal,
-# and the capacity in original transitions.
+# From the panda-gym paper (arXiv 2106.13687): hindsight goals per original goal, the
+# HER paper's k, and the capacity in original transitions.
 K = 4
 BUFFER_SIZE = 1_000_000
 SETTLED = 4  # steps after which Slide's puck, which starts in the air, has fallen
@@ -46,9 +46,10 @@ def make_buffer(
     Args:
         env: Environment whose transitions will be stored.
         capacity: Number of transitions before relabelling, at most `BUFFER_SIZE`.
-        her: "relabel" gives K of K + 1 sampled transitions a hindsight goal. "parts"
-            does so for each object's part of a goal separately. "augment" stores K
-            relabelled copies of each transition. "none" uses the original goals.
+        her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
+            hindsight goal. "parts" does so for each object's part of a goal separately.
+            "augment" stores K relabelled copies of each transition. "none" uses the
+            original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of other
             transitions. The others were achieved later in the same episode.
         seed: Seed of the choice of goals.
@@ -87,8 +88,8 @@ def make_buffer(
 def find_motion(data: TensorDictBase) -> Tensor:
     """Find the episodes in which the achieved goal changed.
 
-    Any action reaches the hindsight goals of the other episodes, so these teach little
-    (arXiv 2012.08850).
+    In an episode without motion every hindsight goal is achieved already, so it teaches
+    little (arXiv 2012.08850).
 
     Args:
         data: Episodes [num_envs, steps].

@@ -93,7 +93,7 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
 
 
 class StartFrom(Transform):
-    """Starts some episodes in given states, with the goals that the episodes have.
+    """Starts some episodes in given states, and keeps each episode's goal.
 
     Args:
         states: States (n,) of `states_at_objects`.
@@ -132,7 +132,7 @@ class StartFrom(Transform):
                 return tensordict_reset
             state["object_pose"][placed, 0] = pose[placed]
             state["object_velocity"][placed, 0] = 0.0
-        # Keep the observations of environments that are not reset again.
+        # The other environments keep the observations of their first reset.
         start = tensordict_reset.copy().update(state.to(env.device))
         start = env.reset(start.set("_reset", chosen.to(env.device)), set_state=True)
         return start.select(*tensordict_reset.keys(True, True))

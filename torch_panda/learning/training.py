@@ -95,7 +95,9 @@ class Run:
         if args.start_at_object:
             states = states_at_objects(args.env_id, seed=args.seed)
             env = TransformedEnv(env, StartFrom(states, args.start_at_object))
-        # Each batch [num_envs, steps] has one whole episode of every environment.
+        # Each batch [num_envs, steps] begins with a reset and has `steps` steps of
+        # every environment: whole episodes, unless some start in the middle of the
+        # task.
         self.collector = Collector(
             env,
             self.agent.explore,
@@ -184,7 +186,7 @@ class Run:
         for _ in range(due if len(self.buffer) else 0):
             if args.anneal_lr:
                 last = args.updates_per_step * args.total_steps
-                # The last iteration may go beyond the last step.
+                # Steps come in whole iterations, so updates may exceed `last`.
                 agent.set_learning_rate(max(0.0, 1 - agent.updates / last))
             batch = self.buffer.sample(args.batch_size - self.num_demos)
             demos = self.demos.sample(self.num_demos) if self.num_demos else None

@@ -4,11 +4,12 @@ The replacement depends on the layout of Bullet's objects in memory. It is used 
 all of these conditions hold; otherwise Bullet's own functions run:
 
 1. ``TORCH_PANDA_SOLVER`` is not ``bullet``.
-2. The process runs on x86-64 Linux. Other compilers fuse multiply-adds.
+2. The process runs on x86-64 Linux. Compilers for other platforms fuse multiply-adds,
+   which changes bits.
 3. The installed pybullet has the supported version.
 4. torch_panda was installed with its C library, compiled from the same sources.
 5. pybullet's extension module has the symbols that are needed, and each table of
-   virtual functions holds the function that is replaced exactly once.
+   virtual functions (vtable) has exactly one slot with the function to replace.
 6. Bullet's objects in a known scene are laid out as ``bullet_types.h`` declares.
 7. The same scene comes out the same with and without the replacement, bit for bit.
 
@@ -40,7 +41,7 @@ from torch_panda.bullet.solver.self_test import run_self_test
 
 SolverName = Literal["packed", "bullet"]
 
-# Chooses the solver of this process before its first client is created.
+# Environment variable, read when the first client of the process is created.
 SOLVER_VARIABLE = "TORCH_PANDA_SOLVER"
 
 _LIBRARY = "torch_panda.bullet.solver._solver"
@@ -67,7 +68,8 @@ _REPLACED = (
     (_MOTOR, "_ZN21btMultiBodyJointMotor" + _CREATE_ROWS),
     (_LIMIT, "_ZN31btMultiBodyJointLimitConstraint" + _CREATE_ROWS),
 )
-_EXPORTED = "b3ConnectPhysicsDirect"  # its address is known in the process, too
+# An exported function: ctypes knows its address, which gives the load address.
+_EXPORTED = "b3ConnectPhysicsDirect"
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class SolverStatus:
 
 
 def activate() -> SolverStatus:
-    """Replace Bullet's solver in this process, if the gate allows it.
+    """Replace Bullet's solver in this process if all conditions of this module hold.
 
     The first call decides. Later calls return its result.
 
@@ -130,7 +132,7 @@ def _decide() -> SolverStatus:
 
 
 def open_gate() -> None:
-    """Check all conditions but the first, and enable the replacement.
+    """Check conditions 2 to 7, and enable the replacement.
 
     Raises:
         GateError: A condition does not hold. Bullet's own functions run.
@@ -174,7 +176,7 @@ def check_version() -> None:
 
 def load_library() -> SolverLibrary:
     """Load the compiled library."""
-    # It has the name of an extension module, but knows nothing of Python.
+    # setuptools builds it like an extension module, but ctypes loads it.
     spec = importlib.util.find_spec(_LIBRARY)
     if spec is None or spec.origin is None:
         raise GateError(
@@ -212,6 +214,7 @@ def find_replacements(path: str) -> list[Replacement]:
                 f"{table_name} holds the function to replace {len(slots)} times, "
                 f"expected once"
             )
-        # Objects point behind the offset and the type information of the table.
+        # Objects point behind the first two words of the table, which are not
+        # functions.
         replacements.append(Replacement(table + 16, table + 8 * slots[0], function))
     return replacements

@@ -63,7 +63,7 @@ class Agent(nn.Module, ABC):
         noise: Sequence[TensorDictModuleBase],
         trained: Sequence[Tensor],
     ) -> None:
-        """Assemble policy, exploration and optimizer; a constructor ends with it.
+        """Assemble policy, exploration and optimizer at the end of a constructor.
 
         Args:
             actor: Module from ``normalized`` to ``action``.
@@ -143,9 +143,9 @@ class Agent(nn.Module, ABC):
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """Take one gradient step of the policy towards demonstrated actions.
 
-        The loss is the mean absolute difference, as in ACT (arXiv 2304.13705). If a
-        demonstrator does one of two things, this loss leads to the more frequent one. A
-        squared loss would lead to an action between the two.
+        The loss is the mean absolute difference, as in ACT (arXiv 2304.13705). Where
+        demonstrators differ, this loss picks the more frequent action. A squared loss
+        would lead to an action between the two.
 
         Returns:
             The loss, a scalar without gradients.
@@ -179,7 +179,7 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
     """Check that hyperparameters fit an environment.
 
     Raises:
-        ValueError: A hyperparameter needs a gripper or a layout that is not there.
+        ValueError: A hyperparameter needs a gripper or a layout that the task lacks.
     """
     if hp.fine_fingers and not spaces.has_free_gripper:
         raise ValueError(

@@ -28,7 +28,7 @@ class DDPG(Agent):
     """A critic, and a deterministic actor that ascends the critic's value."""
 
     num_critics = 1
-    actor_interval = 1  # gradient steps of the critics for each one of the actor
+    actor_interval = 1  # the actor learns in every n-th gradient step
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
