@@ -1,4 +1,9 @@
-"""Experts succeed as often under `physics="fast"`: run with pytest -m slow -s."""
+"""Success of experts under coarser physics: run with pytest -m slow -s.
+
+Under `physics="fast"` it must not fall by more than 2 percentage points in Reach, Push,
+PickAndPlace and Stack. In Slide and Flip it falls further: an expected failure. If only
+the solver stops earlier, Slide must not lose more than 5 points.
+"""
 
 import pytest
 import torch
