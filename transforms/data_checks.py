@@ -162,8 +162,8 @@ class DataCheck:
         An entry is suspect if the environment without its transforms does not have it
         in the same shape. A column passes if the achieved goal alone reproduces it, or
         if it belongs to a copy of one of the environment's own entries, which may
-        contain constants of an episode. Such constants could fit by chance, so the check
-        needs more different goals than an affine function has coefficients.
+        contain constants of an episode. Such constants could fit by chance, so the
+        check needs more different goals than an affine function has coefficients.
 
         Returns:
             Whether the rows have enough different goals to tell.
