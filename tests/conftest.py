@@ -9,12 +9,17 @@ import torch_panda
 from torch_panda.bullet import native
 
 
-@pytest.fixture(scope="session", autouse=True)
-def interrupts():
-    """Ctrl-C raises, also where a shell's background job started with it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+@pytest.fixture(autouse=True)
+def signals():
+    """Ctrl-C raises in every test, whatever handlers the test before it installed.
+
+    A background job of a shell starts with Ctrl-C ignored.
+    """
+    before = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(params=["native", "ctypes"])
@@ -53,10 +58,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(curve, "EPISODES", 8)
     monkeypatch.setattr(curve, "NUM_ENVS", 8)
     monkeypatch.setattr(video, "CELL", (64, 80))
-    handlers = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
     threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
     torch.set_num_threads(threads)
     torch.set_float32_matmul_precision(precision)

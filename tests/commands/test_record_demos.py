@@ -82,8 +82,8 @@ def test_ctrl_c_while_writing_leaves_the_file_as_it_was(tmp_path, monkeypatch):
     out = tmp_path / "demos.pt"
     out.write_bytes(b"before")
 
-    def write_half(content, path):
-        path.write_bytes(b"half")
+    def write_half(content, file):
+        file.write(b"half")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(torch, "save", write_half)

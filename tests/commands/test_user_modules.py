@@ -63,7 +63,7 @@ def test_several_modules_are_imported_in_turn(folder, capsys):
     (folder / "first.py").write_text("print('first')")
     (folder / "second.py").write_text("print('second')")
     modules = ["--import", "first.py", "--import", "second.py"]
-    with pytest.raises(SystemExit, match=r"^there is no "):
+    with pytest.raises(SystemExit, match=r"^no policy 'nothing'"):
         main(["evaluate", "nothing", *modules])
     assert capsys.readouterr().out.splitlines() == ["first", "second"]
 
