@@ -76,4 +76,3 @@ def test_guide():
     goals = names["slices"]["desired_goal"]
     assert (goals == goals[:, :1]).all()
     assert names["batch"].shape == (256,)
-    assert max(map(len, text.splitlines())) <= 120
