@@ -4,7 +4,7 @@
 
 Each plan copies the exact state of one environment into many others, tries a sequence
 of actions in each, and samples better sequences near the best ones. The environment
-then takes the first action. Push succeeds in most episodes, without any training.
+then takes the first action. No training is needed.
 """
 
 import torch

@@ -1,4 +1,4 @@
-"""Generated data sets: what they hold, and that the arguments determine them."""
+"""Generated data sets: their content, and that the arguments determine it."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What holds for every id. A new task is tested without being named here.
+"""Tests that run over every id. They find a new task by its registration.
 
 The expected sizes are read from the task and the robot of an id. The sizes of the ids
 of the paper and of panda-gym are fixed in `test_sizes_of_the_contract`.

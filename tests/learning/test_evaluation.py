@@ -1,4 +1,4 @@
-"""Evaluations: which episodes run, and what is measured."""
+"""Evaluations: the episodes that run, and the results."""
 
 import pytest
 import torch

@@ -112,7 +112,7 @@ def test_concatenating_after_hindsight_has_the_new_goal():
 
 @pytest.mark.parametrize("goals", ["achieved", "zeros"])
 def test_observations_that_hold_the_achieved_goal_are_no_copies(goals):
-    """Even where every row is asked for what it has, or goals are constants."""
+    """This holds even if each desired goal is the achieved one, or is constant."""
     data = Envs(4, [5]).chunk(10).reshape(-1)
     goal = data["achieved_goal"] if goals == "achieved" else torch.zeros(40, 3)
     data["desired_goal"], data["next", "desired_goal"] = goal.clone(), goal.clone()

@@ -13,8 +13,8 @@ from torch_panda.bullet import capi
 
 Doubles = npt.NDArray[np.float64]
 
-# In Bullet's coordinates q and u, joints follow the base, whose pose has 7 numbers and
-# whose velocity has 6.
+# In Bullet's coordinates q and u, the joints follow the base. The pose of the base has
+# 7 numbers, and its velocity has 6.
 Q_OFFSET = 7
 U_OFFSET = 6
 

@@ -1,7 +1,7 @@
 """Restores Bullet's broad phase to its state after the scene was built.
 
-A step depends on more than poses and velocities. Bullet solves contacts in the order in
-which its broad phase found the pairs of bodies, and this order depends on the past. The
+A step depends on more than poses and velocities. Its broad phase finds pairs of bodies
+in an order that depends on the past, and Bullet solves contacts in this order. The
 state of the broad phase consists of
 
 * the pairs whose AABBs overlap, in an order that additions and removals shuffle;
@@ -25,7 +25,7 @@ from torch_panda.rotations import rotate_vector
 
 # Where bodies wait until they are inserted again [m]. The distance is much larger than
 # the scene, so that Bullet inserts an AABB beside those in the scene, and never among
-# those that wait.
+# the waiting ones.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
 # A detection reads one bit of the counter per level of the tree. Trees of the shipped
 # tasks have up to 11 levels. In 120 episodes, bits from the seventh on had no effect.
@@ -35,7 +35,7 @@ _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
 
 
 class _Link(NamedTuple):
-    """A link as it was when its body was built."""
+    """The collision filter and pose with which a link entered the broad phase."""
 
     body: int
     link: int

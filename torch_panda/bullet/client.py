@@ -151,9 +151,9 @@ class PhysicsClient:
             tool: A link to add.
 
         Raises:
-            FileNotFoundError: the file does not exist.
-            ValueError: the URDF is broken, lacks a mesh, or sets collision groups,
-                which `BroadPhase` could not restore; see `urdf.check_urdf`.
+            FileNotFoundError: The file does not exist.
+            ValueError: The URDF is broken, lacks a mesh, or sets collision groups; see
+                `urdf.check_urdf`. Set groups with `set_collision_filter` instead.
             BulletError: Bullet cannot load the file. It prints the reason.
         """
         check_quaternion("orientation", orientation)

@@ -101,7 +101,7 @@ def generate(
                 if progress is not None:
                     progress(len(numbers))
             part: TensorDictBase
-            part = torch.stack(rows, dim=1)[: len(numbers)]  # type: ignore
+            part = torch.stack(rows, dim=1)[: len(numbers)]  # type: ignore[assignment]
             part["collector", "traj_ids"] = numbers[:, None].repeat(1, steps)
             parts.append(part)
     return TensorDict.cat(parts)
@@ -122,9 +122,8 @@ class _Episodes:
         self._generators = []
         noise = []
         for index in range(env.batch_size[0]):
-            env_seed, other_seed = np.random.SeedSequence((seed, first + index)).spawn(
-                2
-            )
+            sequence = np.random.SeedSequence((seed, first + index))
+            env_seed, other_seed = sequence.spawn(2)
             # set_env_seed takes an int64.
             env.set_env_seed(index, int(env_seed.generate_state(1, np.uint64)[0] >> 1))
             self._generators.append(np.random.default_rng(other_seed))

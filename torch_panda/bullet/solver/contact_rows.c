@@ -1,8 +1,8 @@
 /*
  * Rows of contacts, with friction and spinning friction.
  *
- * Which part of Bullet each function stands for
- * ---------------------------------------------
+ * Functions here, and their counterparts in Bullet
+ * ------------------------------------------------
  * convert_manifold  btMultiBodyConstraintSolver::convertMultiBodyContact
  * finish_contact    btMultiBodyConstraintSolver::setupMultiBodyContactConstraint, and
  *                   addMultiBodyFrictionConstraint for friction
@@ -18,8 +18,8 @@
  * Bullet creates the rows of a contact one after the other. Each time it turns the
  * contact into the frame of each link, and prepares loops over all links. Here, what the
  * rows of a contact share is computed once, and a body without links has no loops. The
- * other operations are Bullet's, in Bullet's order. responses.c says what is left out
- * where a body has links.
+ * other operations are Bullet's, in Bullet's order. responses.c explains the case of
+ * a body with links.
  *
  * Bullet converts manifolds of bodies that are not as simple as assumed, with rolling or
  * anisotropic friction, or with numbers that are not finite.
@@ -94,7 +94,7 @@ static int is_static(const struct multi_body *body) {
                                 body->base_collider->flags & (STATIC | KINEMATIC));
 }
 
-/* What a unit impulse along a Jacobian does to the velocities of a body. */
+/* The change of velocity of a body by a unit impulse along a Jacobian. */
 static void respond(const struct multi_body *body, const double *jacobian,
                     double *unit) {
     const struct matrix3 *rotation = body->matrix_buffer.data;
@@ -235,7 +235,7 @@ static double product(const double *a, const double *b, int count) {
     return sum;
 }
 
-/* What all kinds of rows have in common; returns the velocity along the row. */
+/* Fills the fields that all kinds of rows have; returns the velocity along the row. */
 static double finish_row(const struct side *sides, const struct direction *direction,
                          double cfm, const struct solver_info *info) {
     struct constraint_row *row = direction->row;

@@ -52,7 +52,7 @@ _CREATE_ROWS = (
     "20createConstraintRowsER20btAlignedObjectArrayI27btMultiBodySolverConstraint"
     "ER23btMultiBodyJacobianDataRK19btContactSolverInfo"
 )
-# Tables of virtual functions, and what is replaced in them; in the order of hook.c.
+# Tables of virtual functions and the functions to replace, in the order of hook.c.
 _REPLACED = (
     (
         _SOLVER,
@@ -74,7 +74,7 @@ _EXPORTED = "b3ConnectPhysicsDirect"
 
 @dataclass(frozen=True)
 class SolverStatus:
-    """Which solver steps the clients of this process.
+    """The solver that steps the clients of this process.
 
     Attributes:
         name: "packed" is this package's solver, "bullet" is Bullet's own.

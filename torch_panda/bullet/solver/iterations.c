@@ -1,8 +1,8 @@
 /*
  * The solver's iterations, on packed rows.
  *
- * Which part of Bullet each function stands for
- * ---------------------------------------------
+ * Functions here, and their counterparts in Bullet
+ * ------------------------------------------------
  * solve_group       btSequentialImpulseConstraintSolver::
  *                   solveGroupCacheFriendlyIterations, as a btMultiBodyConstraintSolver
  *                   runs it: iterations until the residual is small enough, and the
@@ -12,7 +12,7 @@
  * resolve_row       btMultiBodyConstraintSolver::resolveSingleConstraintRowGeneric
  * resolve_cone      btMultiBodyConstraintSolver::resolveConeFrictionConstraintRows
  * apply             applyDeltaVee of the solver and applyDeltaVeeMultiDof2 of the body,
- *                   which add the same numbers to two accumulators
+ *                   two functions that add the same numbers to two accumulators
  *
  * Why the results are the same bits
  * ---------------------------------
@@ -56,7 +56,7 @@ struct term {
     const double *velocity;
 };
 
-/* What an impulse does to a body: pairs of velocities, both arrays aligned. */
+/* The effect of an impulse on the velocities of a body; both arrays are aligned. */
 struct response {
     const double *unit;
     double *velocity;
@@ -360,7 +360,7 @@ static void pack_rows(struct group *group, const struct solver *solver,
 
 /* ---- memory of a group --------------------------------------------------------- */
 
-/* What is left of the caller's stack, and the blocks that did not fit there. */
+/* The rest of the caller's stack block, and the blocks that did not fit into it. */
 struct memory {
     char *rest;
     size_t size;

@@ -1,8 +1,8 @@
 /*
  * Rows of joint motors and joint limits.
  *
- * Which part of Bullet each function stands for
- * ---------------------------------------------
+ * Functions here, and their counterparts in Bullet
+ * ------------------------------------------------
  * fill_row          btMultiBodyConstraint::fillMultiBodyConstraint, for a Jacobian with
  *                   one entry.
  * create_motor_rows btMultiBodyJointMotor::createConstraintRows

@@ -1,9 +1,9 @@
 /*
  * The layout probe: are Bullet's structs laid out as bullet_types.h says?
  *
- * It looks at a scene whose numbers are known, while Bullet itself solves it. It goes
- * from what is sure to what depends on it: numbers of the settings first, sizes of
- * arrays next, and what pointers point to last.
+ * It looks at a scene whose numbers are known, while Bullet itself solves it. It
+ * checks the numbers of the settings first, the sizes of arrays next, and follows
+ * pointers last, because a check relies on the checks before it.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "solver.h"

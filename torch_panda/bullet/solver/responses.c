@@ -1,8 +1,8 @@
 /*
  * What impulses at joints do to all joints of a body.
  *
- * Which part of Bullet each function stands for
- * ---------------------------------------------
+ * Functions here, and their counterparts in Bullet
+ * ------------------------------------------------
  * solve_pair        btMultiBody::calcAccelerationDeltasMultiDof, for two rows
  *
  * Why the results are the same bits
