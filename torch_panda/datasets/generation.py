@@ -100,8 +100,7 @@ def generate(
                 rows.append(episodes.step())
                 if progress is not None:
                     progress(len(numbers))
-            part: TensorDictBase
-            part = torch.stack(rows, dim=1)[: len(numbers)]  # type: ignore[assignment]
+            part = TensorDict.stack(rows, 1)[: len(numbers)]
             part["collector", "traj_ids"] = numbers[:, None].repeat(1, steps)
             parts.append(part)
     return TensorDict.cat(parts)
