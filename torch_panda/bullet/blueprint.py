@@ -18,7 +18,7 @@ class LoadURDF:
 
     Attributes:
         body: Id that the new body got.
-        file: Path of the file, with the tool if one was added.
+        file: Path of the file. If a tool was added, it is the copy with the tool.
         position: Position of the base, world frame [m].
         orientation: Orientation of the base, quaternion xyzw.
         fixed_base: Whether the base cannot move.
@@ -37,7 +37,7 @@ class CreateBody:
 
     Attributes:
         body: Id that the new body got.
-        shape: Shape of the body; None for a marker that nothing shows.
+        shape: Shape of the body; None for an invisible marker.
         mass: Mass [kg]; 0 for a body that never moves.
         position: Position of its centre, world frame [m].
         visual: How the body is drawn.
@@ -82,7 +82,7 @@ class SetCollisionFilter:
 
 @dataclass(frozen=True)
 class SetPhysics:
-    """Changes physical numbers of a link or joint, which no renderer shows.
+    """Changes physical properties of a link or joint, which renderers ignore.
 
     Attributes:
         method: Method of `PhysicsClient` that was called.

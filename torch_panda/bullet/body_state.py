@@ -1,7 +1,7 @@
 """The state of a body as Bullet reports it, in views of Bullet's memory.
 
-The views are valid until the client's next command: copy numbers that you keep. All
-numbers are float64 and in the world frame.
+The views are valid until the client's next command, so copy the numbers that you want
+to keep. All numbers are float64 and in the world frame.
 """
 
 from ctypes import byref, c_double, c_int, c_void_p
@@ -22,7 +22,13 @@ _DOUBLE = 8  # bytes
 
 
 def _view(address: int | None, first: int, *shape: int) -> Doubles:
-    """A view of doubles in Bullet's memory, from the double with index ``first`` on."""
+    """A view of doubles in Bullet's memory.
+
+    Args:
+        address: Address of an array of doubles.
+        first: Index of the first double of the view.
+        *shape: Shape of the view, of one or two dimensions.
+    """
     assert address is not None  # the status was checked
     count = shape[0] if len(shape) == 1 else shape[0] * shape[1]
     array = (c_double * count).from_address(address + _DOUBLE * first)
@@ -95,10 +101,11 @@ class BodyState:
 
     @property
     def wrenches(self) -> Doubles:
-        """Forces [N] and torques [N m] of the last step on links by parents (m, 6).
+        """Wrench that each link got from its parent link in the last step (m, 6).
 
-        They act at the joint and are given in the link's frame. They are zero unless
-        the joint has a wrench sensor.
+        A wrench is a force [N] and a torque [N m]. It acts at the joint between the two
+        links and is given in the child link's frame. It is zero unless the joint has a
+        wrench sensor.
         """
         num_links, wrenches, _ = self._read_forces()
         return _view(wrenches, 0, num_links, 6)
@@ -110,7 +117,7 @@ class BodyState:
         return _view(motors, 0, num_links)
 
     def _read_forces(self) -> tuple[int, int | None, int | None]:
-        """Number of links, and addresses of wrenches and motor forces."""
+        """Number of links, address of the wrenches, and address of the motor forces."""
         links, wrenches, motors = c_int(), c_void_p(), c_void_p()
         unused = (None,) * 5
         capi.state_result(

@@ -1,18 +1,21 @@
 """Restores Bullet's broad phase to its state after the scene was built.
 
-A step depends on more than poses and velocities. Its broad phase finds pairs of bodies
-in an order that depends on the past, and Bullet solves contacts in this order. The
-state of the broad phase consists of
+The broad phase is the part of collision detection that finds pairs of links whose
+axis-aligned bounding boxes (AABBs) overlap. Bullet solves contacts in the order in
+which these pairs were found, and this order depends on the past. Two worlds with equal
+poses and velocities can therefore step differently.
 
-* the pairs whose AABBs overlap, in an order that additions and removals shuffle;
-* a tree of all AABBs, whose shape determines the order of pairs found together;
-* a counter of collision detections, whose bits choose the leaf of the tree that each
-  detection inserts again;
-* a cursor in the list of pairs, at which each detection starts to look for pairs that
-  no longer overlap.
+The state of the broad phase consists of
 
-No command of Bullet resets this state. `BroadPhase.restore` does it by a sequence of
-commands. ``reset.c`` gives the same commands from C.
+* the list of overlapping pairs, whose order changes when pairs are added or removed;
+* the tree of all AABBs, whose shape determines the order in which pairs are found;
+* the number of collision detections so far. Each detection reinserts one leaf of the
+  tree. The bits of this number choose the path from the root to that leaf;
+* a cursor in the list of pairs. Each detection removes pairs that no longer overlap,
+  and starts to look for them at the cursor.
+
+Bullet has no command that resets this state. `BroadPhase.restore` resets it by a
+sequence of other commands. ``reset.c`` gives the same commands from C.
 """
 
 from ctypes import pointer
@@ -23,12 +26,14 @@ from torch_panda.bullet.blueprint import Blueprint, SetCollisionFilter
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.rotations import rotate_vector
 
-# Where bodies wait until they are inserted again [m]. The distance is much larger than
-# the scene, so that Bullet inserts an AABB beside those in the scene, and never among
-# the waiting ones.
+# Where bodies wait until their links are inserted again [m]. Bullet inserts an AABB
+# near the closest AABBs of the tree. At this distance, the closest AABBs are always
+# those of the scene, and never those of the links that still wait.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
-# A detection reads one bit of the counter per level of the tree. Trees of the shipped
-# tasks have up to 11 levels. In 120 episodes, bits from the seventh on had no effect.
+# The number of detections is restored modulo this cycle, so its lowest 8 bits are
+# restored. A detection reads one bit per level of the tree, and trees of the shipped
+# tasks have up to 11 levels. In 120 episodes, though, only the lowest 6 bits had an
+# effect.
 _DETECTION_CYCLE = 256
 
 _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
@@ -40,18 +45,20 @@ class _Link(NamedTuple):
     body: int
     link: int
     group_mask: tuple[int, int]  # collision group and mask
-    snapshot: int  # has the link at the pose at which it entered the broad phase
+    snapshot: int  # id of a snapshot with the link at the pose at which it entered
 
 
 class BroadPhase:
     """Restores a client's broad phase to its state after the scene was built.
 
-    Loading a snapshot moves bodies without updating their AABBs. A link therefore
-    enters the broad phase exactly when its collision filter is set.
+    Two properties of Bullet's commands make this possible. Setting the collision
+    filter of a link removes the link from the broad phase and inserts it again at its
+    present pose. Loading a snapshot moves bodies, but leaves the AABBs in the broad
+    phase as they are.
 
     Args:
-        client: A client that gets no more bodies, and whose bodies have not moved
-            since they were built.
+        client: A client whose scene is complete and whose bodies have not moved since
+            they were built.
     """
 
     def __init__(self, client: PhysicsClient) -> None:
@@ -60,8 +67,8 @@ class BroadPhase:
         self._links: list[_Link] = []
         self._filters = _read_filters(client.blueprint)
         bodies = {body: _read_poses(client, body) for body in client.bodies}
-        # Filter out all contacts first, because loading a snapshot with contacts would
-        # detect collisions.
+        # Filter out all contacts before the first snapshot: loading a snapshot that has
+        # contacts would run a collision detection.
         for body, poses in bodies.items():
             for link in range(-1, len(poses) - 1):
                 client.set_collision_filter(body, link, *_NO_CONTACTS)
@@ -71,29 +78,32 @@ class BroadPhase:
         for body in bodies:
             client.set_base(body, _FAR_AWAY)
         self._away = client.save()
-        self._pair = client.bodies[:2]
+        self._first_pair = client.bodies[:2]
         client.native.broad_phase = pointer(self._describe())
         self.restore()
 
     def restore(self) -> None:
         """Move all bodies to where they were built and restore the broad phase.
 
-        All links leave the broad phase and enter it one by one, in the order in which
-        they were built. A link that enters has no overlaps and no contacts. Because the
-        old tree is far away, the new tree depends on this sequence only.
+        Move all bodies far away. Then insert one link after another at the pose at
+        which it was built, in the order in which the links were built. An inserted link
+        has lost its overlaps and contacts. The links that are still far away do not
+        affect where a link is inserted, so the new tree depends on this order only.
         """
         client = self._client
         client.load(self._away)
-        # All links wait at one place and overlap there, so filter their pairs out.
+        # All links overlap where they wait, so filter out all their pairs.
         for body, link, _, _ in self._links:
             client.set_collision_filter(body, link, *_NO_CONTACTS)
-        # A detection that finds a single pair moves the cursor to the first pair.
-        for body in self._pair:
+        # Bring the cursor to the start of the list: a detection moves the cursor on,
+        # modulo the number of pairs, so let one detection find exactly one pair.
+        for body in self._first_pair:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
-        for body in self._pair:
+        for body in self._first_pair:
             client.set_collision_filter(body, -1, *_NO_CONTACTS)
-        # Detections are cheap while nothing overlaps: about 1 us.
+        # Advance the number of detections to the next value whose lowest bits are those
+        # after building. While nothing overlaps, a detection takes about 1 us.
         past = client.num_detections - self._num_detections
         client.detect_collisions(-past % _DETECTION_CYCLE)
         for body, link, group_mask, snapshot in self._links:
@@ -109,19 +119,23 @@ class BroadPhase:
             self._away,
             self._built,
             len(links),
-            len(self._pair),
-            self._pair,
+            len(self._first_pair),
+            self._first_pair,
             (native.Link * len(links))(*links),
         )
 
     def _read_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
-        """Append a body's base and links, each as it entered the broad phase.
+        """Append a body's base and links to the list of links to insert.
 
-        The importer adds every link with its centre of mass at the origin of the link's
-        frame. In the end it moves the links to their poses, but not their AABBs. It
-        also rotates links whose inertial frame is rotated. This is not repeated here,
-        because no shipped robot has such links: episodes with such a robot are
-        reproducible, but differ from the first episode of a new client.
+        While Bullet's URDF importer builds a body, it inserts the AABB of each link as
+        if the link's centre of mass were at the origin of the link's frame. At the end,
+        it moves the links to their poses without updating their AABBs. To insert a link
+        where the importer did, its snapshot holds the body shifted by that offset.
+
+        The importer also inserts a link in another orientation if the link's inertial
+        frame is rotated. This method does not imitate that, because no shipped robot
+        has such a link. For a robot that has one, all resets lead to the same broad
+        phase, but it differs from the broad phase of a newly built client.
         """
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):
@@ -138,7 +152,7 @@ class BroadPhase:
 
 
 def _read_filters(blueprint: Blueprint) -> dict[tuple[int, int], tuple[int, int]]:
-    """Collision group and mask of the links, by body and link, that a scene sets."""
+    """Collision groups and masks that a scene sets, by (body, link)."""
     return {
         (command.body, command.link): (command.group, command.mask)
         for command in blueprint

@@ -11,7 +11,8 @@ from torch_panda.rotations import NO_ROTATION
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 NO_SHAPE = -1
 
-# Clients share the caches of Bullet's importer: two threads in it crash.
+# All clients share the caches of Bullet's URDF importer, so two threads that load URDFs
+# at the same time would crash.
 _IMPORTER = threading.Lock()
 
 

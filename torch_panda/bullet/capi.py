@@ -149,8 +149,10 @@ class CameraImage(ctypes.Structure):
     )
 
 
+# Functions of `_work` release the GIL during a call, and those of `_cheap` keep it; see
+# library.py.
 _client = _command = _status = c_void_p
-# Doubles are passed as a ctypes array, or as an address, for example of a tensor.
+# An array of numbers is passed as a ctypes array or as an address.
 _doubles = _floats = c_void_p
 _address = POINTER(c_void_p)
 

@@ -47,7 +47,15 @@ VELOCITY_GAIN = 1.0
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of a body, as its URDF describes it."""
+    """A joint of a body, as its URDF describes it.
+
+    Attributes:
+        index: Index of the joint, and of the link that it moves.
+        name: Name of the joint.
+        link_name: Name of the link that it moves.
+        is_movable: Whether the joint has one degree of freedom.
+        damping: Damping [N m s/rad] or [N s/m].
+    """
 
     index: int
     name: str
@@ -59,20 +67,22 @@ class Joint:
 class PhysicsClient:
     """One DIRECT client of Bullet: a world of bodies.
 
-    One thread at a time may use a client. The client has no visual shapes: it records
-    the commands that build the scene, and renderers draw a copy of the scene that they
-    build from this blueprint.
+    One thread at a time may use a client.
+
+    The client has no visual shapes. Instead, it records the commands that build its
+    scene in a blueprint. A renderer builds its own copy of the scene from the blueprint
+    and draws that copy.
 
     Args:
         physics: Parameters of the integration.
 
     Raises:
-        ImportError: the installed pybullet has another C API.
+        ImportError: the C API of the installed pybullet is not the supported one.
         BulletError: Bullet could not create a client.
 
     Attributes:
         connection: The connection to Bullet, for commands that this class lacks.
-        native: The struct by which the native loop knows the client.
+        native: The struct through which the native loop uses the client.
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
@@ -83,8 +93,10 @@ class PhysicsClient:
         self._bodies: list[int] = []
         self._blueprint: list[Command] = []
         self._is_recording = True
-        # This command has the highest status code in use, which differs in every
-        # version of Bullet that inserts a status code before it.
+        # Check that Bullet's status codes are those of `capi`. New versions of Bullet
+        # insert codes in the middle of the list, which shifts all higher codes.
+        # Collision detection has the highest code that torch_panda uses, so it fails
+        # after any such shift.
         try:
             self.detect_collisions()
         except BulletError as error:
@@ -148,30 +160,30 @@ class PhysicsClient:
             position: Position of the base, world frame [m].
             orientation: Orientation of the base, quaternion xyzw.
             fixed_base: Whether the base cannot move.
-            tool: A link to add.
+            tool: A massless link to add to the URDF; None adds none.
 
         Raises:
             FileNotFoundError: The file does not exist.
             ValueError: The URDF is broken, lacks a mesh, or sets collision groups; see
                 `urdf.check_urdf`. Set groups with `set_collision_filter` instead.
-            BulletError: Bullet cannot load the file. It prints the reason.
+            BulletError: Bullet cannot load the file. Bullet prints the reason.
         """
         check_quaternion("orientation", orientation)
         file = find_urdf(path)
         check_urdf(file)
         if tool is not None:
             file = urdf_with_tool(file, tool)
-        place, rotation = _vector(position), _quaternion(orientation)
+        base_position, rotation = _vector(position), _quaternion(orientation)
         body = building.load_urdf(
             self.connection,
             file,
-            place,
+            base_position,
             rotation,
             fixed_base=fixed_base,
             flags=capi.URDF_IGNORE_VISUAL_SHAPES,
         )
         self._bodies.append(body)
-        self._record(LoadURDF(body, file, place, rotation, fixed_base))
+        self._record(LoadURDF(body, file, base_position, rotation, fixed_base))
         return body
 
     def create_box(
@@ -188,7 +200,7 @@ class PhysicsClient:
             half_extents: Half the edge lengths along x, y and z [m].
             mass: Mass [kg]; 0 makes a body that never moves.
             position: Position of its centre, world frame [m].
-            visual: How renderers draw it.
+            visual: How renderers draw the box.
 
         Raises:
             ValueError: the mass is negative or not finite.
@@ -229,8 +241,8 @@ class PhysicsClient:
 
         Args:
             position: Position of its centre, world frame [m].
-            shape: Shape that renderers draw, translucent; None draws nothing.
-            visual: How renderers draw it.
+            shape: Shape that renderers draw; None makes the marker invisible.
+            visual: How renderers draw the shape. Markers are translucent.
         """
         return self._create_body(shape, 0.0, position, visual, is_marker=True)
 
@@ -244,15 +256,15 @@ class PhysicsClient:
         is_marker: bool = False,
     ) -> int:
         check_not_negative(mass=mass)
-        place = _vector(position)
+        centre = _vector(position)
         collision_shape = building.NO_SHAPE
         if shape is not None and not is_marker:
             collision_shape = self._create_collision_shape(shape)
         body = building.create_body(
-            self.connection, place, mass=mass, collision_shape=collision_shape
+            self.connection, centre, mass=mass, collision_shape=collision_shape
         )
         self._bodies.append(body)
-        self._record(CreateBody(body, shape, mass, place, visual, is_marker))
+        self._record(CreateBody(body, shape, mass, centre, visual, is_marker))
         return body
 
     def _create_collision_shape(self, shape: Shape) -> int:
@@ -300,7 +312,7 @@ class PhysicsClient:
         return float(self._dynamics(body, link).restitution)
 
     def centre_of_mass(self, body: int, link: int = -1) -> tuple[float, ...]:
-        """Centre of mass of a link (-1 is the base) in the frame of its URDF [m]."""
+        """Centre of mass of a link (-1 is the base) in the link's URDF frame [m]."""
         return tuple(self._dynamics(body, link).local_inertial_frame[:3])
 
     def _dynamics(self, body: int, link: int) -> capi.DynamicsInfo:
@@ -320,7 +332,7 @@ class PhysicsClient:
         lateral: float | None = None,
         spinning: float | None = None,
     ) -> None:
-        """Set friction coefficients of a link (-1 is the base); None changes nothing.
+        """Set friction coefficients of a link (-1 is the base); None keeps one.
 
         Raises:
             ValueError: a coefficient is negative or not finite.
@@ -340,18 +352,22 @@ class PhysicsClient:
         restitution: float | None = None,
         joint_damping: float | None = None,
     ) -> None:
-        """Change physical numbers of a link (-1 is the base); None keeps a number.
+        """Change physical properties of a link (-1 is the base).
+
+        None keeps a property as it is. For a contact between two links, Bullet
+        multiplies their frictions, and also multiplies their restitutions.
 
         Args:
-            body: The body.
-            link: The link.
-            mass: Mass [kg]; the inertia of a body's base scales with it.
-            lateral_friction: Friction along a surface. Bullet multiplies the values of
-                two bodies that touch.
-            spinning_friction: Friction about the normal of a contact.
-            restitution: 1 bounces back at full speed. Bullet multiplies the values of
-                two bodies that touch.
-            joint_damping: Damping of the link's joint [N m s/rad] or [N s/m].
+            body: Body id.
+            link: Index of the link.
+            mass: Mass [kg]. Bullet computes a new inertia from the mass and the
+                collision shape.
+            lateral_friction: Coefficient of friction along the surface.
+            spinning_friction: Coefficient of friction against rotation about the normal
+                of a contact.
+            restitution: Share of its speed that a body keeps when it bounces, 0 to 1.
+            joint_damping: Damping of the joint that moves the link [N m s/rad] or
+                [N s/m].
 
         Raises:
             ValueError: a number is negative or not finite.
@@ -374,9 +390,10 @@ class PhysicsClient:
         self._record(SetPhysics("set_dynamics", (body, link, *numbers.values())))
 
     def set_joint_friction(self, body: int, joint: int, force: float) -> None:
-        """Let a joint without a motor resist motion by up to a force [N] or [N m].
+        """Set the friction of a joint that no motor drives [N m] or [N].
 
-        The default of Bullet is about 1 N.
+        Bullet's default is about 1 N. The friction is a motor with this maximum force,
+        which drives the velocity of the joint to zero.
 
         Raises:
             ValueError: the force is negative or not finite.
@@ -395,13 +412,13 @@ class PhysicsClient:
         self._record(SetPhysics("set_joint_friction", (body, joint, force)))
 
     def set_collision_filter(self, body: int, link: int, group: int, mask: int) -> None:
-        """Set the collision group and mask of a link (-1 is the base).
+        """Set the collision group and mask of a link (-1 is the base), two bit fields.
 
-        Resets restore the filter that was set while the scene was built.
+        Two links A and B can touch if ``group_A & mask_B`` or ``group_B & mask_A`` is
+        not 0. Resets restore the filter that was set while the scene was built.
 
-        Two links touch if the group of either has a bit of the other's mask. The link
-        leaves Bullet's broad phase and enters it again as the last link, without its
-        former overlaps and contacts.
+        Bullet removes the link from the broad phase and inserts it again as the last
+        link. The link thereby loses its present overlaps and contacts.
         """
         command = capi.filter_init(self.connection.handle)
         capi.filter_set_group_mask(command, body, link, group, mask)
@@ -409,7 +426,7 @@ class PhysicsClient:
         self._record(SetCollisionFilter(body, link, group, mask))
 
     def enable_wrench_sensor(self, body: int, joint: int) -> None:
-        """Make Bullet compute the forces through a joint in every step."""
+        """Make Bullet compute the wrench in a joint; see `BodyState.wrenches`."""
         handle = self.connection.handle
         command = capi.physics_init(handle)
         capi.physics_set_joint_feedback(command, capi.JOINT_FEEDBACK_IN_JOINT_FRAME)
@@ -423,7 +440,7 @@ class PhysicsClient:
     def set_joint(
         self, body: int, joint: int, position: float, velocity: float
     ) -> None:
-        """Move a joint to a position [rad] or [m], with a velocity (per second)."""
+        """Set the position [rad] or [m] and velocity [rad/s] or [m/s] of a joint."""
         self.set_joints(body, (joint,), (position,), (velocity,))
 
     def set_joints(
@@ -433,7 +450,7 @@ class PhysicsClient:
         positions: Sequence[float],
         velocities: Sequence[float],
     ) -> None:
-        """Move several joints at once; see `set_joint`."""
+        """Set the positions and velocities of several joints; see `set_joint`."""
         building.set_joints(self.connection, body, joints, positions, velocities)
         if self._is_recording:
             self._record(
@@ -448,11 +465,11 @@ class PhysicsClient:
         linear_velocity: Sequence[float] = ORIGIN,
         angular_velocity: Sequence[float] = ORIGIN,
     ) -> None:
-        """Move a body to a pose and give it a velocity, in the world frame.
+        """Set the pose and the velocity of a body's base, in the world frame.
 
         Args:
-            body: The body.
-            position: Position of its centre of mass [m].
+            body: Body id.
+            position: Position of the base's centre of mass [m].
             orientation: Quaternion xyzw.
             linear_velocity: Linear velocity [m/s].
             angular_velocity: Angular velocity [rad/s].
@@ -484,10 +501,10 @@ class PhysicsClient:
         return int(capi.status_snapshot(status))
 
     def load(self, snapshot: int) -> None:
-        """Restore a snapshot, which must have been taken without contacts.
+        """Restore a snapshot, which must have been taken while there were no contacts.
 
-        Unlike `set_base`, this does not update the AABBs from which Bullet's broad
-        phase finds overlaps: the next collision detection does.
+        Unlike `set_base`, this does not update the bodies' AABBs in Bullet's broad
+        phase. The next collision detection updates them.
         """
         command = capi.load_init(self.connection.handle)
         capi.load_set_snapshot(command, snapshot)
@@ -502,17 +519,18 @@ class PhysicsClient:
         forces: Sequence[float],
         velocities: Sequence[float] | Doubles = (),
     ) -> None:
-        """Drive the first movable joints to velocities and the others to positions.
+        """Set the targets of the motors of all movable joints of a body.
 
-        Does the same as pybullet's ``setJointMotorControlArray`` in velocity and in
-        position control, with the position gain of the client's physics. In position
-        control the desired velocity is Bullet's default, 0.
+        The first joints, as many as there are ``velocities``, get velocity targets. The
+        remaining joints get position targets. The motors behave as after pybullet's
+        ``setJointMotorControlArray``, but their position gain is
+        `PhysicsParams.position_gain`.
 
         Args:
-            body: The body.
-            positions: Positions of the other joints [rad] or [m].
-            forces: Maximum force of every motor [N m] or [N].
-            velocities: Velocities of the first joints [rad/s] or [m/s].
+            body: Body id.
+            positions: Target positions of the remaining joints [rad] or [m].
+            forces: Maximum force of each joint's motor [N m] or [N].
+            velocities: Target velocities of the first joints [rad/s] or [m/s].
         """
         command = capi.motor_init(
             self.connection.handle, body, capi.CONTROL_MODE_POSITION_VELOCITY_PD
@@ -531,7 +549,10 @@ class PhysicsClient:
         )
 
     def apply_torques(self, body: int, torques: Doubles) -> None:
-        """Apply torques [N m] to the first movable joints for one time step."""
+        """Apply torques [N m] to the first movable joints, in the next time step only.
+
+        The first joints are as many as there are torques.
+        """
         command = capi.motor_init(
             self.connection.handle, body, capi.CONTROL_MODE_TORQUE
         )
@@ -544,8 +565,8 @@ class PhysicsClient:
     def step(self, count: int = 1) -> None:
         """Advance the world by ``count`` time steps."""
         handle = self.connection.handle
-        # A client has one command buffer, which stepping does not change: submitting
-        # the same command again steps again.
+        # One command serves all time steps: it lies in the client's command buffer, and
+        # a time step does not overwrite this buffer.
         command = capi.step_init(handle)
         expected = capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED
         for _ in range(count):
@@ -559,7 +580,7 @@ class PhysicsClient:
         handle = self.connection.handle
         command = capi.detect_init(handle)
         self.native.num_detections += count
-        for _ in range(count):  # one command buffer, as in `step`
+        for _ in range(count):  # one command for all detections, as in `step`
             status = capi.submit(handle, command)
         check_status(
             status,
@@ -591,10 +612,13 @@ class PhysicsClient:
         """Contacts of the last time step.
 
         Args:
-            body_a: Only contacts of this body, which becomes body a of each contact.
-            body_b: Only contacts with this body.
+            body_a: Return only contacts of this body, as body a of each contact; None
+                returns contacts of all bodies.
+            body_b: Return only contacts with this body; None returns contacts with all
+                bodies.
         """
-        # Bullet could filter, but swaps a and b without swapping the friction forces.
+        # Filter in Python: Bullet's own filter exchanges bodies a and b where needed,
+        # but does not reverse the friction forces.
         handle = self.connection.handle
         self.connection.submit(
             capi.contact_init(handle),
@@ -620,14 +644,14 @@ class PhysicsClient:
         orientation: Sequence[float],
         joint_positions: Doubles,
     ) -> None:
-        """Find joint positions that bring a link to a pose, by damped least squares.
+        """Find joint positions that bring a link to a pose.
 
-        This is Bullet's default solver. Its other solvers share a static work vector
-        and are not thread-safe.
+        The solver is Bullet's default, damped least squares. Bullet's other solvers
+        keep a vector in static memory, so they are not thread-safe.
 
         Args:
-            body: The body.
-            link: The link whose centre of mass is to reach the pose.
+            body: Body id.
+            link: Index of the link whose centre of mass should reach the pose.
             position: Target position (3,), world frame [m].
             orientation: Target orientation, quaternion xyzw.
             joint_positions: Output, one position per movable joint.
@@ -649,7 +673,7 @@ class PhysicsClient:
         )
 
     def _run(self, command: int, action: str) -> None:
-        """Submit a command that returns nothing but its success."""
+        """Submit a command that has no result, and check that it succeeded."""
         self.connection.submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, action)
 
 

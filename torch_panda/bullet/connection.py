@@ -59,7 +59,7 @@ class Connection:
             Handle of the status, valid until the next command.
 
         Raises:
-            BulletError: the client is closed, or the status code is another one.
+            BulletError: the client is closed, or Bullet answered with another code.
         """
         status: int = capi.submit(self.handle, command)
         return check_status(status, expected, action)
@@ -67,7 +67,7 @@ class Connection:
     def submit_quick(self, command: int, expected: int, action: str) -> int:
         """Submit a cheap command: keep the GIL, because releasing it costs more.
 
-        Arguments, result and errors are those of `submit`.
+        The arguments, the result and the errors are those of `submit`.
         """
         status: int = capi.submit_quick(self.handle, command)
         return check_status(status, expected, action)
@@ -89,10 +89,10 @@ def connect() -> Connection:
 
 
 def check_status(status: int | None, expected: int, action: str) -> int:
-    """Return a status if its code is the expected one.
+    """Return a status unchanged if its code is the expected one.
 
     Raises:
-        BulletError: the code is another one, or Bullet gave no answer.
+        BulletError: Bullet answered with another code, or not at all.
     """
     code = capi.status_type(status) if status else None
     if code != expected:

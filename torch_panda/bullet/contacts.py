@@ -16,10 +16,10 @@ class ContactPoint(NamedTuple):
     link_b: int
     position_on_a: Vector  # [m]
     position_on_b: Vector  # [m]
-    normal_on_b: Vector  # from b towards a
+    normal_on_b: Vector  # points from b to a
     distance: float  # [m], negative where the bodies penetrate
-    normal_force: float  # [N], pushes a along the normal and b against it
-    friction_force: Vector  # [N], on a; its negative acts on b
+    normal_force: float  # [N], on a along normal_on_b; b gets the opposite force
+    friction_force: Vector  # [N], on a; b gets the opposite force
 
     @property
     def force_on_a(self) -> Vector:
@@ -47,7 +47,7 @@ class ContactPoint(NamedTuple):
 
 
 def read_contact(point: capi.ContactPoint) -> ContactPoint:
-    """Convert a contact point from Bullet's struct."""
+    """Convert Bullet's struct of a contact point."""
     friction = (
         point.friction_force_1 * d1 + point.friction_force_2 * d2
         for d1, d2 in zip(

@@ -1,13 +1,14 @@
 """Finds and loads Bullet: the extension module that pybullet's wheel installs.
 
-The module is loaded twice, because in ctypes the library object decides about the GIL:
+ctypes loads the module twice, because the class of a ctypes library decides whether its
+functions release the GIL:
 
-* ``CDLL`` releases the GIL during a call. It serves the calls that do real work, so
-  that clients in different threads step at the same time.
-* ``PyDLL`` keeps the GIL. It serves the cheap setters: releasing the GIL costs more
-  than they do, and two threads would pass it back and forth.
+* ``CDLL`` releases the GIL during a call. It serves calls that take long, such as time
+  steps, so that threads can step different clients at the same time.
+* ``PyDLL`` keeps the GIL. It serves cheap calls, such as setters: releasing the GIL
+  would take longer than the call, and two threads would pass it back and forth.
 
-The module is not imported, because importing pybullet prints a line.
+Python does not import the module, because importing pybullet prints a line.
 """
 
 import ctypes
@@ -44,7 +45,7 @@ def library_path(module: str = "pybullet") -> str:
 
 
 def bind(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any:  # noqa: ANN401 (ctypes function types)
-    """Declare a C function: its name, its result type and its argument types.
+    """Declare a C function with its name, its result type and its argument types.
 
     Raises:
         ImportError: the library does not export the name.

@@ -12,9 +12,12 @@ PhysicsName = Literal["exact", "fast"]
 class PhysicsParams:
     """Parameters of the physics; the defaults are those of panda-gym 3.0.7.
 
-    The control frequency is 1 / (``timestep`` * ``n_substeps``), 25 Hz by default. In
-    every substep, motors remove the share ``position_gain`` of a joint's error. With n
-    substeps instead of 20, a gain of about 1 - 0.9 ** (20 / n) keeps the arm as quick.
+    The control frequency is 1 / (``timestep`` * ``n_substeps``), 25 Hz by default.
+
+    In every substep, a motor removes the share ``position_gain`` of its joint's
+    position error. The default, 0.1 in each of 20 substeps, leaves 0.9 ** 20 of the
+    error after a step. With n substeps, a gain of about 1 - 0.9 ** (20 / n) leaves as
+    much, so that the arm moves as fast.
 
     Args:
         timestep: Length of a substep [s].
@@ -26,10 +29,11 @@ class PhysicsParams:
             substep.
         gravity: Gravity along the world's z axis [m/s^2].
         ik_iterations: Maximum number of iterations of the inverse kinematics in a step.
-            The default, which is Bullet's, ends about 13 mm before a target that is
-            50 mm away. Fewer iterations go as far with less damping, about in
-            proportion.
-        ik_damping: Damping of the least squares of the inverse kinematics.
+            With the defaults, which are Bullet's, the arm stops about 13 mm short of a
+            target that is 50 mm away. Fewer iterations get as close if ``ik_damping``
+            is reduced by about the same factor.
+        ik_damping: Damping of the inverse kinematics, which Bullet solves by damped
+            least squares.
 
     Raises:
         ValueError: an argument is out of range.
@@ -79,12 +83,13 @@ EXACT = PhysicsParams()
 FAST = PhysicsParams(
     timestep=1 / 300,
     n_substeps=12,
-    # The solver needs all its iterations only where fingers hold a cube. A larger
-    # threshold saves as much time as a maximum of 10 iterations and keeps the grasp.
+    # The solver needs all its iterations only while the fingers hold a cube. A larger
+    # threshold ends it early otherwise. This saves as much time as a maximum of 10
+    # iterations would, and does not weaken the grasp.
     residual_threshold=1e-3,
-    # Somewhat more than 1 - 0.9 ** (20 / 12) = 0.161. With this gain, a puck that the
-    # scripted expert strikes slides as far as in exact physics, to about 1 %. Other
-    # strikes differ more.
+    # The formula of `PhysicsParams` gives 1 - 0.9 ** (20 / 12) = 0.161. With this
+    # larger gain, a puck that the scripted expert strikes slides as far as in exact
+    # physics, to about 1 %. Other strikes differ more.
     position_gain=0.176,
     # The joint positions differ on average by 0.003 rad from those of 20 iterations
     # with the default damping.
@@ -96,7 +101,7 @@ _NAMED: dict[str, PhysicsParams] = {"exact": EXACT, "fast": FAST}
 
 
 def read_physics(physics: "PhysicsParams | PhysicsName") -> PhysicsParams:
-    """Look up the parameters of a name. Parameters are returned as they are.
+    """Look up a preset by its name; `PhysicsParams` are returned unchanged.
 
     Raises:
         ValueError: there is no preset of this name.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Scene:
-    """The bodies that a simulation moves and reads; the same ids in every client.
+    """Ids of the bodies that a simulation moves and reads, the same in every client.
 
     Attributes:
         robot: Body id of the robot.

@@ -44,10 +44,12 @@ class Visual:
 
     Attributes:
         color: Red, green and blue, from 0 to 1.
-        texture: Image file that replaces the colour of a box. It has three by two
-            squares: the faces +x, +y, +z in the upper row and -x, -y, -z in the lower.
+        texture: Image file that replaces the colour of a box; None keeps the colour.
+            The image shows the faces of the box in two rows of three squares: +x, +y
+            and +z in the upper row, -x, -y and -z in the lower row.
         opacity: Opacity of a marker, from 0 to 1. Other bodies are opaque.
-        name: Name of the body in `segmentation_ids`; None means its role in the task.
+        name: Name of the body in `RobotTaskEnv.segmentation_ids`; None means its role
+            in the task, for example "object1".
     """
 
     color: Color = GREEN

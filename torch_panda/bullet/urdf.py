@@ -18,8 +18,8 @@ _JOINT_TYPES = (
     "planar",
     "spherical",
 )
-# Geometries that Bullet knows, and the attributes that they need.
-_SIZES = {
+# Geometries that Bullet knows, and the attributes that each of them needs.
+_GEOMETRY_ATTRIBUTES = {
     "box": ("size",),
     "sphere": ("radius",),
     "cylinder": ("radius", "length"),
@@ -29,7 +29,7 @@ _SIZES = {
     "cdf": ("filename",),
 }
 
-_SCRATCH_LOCK = threading.Lock()
+_FOLDER_LOCK = threading.Lock()
 
 
 class Tool(NamedTuple):
@@ -63,9 +63,9 @@ def find_urdf(path: str | Path) -> str:
 
 
 def parse_urdf(file: str | Path) -> ElementTree.Element:
-    """The ``<robot>`` element of a URDF.
+    """Read the ``<robot>`` element of a URDF.
 
-    Like Bullet's own parser, this ignores text before and after the element.
+    Text before and after the element is ignored, as by Bullet's own parser.
 
     Raises:
         ValueError: the file has no <robot> element, or is not XML.
@@ -76,9 +76,10 @@ def parse_urdf(file: str | Path) -> ElementTree.Element:
         raise ValueError(f"{file} is not a URDF: it has no <robot> element")
     last = text.rfind(end) + len(end) if end in text else None
     try:
-        # Empty lines instead of the text before keep the line numbers of errors.
-        lines = "\n" * text.count("\n", 0, first.start())
-        return ElementTree.fromstring(lines + text[first.start() : last])
+        # Replace the text before the element by as many empty lines, so that line
+        # numbers in errors are those of the file.
+        empty_lines = "\n" * text.count("\n", 0, first.start())
+        return ElementTree.fromstring(empty_lines + text[first.start() : last])
     except ElementTree.ParseError as error:
         raise ValueError(f"{file} is not XML: {error}") from None
 
@@ -86,8 +87,8 @@ def parse_urdf(file: str | Path) -> ElementTree.Element:
 def check_urdf(file: str) -> None:
     """Make sure that Bullet can load a URDF.
 
-    Bullet crashes where links do not form one tree. Where it refuses a file, its status
-    code tells no reason.
+    Bullet itself crashes if the links do not form one tree. Other faults make it refuse
+    the file with a status code that does not name the fault.
 
     Raises:
         ValueError: Bullet would crash or refuse the file, or the file sets collision
@@ -121,13 +122,13 @@ def _check_names(file: str, robot: ElementTree.Element, tag: str) -> None:
 
 
 def _check_tree(file: str, robot: ElementTree.Element) -> None:
-    """Make sure that joints attach all links to one base."""
+    """Make sure that the joints attach all links to one base, without loops."""
     links = [str(link.get("name")) for link in robot.findall("link")]
     if not links:
         raise ValueError(f"{file}: a URDF needs at least one <link>")
     parents: dict[str, str] = {}
     for joint in robot.findall("joint"):
-        parent, child = _ends(file, joint, links)
+        parent, child = _read_joint(file, joint, links)
         if child in parents:
             raise ValueError(
                 f"{file}: link {child!r} is the child of two joints, the second is "
@@ -140,16 +141,22 @@ def _check_tree(file: str, robot: ElementTree.Element) -> None:
             if parent in ancestors:
                 raise ValueError(f"{file}: joints form a loop through link {link!r}")
             ancestors.append(parent)
-    base, *others = (link for link in links if link not in parents)
-    if others:
+    base, *detached = (link for link in links if link not in parents)
+    if detached:
         raise ValueError(
-            f"{file}: no joint attaches link {others[0]!r} to the base {base!r}: add a "
-            f"joint whose child is {others[0]!r}, or remove the link"
+            f"{file}: no joint attaches link {detached[0]!r} to the base {base!r}: add "
+            f"a joint whose child is {detached[0]!r}, or remove the link"
         )
 
 
-def _ends(file: str, joint: ElementTree.Element, links: list[str]) -> tuple[str, str]:
-    """Parent and child of a joint, which Bullet must be able to build."""
+def _read_joint(
+    file: str, joint: ElementTree.Element, links: list[str]
+) -> tuple[str, str]:
+    """Names of a joint's parent and child link.
+
+    Raises:
+        ValueError: Bullet could not build the joint.
+    """
     owner = f"{file}: joint {joint.get('name')!r}"
     joint_type = joint.get("type")
     if joint_type not in _JOINT_TYPES:
@@ -181,12 +188,13 @@ def _check_shape(
             f"and masks, so a reset could not restore them"
         )
     geometry = shape.find("geometry/*")
-    if geometry is None or geometry.tag not in _SIZES:
+    if geometry is None or geometry.tag not in _GEOMETRY_ATTRIBUTES:
         actual = "nothing" if geometry is None else f"<{geometry.tag}>"
         raise ValueError(
-            f"{owner} must have one of {sorted(_SIZES)} as its geometry, got {actual}"
+            f"{owner} must have one of {sorted(_GEOMETRY_ATTRIBUTES)} as its geometry, "
+            f"got {actual}"
         )
-    for attribute in _SIZES[geometry.tag]:
+    for attribute in _GEOMETRY_ATTRIBUTES[geometry.tag]:
         if geometry.get(attribute) is None:
             raise ValueError(f"{owner} has a <{geometry.tag}> without {attribute!r}")
     mesh = geometry.get("filename", "")
@@ -199,10 +207,15 @@ def _check_shape(
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """The file of a mesh, or None. It is searched where Bullet searches.
+    """Find the file of a mesh as Bullet does; None if there is no such file.
 
-    These are the folder of the URDF, all folders above it, the working directory and
-    two folders above that.
+    Bullet searches the folder of the URDF, all folders above it, the working directory
+    and the two folders above the working directory.
+
+    Args:
+        name: Name of the mesh in the URDF, with or without a prefix such as
+            ``package://``.
+        urdf: Path of the URDF.
     """
     for prefix in ("package://", "model://", "file://"):
         name = name.removeprefix(prefix)
@@ -212,21 +225,23 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
 
 
 @functools.cache
-def _scratch() -> tempfile.TemporaryDirectory[str]:
+def _process_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="torch_panda-")
 
 
 def make_scratch_folder() -> Path:
-    """A new folder for URDFs and meshes, which is deleted when the process ends."""
-    # Without the lock, several threads could make a directory each. The cache would
-    # keep one of them, and Python would delete the others at once.
-    with _SCRATCH_LOCK:
-        return Path(tempfile.mkdtemp(dir=_scratch().name))
+    """Make a new folder for URDFs and meshes; it is deleted when the process ends."""
+    # Without the lock, two threads could both make a folder of the process. The cache
+    # keeps only one of the two, and Python would delete the other at once.
+    with _FOLDER_LOCK:
+        return Path(tempfile.mkdtemp(dir=_process_folder().name))
 
 
 @functools.cache
 def urdf_with_tool(file: str, tool: Tool) -> str:
-    """A URDF file with one more link, the last one, named "tool".
+    """Write a copy of a URDF with a tool, and return the path of the copy.
+
+    The tool is the last link of the copy and is named "tool".
 
     Raises:
         ValueError: the URDF has no link of the name to which the tool is fixed.
@@ -239,7 +254,7 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     for mesh in robot.iter("mesh"):
         if (path := find_mesh(mesh.get("filename", ""), source)) is not None:
             mesh.set("filename", str(path))
-    # A link without <inertial> would have Bullet's default mass, 1 kg.
+    # Bullet gives a link without <inertial> a mass of 1 kg.
     massless = (
         "<mass value='0'/><inertia ixx='0' iyy='0' izz='0' ixy='0' ixz='0' iyz='0'/>"
     )
