@@ -1,6 +1,7 @@
 """The plotting example: what it draws, and what it cannot."""
 
 import csv
+import json
 from pathlib import Path
 
 import pytest
@@ -119,6 +120,27 @@ def test_algorithms_share_a_panel_where_they_fit(tmp_path, figures):
     assert titles == ["PandaReach-v1", "PandaSlide-v1", "PandaStack-v1"]
     rows = {round(axes.get_position().y0, 2) for axes in figures[0].axes}
     assert len(rows) == 2  # three panels are side by side
+
+
+def test_a_label_in_the_options_names_the_line(tmp_path, figures):
+    for seed, label in ((0, "strong"), (1, "strong"), (2, None)):
+        write_run(tmp_path / str(seed), Args(seed=seed, gamma=0.9, noise_eps=0.1))
+        options = json.loads((tmp_path / str(seed) / "args.json").read_text())
+        if label:
+            options["label"] = label
+        (tmp_path / str(seed) / "args.json").write_text(json.dumps(options))
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    assert lines_of(figures[0].axes[0]) == [
+        "DDPG, paper, gamma 0.9, noise eps 0.1 (1 seed)",
+        "DDPG, strong (2 seeds)",
+    ]
+
+
+def test_the_lines_of_a_panel_have_different_colours():
+    panels = [["a"], ["b", "c"], ["d", "e", "f", "g"], ["h"], ["i", "a", "b", "j"]]
+    looks = plots.choose_looks(panels)
+    for names in panels:
+        assert len({looks[name]["color"] for name in names}) == len(names)
 
 
 def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):

@@ -3,6 +3,10 @@
 A run is a folder with args.json and curve.csv. A line is the median over the seeds, and
 a band shows the interquartile range, as in the panda-gym paper. A panel has at most
 four lines. A task with more lines has a panel for each algorithm.
+
+The legend names the algorithm and the options that differ from the preset. An entry
+``label`` in args.json replaces the options by a name. Runs of one task and algorithm
+that have the same name form one line.
 """
 
 import csv
@@ -65,8 +69,7 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
         ValueError: The ending of its name is not a format.
     """
     panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
-    names = sorted({name for _, lines in panels for name in lines})
-    looks = {name: next_look(i) for i, name in enumerate(names)}
+    looks = choose_looks([list(lines) for _, lines in panels])
     width = min(COLUMNS, len(panels))
     height = -(-len(panels) // width)
     # Legends are below the panels.
@@ -107,10 +110,23 @@ def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
     ]
 
 
-def next_look(number: int) -> dict[str, str]:
-    """Colour and dashes of a line; the first 28 lines differ."""
-    dashes, color = divmod(number, len(COLORS))
-    return {"color": COLORS[color], "linestyle": DASHES[dashes % len(DASHES)]}
+def choose_looks(panels: list[list[str]]) -> dict[str, dict[str, str]]:
+    """Colour and dashes of each line, the same in all panels.
+
+    The first 28 lines differ. The lines of a panel have different colours where the
+    lines that they share with earlier panels allow it.
+    """
+    looks: dict[str, dict[str, str]] = {}
+    unused = [(color, dashes) for dashes in DASHES for color in COLORS]
+    for names in panels:
+        for name in names:
+            if name not in looks:
+                taken = {looks[other]["color"] for other in names if other in looks}
+                free = [look for look in unused if look[0] not in taken]
+                color, dashes = (free or unused or [(COLORS[0], DASHES[0])])[0]
+                looks[name] = {"color": color, "linestyle": dashes}
+                unused = [look for look in unused if look != (color, dashes)]
+    return looks
 
 
 def draw_panel(
@@ -147,7 +163,8 @@ def read_runs(folders: list[Path]) -> Runs:
         try:
             args = json.loads((path.parent / "args.json").read_text())
             task, algo = str(args["env_id"]), str(args["algo"]).upper()
-            line = line_label(str(args["preset"]), args.get("changed", {}))
+            changed = args.get("changed", {})
+            line = str(args.get("label") or line_label(str(args["preset"]), changed))
             with path.open() as file:
                 curve = [
                     {key: float(value) for key, value in row.items() if value}
@@ -176,6 +193,8 @@ def line_label(preset: str, changed: dict[str, object]) -> str:
             parts.append(name)
         elif value in (False, "none", 0):
             parts.append(f"no {name}")
+        elif isinstance(value, list):
+            parts.append(f"{name} {' to '.join(f'{x:g}' for x in value)}")
         else:
             parts.append(f"{name} {value}")
     return ", ".join(parts)
