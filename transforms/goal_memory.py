@@ -1,4 +1,4 @@
-"""Goals of the transitions in a replay buffer, in the order of their trajectories."""
+"""Goals of all transitions in a replay buffer, grouped by trajectory."""
 
 import copy
 import weakref
@@ -21,62 +21,71 @@ from torch_panda.transforms.strategies import (
 
 Goals = NDArray[Any]  # (n, *goal)
 
-# Where a transition stands in its trajectory.
+# One entry per remembered transition. Steps count from 0 in each trajectory.
 _POSITION = np.dtype([("trajectory", np.int32), ("step", np.int32)])
+# One entry per remembered trajectory. Its goals are in a block of successive rows.
 _TRAJECTORY = np.dtype(
     [
-        ("first", np.int32),  # oldest step that the buffer still holds
-        ("end", np.int32),  # one more than the last step
-        ("offset", np.int32),  # step s has its goals at row `offset + s` of the goals
-        ("limit", np.int32),  # steps below this one fit into the region
-        ("region", np.int32),  # first row of the region of the goals
+        ("first", np.int32),  # oldest step that is still remembered
+        ("end", np.int32),  # newest step + 1
+        ("offset", np.int32),  # the goals of step s are in row `offset + s`
+        ("limit", np.int32),  # the block has room for the steps below this one
+        ("block", np.int32),  # first row of the block
     ]
 )
-_MIN_REGION = 16  # rows
+_MIN_BLOCK = 16  # rows
 
 
 class GoalMemory:
     """Remembers the goals of all stored transitions, and draws hindsight goals.
 
-    Serial numbers count the transitions in the order in which they are written. A
-    round-robin buffer overwrites its oldest rows first. It therefore holds the
-    transitions with the largest serial numbers, and with every transition also all
-    later steps of its trajectory.
+    Each transition gets a serial number: 0, 1, 2 and so on, in the order of writing. A
+    round-robin buffer overwrites its oldest rows first. So it always holds the newest
+    transitions, and for each of them all later steps of the same trajectory.
 
-    Three arrays lead from a serial number to goals:
+    Three arrays lead from a serial number to goals. An example with a ring of 10
+    entries:
 
-    - a ring has the trajectory and step of every remembered transition;
-    - a table has a row for every remembered trajectory, see `_TRAJECTORY`;
-    - `_goals` has a contiguous region for each trajectory, one row per step. A full
-      region is copied into a larger one.
+        serial number 17
+            `_ring[17 % 10]` is (trajectory 3, step 5)
+                `_trajectories[3]["offset"]` is 40
+                    `_goals[40 + 5]` holds the goals of this transition
+                    `_goals[40 + 6]` holds the goals of the trajectory's next step
 
-    The root goal of a row is the achieved goal before its step. A row extends the open
-    trajectory with its id, unless that trajectory's last achieved goal differs from the
-    row's root goal: then a new collector reuses the id. Some data have root goals that
-    never equal the goals achieved before them, so root goals are ignored until two of
-    them are equal.
+    Each trajectory has a block of successive rows in `_goals`. If the block is full,
+    its goals move to a larger block.
+
+    A new transition continues the open trajectory with the same id. (A trajectory is
+    open until a transition of it is done.) But a second collector may reuse an id that
+    the first one left open. The memory detects this by the root goal, which is the
+    achieved goal before a step. Within a trajectory, the root goal equals the goal that
+    the previous step achieved. If it differs, a new trajectory begins. Data in which
+    the two are never equal do not permit this check, so it is off until they are equal
+    for the first time.
     """
 
     def __init__(self) -> None:
-        self.buffer: weakref.ref[ReplayBuffer] | None = None  # whose rows these are
-        self.count = 0  # serial number of the next transition
+        # The buffer whose transitions are remembered.
+        self.buffer: weakref.ref[ReplayBuffer] | None = None
+        self.count = 0  # transitions written so far: the next serial number
         self.oldest = 0  # serial number of the oldest remembered transition
-        # Open trajectories: id -> (number, next step, bytes of the last achieved goal).
+        # Open trajectories by id: trajectory number, next step, last achieved goal.
         self._open: dict[int, tuple[int, int, bytes]] = {}
-        self._roots_match = False  # whether a root goal ever equalled the goal before
-        self._ring = np.zeros(0, _POSITION)  # indexed by serial number, modulo its size
-        self._trajectories = np.zeros(64, _TRAJECTORY)  # indexed by trajectory number
+        self._checks_root_goals = False
+        self._ring = np.zeros(0, _POSITION)  # index: serial number % ring size
+        self._trajectories = np.zeros(64, _TRAJECTORY)  # index: trajectory number
         self._free_numbers = [*range(64)]  # trajectory numbers that are not in use
-        # Achieved goals and, if they are needed, desired goals: (rows, 1 or 2, *goal).
+        # Column 0 holds achieved goals. Column 1 holds desired goals, if they are
+        # needed. The shape is (rows, 1 or 2, *goal).
         self._goals: Goals = np.zeros((0, 1), dtype=np.float32)
-        self._allocated = 0  # rows of `_goals` that belong to a region or a free region
-        self._free_regions: dict[int, list[int]] = {}  # size -> first rows
+        self._num_rows = 0  # rows of `_goals` that belong to a block, used or free
+        self._free_blocks: dict[int, list[int]] = {}  # block size -> first rows
 
     def write(
         self,
         ids: Integers,
         done: NDArray[np.bool_],
-        roots: Goals | None,
+        root_goals: Goals | None,
         goals: list[Goals],
         stored: int,
     ) -> Integers:
@@ -85,7 +94,7 @@ class GoalMemory:
         Args:
             ids: Ids of the trajectories, or numbers of the environments, (n,).
             done: Whether the transition ends its trajectory, (n,).
-            roots: Achieved goals before the transitions, if the data have them.
+            root_goals: Achieved goals before the transitions, if the data have them.
             goals: Achieved goals after the transitions and, if "desired" is among the
                 strategies, their desired goals.
             stored: Number of earlier transitions that the buffer still holds.
@@ -98,48 +107,49 @@ class GoalMemory:
             self._goals = np.zeros(shape, np.result_type(*goals))
         self._make_room(len(ids), stored)
         serials = np.arange(self.count, self.count + len(ids))
-        numbers, steps = self._assign(ids, done, roots, goals[0])
-        slots = serials % len(self._ring)
-        self._ring["trajectory"][slots] = numbers
-        self._ring["step"][slots] = steps
+        numbers, steps = self._assign_positions(ids, done, root_goals, goals[0])
+        ring_indices = serials % len(self._ring)
+        self._ring["trajectory"][ring_indices] = numbers
+        self._ring["step"][ring_indices] = steps
 
-        self._trajectories["end"][numbers] = steps + 1  # the last of equal numbers wins
-        is_full = steps >= self._trajectories["limit"].take(numbers)
-        for number in set(numbers[is_full].tolist()):
-            self._enlarge(number)
+        # If a trajectory occurs several times, numpy keeps the last value.
+        self._trajectories["end"][numbers] = steps + 1
+        exceeds_block = steps >= self._trajectories["limit"].take(numbers)
+        for number in set(numbers[exceeds_block].tolist()):
+            self._enlarge_block(number)
         rows = self._trajectories["offset"].take(numbers) + steps
         for column, values in enumerate(goals):
             self._goals[rows, column] = values
         self.count += len(ids)
         return serials
 
-    def _assign(
+    def _assign_positions(
         self,
         ids: Integers,
         done: NDArray[np.bool_],
-        roots: Goals | None,
-        achieved: Goals,
+        root_goals: Goals | None,
+        achieved_goals: Goals,
     ) -> tuple[Integers, Integers]:
         """Returns trajectory numbers and steps of new transitions, (n,) each."""
-        root_bytes = [b""] * len(ids) if roots is None else _to_bytes(roots)
-        achieved_bytes = root_bytes if roots is None else _to_bytes(achieved)
+        if root_goals is None:  # empty bytes stand for unknown goals
+            roots = achieved = [b""] * len(ids)
+        else:
+            roots, achieved = _to_bytes(root_goals), _to_bytes(achieved_goals)
         numbers, steps = [], []
-        transitions = zip(
-            ids.tolist(), done.tolist(), root_bytes, achieved_bytes, strict=True
-        )
+        transitions = zip(ids.tolist(), done.tolist(), roots, achieved, strict=True)
         for trajectory_id, is_done, root, goal in transitions:
             number, step, last_goal = self._open.pop(trajectory_id, (-1, 0, b""))
             if root == last_goal != b"":
-                self._roots_match = True
-            if number < 0 or (self._roots_match and root != last_goal):
-                number, step = self._new_number(), 0
+                self._checks_root_goals = True
+            if number < 0 or (self._checks_root_goals and root != last_goal):
+                number, step = self._take_number(), 0
             if not is_done:
                 self._open[trajectory_id] = number, step + 1, goal
             numbers.append(number)
             steps.append(step)
         return np.array(numbers, dtype=np.int32), np.array(steps, dtype=np.int32)
 
-    def _new_number(self) -> int:
+    def _take_number(self) -> int:
         """Returns a trajectory number that is not in use."""
         if not self._free_numbers:
             size = len(self._trajectories)
@@ -147,34 +157,36 @@ class GoalMemory:
             self._free_numbers = [*range(size, len(self._trajectories))]
         return self._free_numbers.pop()
 
-    def _enlarge(self, number: int) -> None:
-        """Copies a trajectory's goals into a region in which its steps fit."""
+    def _enlarge_block(self, number: int) -> None:
+        """Moves a trajectory's goals to a block that has room for all its steps."""
         first, end, offset, limit, _ = self._trajectories[number].tolist()
         goals = self._goals[offset + first : offset + limit].copy()
-        self._free_region(number)
-        size = 1 << max(_MIN_REGION - 1, 9 * (end - first) // 8).bit_length()
-        free = self._free_regions.setdefault(size, [])
-        if not free:
-            free.append(self._allocated)
-            self._allocated += size
-            self._goals = _grow(self._goals, self._allocated)
-        region = free.pop()
-        self._goals[region : region + len(goals)] = goals
-        self._trajectories[number] = first, end, region - first, first + size, region
+        self._free_block(number)
+        # Sizes are powers of two, so that freed blocks fit other trajectories.
+        size = 1 << max(_MIN_BLOCK - 1, 9 * (end - first) // 8).bit_length()
+        free_blocks = self._free_blocks.setdefault(size, [])
+        if not free_blocks:
+            free_blocks.append(self._num_rows)
+            self._num_rows += size
+            self._goals = _grow(self._goals, self._num_rows)
+        block = free_blocks.pop()
+        self._goals[block : block + len(goals)] = goals
+        self._trajectories[number] = first, end, block - first, first + size, block
 
-    def _free_region(self, number: int) -> None:
-        """Frees the region of a trajectory, if it has one."""
-        _, _, offset, limit, region = self._trajectories[number].tolist()
+    def _free_block(self, number: int) -> None:
+        """Frees the block of a trajectory, if it has one."""
+        _, _, offset, limit, block = self._trajectories[number].tolist()
         if limit:
-            self._free_regions[offset + limit - region].append(region)
+            size = offset + limit - block
+            self._free_blocks[size].append(block)
 
     def _make_room(self, n: int, stored: int) -> None:
-        """Makes room in the ring for n transitions, and for some more."""
+        """Makes room in the ring for n more transitions."""
         size, end = len(self._ring), self.count + n
         if end - self.oldest <= size:
             return
         self.forget(self.count - stored)
-        needed = end - self.oldest + size // 64  # so that the ring rarely grows
+        needed = end - self.oldest + size // 64  # some spare room, to grow rarely
         if needed > size:
             serials = np.arange(self.oldest, self.count)
             positions = self._ring.take(serials % size)
@@ -182,7 +194,7 @@ class GoalMemory:
             self._ring[serials % len(self._ring)] = positions
 
     def forget(self, oldest: int) -> None:
-        """Forgets the transitions before serial number `oldest`: the buffer has."""
+        """Forgets overwritten transitions: those with serial numbers below `oldest`."""
         if oldest <= self.oldest:
             return
         numbers, steps = self.find(np.arange(self.oldest, oldest))
@@ -190,7 +202,7 @@ class GoalMemory:
         first[numbers] = steps + 1
         forgotten = set(numbers[first[numbers] == end[numbers]].tolist())
         for number in forgotten:
-            self._free_region(number)
+            self._free_block(number)
             self._trajectories[number] = 0
         self._free_numbers += forgotten
         self._open = {
@@ -206,7 +218,7 @@ class GoalMemory:
         return positions["trajectory"], positions["step"]
 
     def is_open(self, serials: Integers) -> NDArray[np.bool_]:
-        """Returns whether the transitions' trajectories may still go on, (n,)."""
+        """Returns whether each transition's trajectory is still open, (n,)."""
         open_numbers = [number for number, _, _ in self._open.values()]
         return np.isin(self.find(serials)[0], open_numbers)
 
@@ -217,16 +229,28 @@ class GoalMemory:
     def draw(
         self, serials: Integers, mixture: Mixture, generator: Generator | None
     ) -> Goals:
-        """Draws a goal for each transition, (n,), by a mixture: (n, *goal)."""
+        """Draws a hindsight goal for each transition.
+
+        Args:
+            serials: Serial numbers of the transitions, (n,).
+            mixture: Strategies that choose where each goal comes from.
+            generator: Generator of the random draws, torch's if None.
+
+        Returns:
+            The goals, (n, *goal).
+        """
         goals = np.empty((len(serials), *self._goals.shape[2:]), self._goals.dtype)
         for strategy, rows in mixture.split(len(serials), generator):
-            own = serials[rows]
-            if strategy in (RANDOM, DESIRED):
-                end = np.full(len(own), self.count)
-                own = draw_integers(self.oldest, end, generator)
-            numbers, steps = self.find(own)
+            # The transitions that the goals come from: first their trajectories...
+            sources = serials[rows]
+            uses_all_trajectories = strategy in (RANDOM, DESIRED)
+            if uses_all_trajectories:
+                end = np.full(len(sources), self.count)
+                sources = draw_integers(self.oldest, end, generator)
+            numbers, steps = self.find(sources)
             trajectories = self._trajectories.take(numbers)
-            if strategy not in (RANDOM, DESIRED):
+            # ...then their steps.
+            if not uses_all_trajectories:
                 first, end = trajectories["first"], trajectories["end"]
                 steps = choose_steps(
                     strategy, steps, first, end, mixture.discount, generator
@@ -238,9 +262,12 @@ class GoalMemory:
         return goals
 
     def state(self) -> dict[str, Any]:
-        """Returns a copy of all contents, as tensors, numbers, strings, containers."""
+        """Returns a copy of all contents, as tensors, numbers, strings, containers.
+
+        The keys never change, so that newer versions can read older files.
+        """
         ring = self._ring.view(np.int32).reshape(-1, 2)
-        table = self._trajectories.view(np.int32).reshape(-1, 5)
+        trajectories = self._trajectories.view(np.int32).reshape(-1, 5)
         return {
             "count": self.count,
             "freed": self.oldest,
@@ -248,42 +275,42 @@ class GoalMemory:
                 trajectory_id: (number, step, goal.hex())
                 for trajectory_id, (number, step, goal) in self._open.items()
             },
-            "_links": self._roots_match,
+            "_links": self._checks_root_goals,
             "_ring": torch.from_numpy(ring.copy()),
-            "_table": torch.from_numpy(table.copy()),
+            "_table": torch.from_numpy(trajectories.copy()),
             "_unused": self._free_numbers.copy(),
             "_goals": torch.from_numpy(self._goals.copy()),
-            "_used": self._allocated,
-            "_free_regions": copy.deepcopy(self._free_regions),
+            "_used": self._num_rows,
+            "_free_regions": copy.deepcopy(self._free_blocks),
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Takes a copy of what another memory's `state` returned."""
+        """Restores a copy of the contents that `state` returned."""
 
         def to_array(tensor: Tensor) -> NDArray[Any]:
             return tensor.numpy(force=True).copy()
 
         self.count, self.oldest = state["count"], state["freed"]
-        self._roots_match = state["_links"]
-        # Root goals tell whether the next rows are of the same collector. Without
-        # them, a new collector may reuse the ids, so that no trajectory may go on.
+        self._checks_root_goals = state["_links"]
+        # The next rows may come from a new collector that reuses the ids. Only the
+        # check of root goals would detect this. Without it, end all trajectories.
         self._open = {
             trajectory_id: (number, step, bytes.fromhex(goal))
             for trajectory_id, (number, step, goal) in state["open"].items()
-            if self._roots_match
+            if self._checks_root_goals
         }
         self._ring = to_array(state["_ring"]).view(_POSITION).ravel()
         self._trajectories = to_array(state["_table"]).view(_TRAJECTORY).ravel()
         self._free_numbers = [*state["_unused"]]
-        self._goals, self._allocated = to_array(state["_goals"]), state["_used"]
-        self._free_regions = copy.deepcopy(state["_free_regions"])
+        self._goals, self._num_rows = to_array(state["_goals"]), state["_used"]
+        self._free_blocks = copy.deepcopy(state["_free_regions"])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "buffer": None}  # a weak reference cannot be pickled
 
 
 def _to_bytes(goals: Goals) -> list[bytes]:
-    """Returns each goal of (n, *goal) as bytes, which are fast to compare."""
+    """Returns the bytes of each goal of (n, *goal). Python compares bytes fast."""
     flat = np.ascontiguousarray(goals).reshape(len(goals), -1)
     return flat.view(f"V{flat[0].nbytes}").ravel().tolist()
 
