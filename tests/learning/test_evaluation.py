@@ -64,11 +64,44 @@ def test_options_of_make_are_passed_on():
     assert result.at_start.all()
 
 
+def test_fixed_tasks_are_reported_one_by_one():
+    still = TensorDictModule(lambda goal: 0 * goal, ["desired_goal"], ["action"])
+    options = {"episodes": 23, "tasks": "fixed", "seed": 3}
+    result = torch_panda.evaluate(still, "PandaPush-v1", num_envs=4, **options)
+    tasks = torch_panda.evaluation_tasks("PandaPush-v1")
+    assert list(result.tasks) == list(tasks)
+    assert all(len(task.success) == 5 for task in result.tasks.values())
+    # The hand stays far from the object, which stays where it starts.
+    assert torch.equal(result.success, result.at_start)
+    for name, state in tasks.items():
+        distance = (state["object_pose"][0, :3] - state["desired_goal"]).norm()
+        assert result.tasks[name].success_rate == float(distance < 0.05)
+    rates = [task.success_rate for task in result.tasks.values()]
+    assert result.success_rate == pytest.approx(sum(rates) / 5)
+    assert f"very_near={rates[0]:.3f}" in repr(result)
+
+
+def test_episodes_of_a_fixed_task_differ_and_depend_on_the_seed_alone():
+    expert = make_expert("PandaPush-v1")
+    options = {"episodes": 15, "tasks": "fixed"}
+    few, many, other = (
+        torch_panda.evaluate(
+            expert, "PandaPush-v1", num_envs=num_envs, seed=seed, **options
+        )
+        for num_envs, seed in ((2, 1), (15, 1), (15, 2))
+    )
+    assert torch.equal(few.returns, many.returns)
+    assert not torch.equal(few.returns, other.returns)
+    assert len(many.tasks["far"].returns.unique()) > 1
+    assert many.success_rate == 1.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
         ({"episodes": 0}, ValueError, "episodes must be"),
         ({"num_envs": 0}, ValueError, "num_envs must be"),
+        ({"tasks": "named"}, ValueError, 'tasks must be "random" or "fixed"'),
         ({"env_id": "PandaFly-v1"}, ValueError, "unknown environment id"),
         ({"policy": "PandaReach-v1"}, TypeError, "load_policy reads one from a file"),
         ({"n_envs": 4}, TypeError, "n_envs"),

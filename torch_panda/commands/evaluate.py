@@ -1,6 +1,7 @@
 """Measure how often a trained policy succeeds.
 
 python -m torch_panda evaluate runs/PandaPush-v1-ddpg-relabel-0 --episodes 200
+python -m torch_panda evaluate PandaPush-v1 --tasks fixed
 """
 
 from collections.abc import Sequence
@@ -9,9 +10,10 @@ from math import sqrt
 from typing import Annotated
 
 import tyro
+from torch import Tensor
 
 from torch_panda.bullet import PhysicsName
-from torch_panda.learning.evaluation import evaluate, wilson_interval
+from torch_panda.learning.evaluation import Tasks, evaluate, wilson_interval
 from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
 from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
@@ -27,6 +29,9 @@ class Args:
     """another task with the same spaces; None means the task of the policy"""
     episodes: Positive = 200
     """number of episodes"""
+    tasks: Tasks = "random"
+    """starts and goals: those that the task draws ("random"), or the five evaluation
+    tasks ("fixed"), whose success is printed one by one"""
     num_envs: Positive = 32
     """number of environments that are stepped in parallel"""
     num_threads: Positive | None = None
@@ -54,6 +59,7 @@ def main(args: Args) -> None:
             episodes=args.episodes,
             seed=args.seed,
             num_envs=args.num_envs,
+            tasks=args.tasks,
             num_threads=args.num_threads,
             physics=args.physics,
             task_options=args.task_options,
@@ -61,22 +67,27 @@ def main(args: Args) -> None:
     except (ValueError, TypeError) as error:
         raise SystemExit(str(error)) from None
     changes = "".join(f", {key} {value}" for key, value in args.task_options.items())
-    print(f"{env_id}{changes}, {args.episodes} episodes, {args.physics} physics")
-    for name, flags in (
-        ("success at the end", result.success),
-        ("success at any time", result.ever),
-        ("solved at the start", result.at_start),
-    ):
-        low, high = wilson_interval(int(flags.sum()), args.episodes)
-        share = flags.float().mean()
-        print(f"{name:20s} {share:6.1%}  [{low:.1%}, {high:.1%}]")
+    episodes = len(result.success)
+    print(f"{env_id}{changes}, {episodes} episodes, {args.physics} physics")
+    for name, task in result.tasks.items():
+        print_share(f"success of {name}", task.success)
+    print_share("success at the end", result.success)
+    print_share("success at any time", result.ever)
+    print_share("solved at the start", result.at_start)
     mean = result.mean_return
     interval = ""
-    if args.episodes > 1:
-        half = 1.96 * float(result.returns.std()) / sqrt(args.episodes)
+    if episodes > 1:
+        half = 1.96 * float(result.returns.std()) / sqrt(episodes)
         interval = f"  [{mean - half:.2f}, {mean + half:.2f}]"
     print(f"{'return':20s} {mean:6.2f}{interval}")
     print(f"{'steps':20s} {result.mean_length:6.1f}")
+
+
+def print_share(name: str, flags: Tensor) -> None:
+    """Print the share of episodes (n,) that have a flag, with its 95 % interval."""
+    low, high = wilson_interval(int(flags.sum()), len(flags))
+    share = flags.float().mean()
+    print(f"{name:20s} {share:6.1%}  [{low:.1%}, {high:.1%}]")
 
 
 def run(arguments: Sequence[str]) -> None:

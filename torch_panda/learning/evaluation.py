@@ -1,17 +1,26 @@
 """Evaluates a policy over many episodes, which run in parallel."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import sqrt
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.evaluation_tasks import evaluation_tasks
 from torch_panda.learning.rollouts import play_episodes
 from torch_panda.registry import make
+
+Tasks = Literal["random", "fixed"]
+
+# Number of random actions at the start of each episode of a fixed task. Without them
+# all episodes of a task would be the same.
+RANDOM_ACTIONS = 3
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,9 @@ class Evaluation:
         at_start: Whether the start of each episode is a success, (n,) bool.
         returns: Sum of the rewards of each episode, (n,).
         lengths: Number of steps of each episode, (n,).
+        tasks: Results of each fixed task by its name, empty for random episodes. All
+            tasks have the same number of episodes, so the other attributes are means
+            over the tasks.
     """
 
     success: Tensor
@@ -31,6 +43,7 @@ class Evaluation:
     at_start: Tensor
     returns: Tensor
     lengths: Tensor
+    tasks: Mapping[str, "Evaluation"] = field(default_factory=dict)
 
     @property
     def success_rate(self) -> float:
@@ -54,9 +67,12 @@ class Evaluation:
 
     def __repr__(self) -> str:
         low, high = self.interval
+        tasks = "".join(
+            f", {name}={result.success_rate:.3f}" for name, result in self.tasks.items()
+        )
         return (
             f"Evaluation({len(self.success)} episodes, success_rate="
-            f"{self.success_rate:.3f} [{low:.3f}, {high:.3f}], mean_return="
+            f"{self.success_rate:.3f} [{low:.3f}, {high:.3f}]{tasks}, mean_return="
             f"{self.mean_return:.2f}, mean_length={self.mean_length:.1f})"
         )
 
@@ -68,6 +84,7 @@ def evaluate(
     episodes: int = 200,
     seed: int | None = 1_000,
     num_envs: int = 32,
+    tasks: Tasks = "random",
     **options: Any,  # noqa: ANN401 (those of `make`)
 ) -> Evaluation:
     """Evaluate a policy on an environment, without exploration noise.
@@ -79,6 +96,11 @@ def evaluate(
         episodes: Number of episodes.
         seed: Seed of the episodes; None draws one.
         num_envs: Number of environments stepped in parallel, at most one per episode.
+        tasks: "random" draws the starts and goals as the task does. "fixed" starts from
+            the five `torch_panda.evaluation_tasks` and reports the success of each one.
+            Every task has the same number of episodes, so ``episodes`` is rounded up to
+            a multiple of five. Each episode begins with `RANDOM_ACTIONS` random
+            actions, drawn from ``seed``, so that the episodes of a task differ.
         **options: Other arguments of `make`, such as ``task_options`` and ``device``.
 
     Raises:
@@ -91,8 +113,13 @@ def evaluate(
             f"policy must be a TensorDictModule, got {policy!r}: load_policy reads one "
             "from a file"
         )
+    if tasks not in get_args(Tasks):
+        raise ValueError(f'tasks must be "random" or "fixed", got {tasks!r}')
     num_envs = min(num_envs, episodes)
     with make(env_id, num_envs=num_envs, seed=seed, **options) as env:
+        if tasks == "fixed":
+            states = evaluation_tasks(env_id)
+            return evaluate_fixed_in(env, policy, episodes, states, seed=seed)
         return evaluate_in(env, policy, episodes)
 
 
@@ -102,25 +129,95 @@ def evaluate_in(
     """Evaluate a policy over the next episodes of a batch of environments."""
     parts: list[Evaluation] = []
     while sum(len(part.success) for part in parts) < episodes:
-        rollout, lengths = play_episodes(env, policy)
-        success = rollout["next", "success"].squeeze(-1)
-        reward = rollout["next", "reward"].squeeze(-1)
-        steps = torch.arange(rollout.shape[1], device=lengths.device)
-        is_played = steps < lengths[:, None]
-        parts.append(
-            Evaluation(
-                success=success.gather(1, lengths[:, None] - 1).squeeze(1),
-                ever=(success & is_played).any(1),
-                at_start=rollout["success"][:, 0, 0],
-                returns=(reward * is_played).sum(1),
-                lengths=lengths,
-            )
-        )
-    joined = {
-        field.name: torch.cat([getattr(part, field.name) for part in parts])
-        for field in fields(Evaluation)
+        parts.append(_summarize(*play_episodes(env, policy)))
+    return _join(parts, range(episodes))
+
+
+def evaluate_fixed_in(
+    env: RobotTaskEnv,
+    policy: TensorDictModuleBase,
+    episodes: int,
+    states: Mapping[str, TensorDict],
+    *,
+    seed: int | None,
+) -> Evaluation:
+    """Evaluate a policy from fixed starts, in a batch of environments.
+
+    Args:
+        env: Batched environment.
+        policy: Policy that writes ``action``.
+        episodes: Number of episodes, rounded up to the same number for each start.
+        states: Start states by name, as `evaluation_tasks` returns them.
+        seed: Seed of the first `RANDOM_ACTIONS` actions; None draws one. The episodes
+            do not depend on the number of environments.
+    """
+    episodes += -episodes % len(states)
+    num_envs = env.batch_size[0]
+    generator = torch.Generator()
+    if seed is None:
+        generator.seed()
+    else:
+        generator.manual_seed(seed)
+    shape = (episodes, RANDOM_ACTIONS, env.action_spec.shape[-1])
+    actions = (2 * torch.rand(shape, generator=generator) - 1).to(env.device)
+    starts = TensorDict.stack(list(states.values())).to(env.device)
+    parts: list[Evaluation] = []
+    for first in range(0, episodes, num_envs):
+        # The last batch repeats episodes that `_join` leaves out.
+        numbers = torch.arange(first, first + num_envs) % episodes
+        start = env.reset(starts[numbers % len(states)], set_state=True)
+        begin = _RandomStart(policy, actions[numbers])
+        parts.append(_summarize(*play_episodes(env, begin, start=start)))
+    tasks = {
+        name: _join(parts, range(index, episodes, len(states)))
+        for index, name in enumerate(states)
     }
-    return Evaluation(**{name: x[:episodes].cpu() for name, x in joined.items()})
+    return _join(parts, range(episodes), tasks)
+
+
+class _RandomStart(TensorDictModuleBase):
+    """Replaces the first actions of a policy, (num_envs, steps, action_dim)."""
+
+    def __init__(self, policy: TensorDictModuleBase, actions: Tensor) -> None:
+        super().__init__()
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = ["action"]  # type: ignore[misc]  # it has a setter
+        self._policy, self._actions = policy, list(actions.unbind(1))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = self._policy(tensordict)
+        if self._actions:
+            tensordict["action"] = self._actions.pop(0)
+        return tensordict
+
+
+def _summarize(rollout: TensorDictBase, lengths: Tensor) -> Evaluation:
+    """Results of episodes [num_envs, steps] with these numbers of steps."""
+    success = rollout["next", "success"].squeeze(-1)
+    reward = rollout["next", "reward"].squeeze(-1)
+    steps = torch.arange(rollout.shape[1], device=lengths.device)
+    is_played = steps < lengths[:, None]
+    return Evaluation(
+        success=success.gather(1, lengths[:, None] - 1).squeeze(1),
+        ever=(success & is_played).any(1),
+        at_start=rollout["success"][:, 0, 0],
+        returns=(reward * is_played).sum(1),
+        lengths=lengths,
+    )
+
+
+def _join(
+    parts: list[Evaluation],
+    episodes: range,
+    tasks: Mapping[str, Evaluation] | None = None,
+) -> Evaluation:
+    """Results of these episodes of all parts."""
+    names = ("success", "ever", "at_start", "returns", "lengths")
+    joined = {
+        name: torch.cat([getattr(part, name) for part in parts]) for name in names
+    }
+    chosen = {name: x[list(episodes)].cpu() for name, x in joined.items()}
+    return Evaluation(**chosen, tasks=tasks or {})
 
 
 def wilson_interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:

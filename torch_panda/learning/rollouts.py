@@ -13,6 +13,7 @@ def play_episodes(
     env: RobotTaskEnv,
     policy: TensorDictModuleBase,
     exploration: ExplorationType = ExplorationType.DETERMINISTIC,  # type: ignore[assignment]
+    start: TensorDictBase | None = None,
 ) -> tuple[TensorDictBase, Tensor]:
     """Play one new episode in every environment.
 
@@ -20,6 +21,8 @@ def play_episodes(
         env: Batch of environments.
         policy: Policy that writes ``action``.
         exploration: Whether the policy may add its noise.
+        start: First observations, as `RobotTaskEnv.reset` returns them; None resets the
+            environments.
 
     Returns:
         Transitions [num_envs, steps], and the number of steps of each episode,
@@ -31,6 +34,8 @@ def play_episodes(
             policy,
             break_when_any_done=False,
             break_when_all_done=True,
+            auto_reset=start is None,
+            tensordict=start,
         )
     has_ended = rollout["next", "done"].squeeze(-1).cumsum(1) > 0
     return rollout, (~has_ended).sum(1) + 1
