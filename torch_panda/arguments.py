@@ -1,4 +1,4 @@
-"""Arguments by name: errors that list the accepted ones, and reprs that show them."""
+"""Keyword arguments: errors that list the accepted names, and reprs with the values."""
 
 import difflib
 import inspect
@@ -11,8 +11,8 @@ class Configured:
     """Base of classes whose objects are configured by keyword arguments.
 
     An unknown argument raises a `TypeError` that lists the accepted ones. The ``repr``
-    of an object shows its arguments, which it keeps as attributes of the same names,
-    or of these names after an underscore.
+    of an object shows its arguments. It finds the value of an argument ``x`` in the
+    attribute ``x`` or ``_x``.
     """
 
     def __new__(cls, *args: object, **arguments: object) -> Self:
@@ -35,8 +35,7 @@ def check_call(
 ) -> None:
     """Refuse arguments that a function or class does not have.
 
-    A function with ``**options`` reads them itself or passes them on, so it is not
-    checked.
+    A function with ``**options`` accepts any name, so it is not checked here.
 
     Args:
         owner: Name of the function, for the error.
@@ -75,7 +74,8 @@ def check_names(
         hint = f"did you mean {similar[0]!r}? " if similar else ""
         if advice and name in advice:
             hint = f"{advice[name]}; "
-        # Python's own phrase. torchrl's GymEnv looks for it to drop `frameskip`.
+        # The wording is Python's own, because torchrl's GymEnv looks for it and then
+        # tries again without the argument `frameskip`.
         raise TypeError(
             f"{owner} got an unexpected keyword argument {name!r}; {hint}"
             f"accepted are {', '.join(accepted) or 'none'}"
@@ -83,7 +83,10 @@ def check_names(
 
 
 def _argument_names(owner: type) -> list[str]:
-    """Names of the arguments of a class, and of its base where it passes options on."""
+    """Names of the arguments of a class.
+
+    A class with ``**options`` passes them to its base class, whose names are included.
+    """
     names: list[str] = []
     for base in owner.__mro__:
         if "__init__" in vars(base):

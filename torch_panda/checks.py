@@ -1,4 +1,4 @@
-"""Argument checks. Every module may import this one; it imports none of the package."""
+"""Argument checks. This module imports nothing of the package, so all may import it."""
 
 import math
 import operator
@@ -73,7 +73,7 @@ def check_range(name: str, value: Sequence[float]) -> None:
     """Check that an argument is a pair (lowest, highest) of non-negative numbers.
 
     Raises:
-        ValueError: It is not such a pair.
+        ValueError: The argument is not such a pair.
     """
     try:
         low, high = map(float, value)
@@ -89,7 +89,7 @@ def check_choice(name: str, value: object, choices: Collection[object]) -> None:
     """Check that an argument is one of several values.
 
     Raises:
-        ValueError: It is another value.
+        ValueError: The argument is none of these values.
     """
     if value not in choices:
         raise ValueError(f"{name} must be one of {tuple(choices)}, got {value!r}")
@@ -99,7 +99,7 @@ def check_instance(name: str, value: object, expected: type) -> None:
     """Check that an argument is an instance of a class.
 
     Raises:
-        TypeError: It is an instance of another class, or it is a class.
+        TypeError: The argument is an instance of another class, or a class itself.
     """
     if not isinstance(value, expected):
         got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
@@ -118,7 +118,7 @@ def check_device(device: torch.device | str | int | None) -> torch.device:
     device = torch.device("cpu" if device is None else device)
     try:
         torch.empty(0, device=device)
-    except AssertionError as error:  # torch was built without support for it
+    except AssertionError as error:  # torch was built without support for the device
         raise RuntimeError(f"device {device} does not work: {error}") from None
     return device
 
@@ -129,7 +129,7 @@ def check_memory(num_envs: int, bytes_per_env: float) -> None:
     Raises:
         ValueError: The environments would take more than the physical memory.
     """
-    if sys.platform == "win32":  # without os.sysconf
+    if sys.platform == "win32":  # Windows has no os.sysconf
         return
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     needed = num_envs * bytes_per_env
@@ -145,7 +145,9 @@ def check_memory(num_envs: int, bytes_per_env: float) -> None:
 
 
 def all_finite(values: Tensor) -> bool:
-    """Whether all numbers are finite. One operation suffices if their sum is."""
+    """Whether all numbers are finite."""
+    # The sum is finite only if all numbers are, and computing it is faster than calling
+    # `isfinite`. But a sum of finite numbers may overflow, so `isfinite` decides then.
     return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
 
 
@@ -154,7 +156,7 @@ def check_action(action: object, shape: tuple[int, ...]) -> Tensor:
 
     Args:
         action: The action, (*batch_shape, action_dim), of a floating-point dtype.
-        shape: The shape that it must have.
+        shape: The shape that the action must have.
 
     Raises:
         ValueError: The action is not a tensor, has another shape, or is not finite.
@@ -191,7 +193,7 @@ def check_output(
         function: Name of the function, for the error.
         value: The returned value.
         shape: The shape that the tensor must have.
-        dtype: The dtype that it must have; None accepts any.
+        dtype: The dtype that the tensor must have; None accepts any.
 
     Raises:
         ValueError: The tensor has another shape or dtype.
@@ -217,7 +219,7 @@ def check_rows(
         name: Name of the tensor, for the error.
         is_valid: Whether each entry is valid, (len(envs), ...) bool.
         envs: The environments of the rows.
-        requirement: Completes the error "... must be".
+        requirement: End of the error message "... must be ...".
 
     Raises:
         ValueError: An entry is not valid. The error names the first such environment.
@@ -234,11 +236,14 @@ def check_quaternion(name: str, quaternion: Sequence[float]) -> None:
     """Check that four numbers are a quaternion xyzw of any positive length.
 
     Raises:
-        ValueError: They are not four numbers, are all 0, or are not finite.
+        ValueError: The numbers are not four, are all 0, or are not finite.
     """
     length = math.hypot(*quaternion)
     if not (len(quaternion) == 4 and 0 < length < math.inf):
-        raise ValueError(f"{name} must be a quaternion xyzw, got {tuple(quaternion)}")
+        raise ValueError(
+            f"{name} must be a quaternion xyzw, four finite numbers that are not all "
+            f"0, got {tuple(quaternion)}"
+        )
 
 
 def check_rotations(name: str, pose: Tensor, envs: Sequence[int]) -> None:

@@ -1,14 +1,15 @@
-"""Optional libraries, by the extra of ``pip install`` that brings them."""
+"""Extras of the package and the optional libraries that they install."""
 
 from typing import NamedTuple
 
 
 class Extra(NamedTuple):
-    """An extra of the package; pyproject.toml lists the versions.
+    """An extra of the package; pyproject.toml lists the versions of its libraries.
 
     Attributes:
-        purpose: What it is for.
-        modules: Modules that it brings; the first one tells whether it is installed.
+        purpose: Commands or features that need the extra.
+        modules: Modules that the extra installs. If the first one is installed, the
+            extra counts as installed.
         oldest_python: Oldest version of Python for which its libraries exist.
     """
 
@@ -39,7 +40,7 @@ def install_command(extra: str) -> str:
 
 
 def explain_missing(error: ModuleNotFoundError) -> str | None:
-    """Say which extra brings a module that is missing; None if none of them does."""
+    """Say which extra installs a missing module; None if no extra does."""
     module = (error.name or "").partition(".")[0]
     for name, extra in EXTRAS.items():
         if module in extra.modules:

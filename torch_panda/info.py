@@ -48,7 +48,7 @@ def versions() -> dict[str, str]:
 
 
 def environments() -> list[str]:
-    """Ids, sizes and length of episodes, a line for each robot, task and control."""
+    """Ids, sizes and number of steps, a line for each robot, task and control type."""
     families: dict[str, list[str]] = {}
     for env_id in torch_panda.ENV_IDS:
         families.setdefault(re.sub(r"(Dense)?-v\d+$", "", env_id), []).append(env_id)
@@ -69,7 +69,7 @@ def environments() -> list[str]:
 
 
 def renderers() -> list[str]:
-    """Renderers that pybullet was installed with, a line for each."""
+    """Renderers of the installed pybullet, a line for each."""
     egl = "installed" if find_spec("eglRenderer") else "not installed"
     return ["tiny (TinyRenderer, on the CPU): installed", f"egl (OpenGL): {egl}"]
 
@@ -114,7 +114,7 @@ def stepping() -> str:
 
 
 def describe() -> str:
-    """The whole text."""
+    """Text of all sections."""
     threads = f"default: one per core, here {num_cores()} of {os.cpu_count()}"
     sections = {
         "versions": [f"{name} {number}" for name, number in versions().items()],

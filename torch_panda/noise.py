@@ -1,9 +1,9 @@
-"""Noise and delay as torchrl transforms, which torchrl does not have.
+"""Transforms for TorchRL that add noise to observations and actions, or delay actions.
 
     env = TransformedEnv(make(...), Compose(ActionDelay(1), ActionNoise(0.05)))
 
-A rollout stores the policy's own action, without delay and noise, and the observation
-that the policy saw, with its noise.
+A rollout stores the action that the policy chose, before delay and noise, and the
+observation that the policy saw, with its noise.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class GaussianNoise:
 
     def add(self, value: Tensor) -> Tensor:
         """Return the sum of a tensor and new noise of the same shape."""
-        if self._generator is None:  # in the process that uses it
+        if self._generator is None:  # make it in the process that uses it
             self._generator = torch.Generator(value.device)
             if self._seed is None:
                 self._generator.seed()
@@ -116,7 +116,7 @@ class ActionDelay(Transform):
             raise ValueError(f"steps must be at least 1, got {steps}")
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
         self._steps = steps
-        self._queue: list[Tensor] = []  # the next action first
+        self._queue: list[Tensor] = []  # delayed actions, oldest first
 
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
         if not self._queue:

@@ -12,7 +12,7 @@ NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
     """Rotate vectors, (..., 3), by quaternions, (..., 4).
 
-    With q = (u, w) the result is v + w t + u x t, where t = 2 u x v.
+    For q = (u, w) with vector part u, the result is v + w t + u x t with t = 2 u x v.
     """
     u, vector = torch.broadcast_tensors(quaternion[..., :3], vector)
     w, t = quaternion[..., 3:], 2 * torch.linalg.cross(u, vector)
@@ -40,9 +40,10 @@ def rotation_distance(first: Tensor, second: Tensor) -> Tensor:
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
-    """Product of quaternions, (..., 4) each: the rotation second, and then first.
+    """Product of quaternions, (..., 4) each.
 
-    It is also the rotation first, and then second in the rotated frame.
+    As a rotation, it is ``second`` followed by ``first``, both about the world's axes.
+    Equally, it is ``first`` followed by ``second`` about the axes turned by ``first``.
     """
     first, second = torch.broadcast_tensors(first, second)
     a, w = first[..., :3], first[..., 3:]
@@ -52,7 +53,7 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotate_vector(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """Rotate one vector by one quaternion; `rotate` without tensors."""
+    """Rotate one vector by one quaternion, as `rotate` does, but without tensors."""
     x, y, z, w = quaternion
     a, b, c = vector
     p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)

@@ -11,8 +11,9 @@ def name_dead_workers(processes: Iterable[BaseProcess]) -> Iterator[None]:
     """Context manager that makes the error of a killed worker name the worker.
 
     torchrl's multi-process collectors notice a killed worker within about a second and
-    then end the other workers. If these take longer than 0.1 s to end, as large
-    environments do, torchrl 0.14 raises an error that does not say which worker died::
+    then end the other workers. If a worker takes longer than 0.1 s to end, which is
+    common with large environments, the error of torchrl 0.14 does not say which worker
+    was killed::
 
         with name_dead_workers(collector.procs):
             for data in collector:
@@ -45,7 +46,10 @@ def _pid(process: BaseProcess) -> int | None:
 
 
 def _exit_code(process: BaseProcess) -> int | None:
-    """Exit code of a process that died by itself; None if it lives or was ended."""
+    """Exit code of a process that failed.
+
+    None if the process still runs, ended normally, or was ended by torchrl.
+    """
     try:
         code = process.exitcode
     except ValueError:  # torchrl closes the processes that it ends

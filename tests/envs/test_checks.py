@@ -251,7 +251,7 @@ def test_observations_are_not_taken_for_a_state(env):
 def test_a_state_beside_observations_needs_set_state(env):
     td = env.reset(env.get_state(), set_state=True)
     assert "object_pose" in td
-    with pytest.raises(ValueError, match="say set_state=True"):
+    with pytest.raises(ValueError, match="pass set_state=True"):
         env.reset(td)
     env.reset(td, set_state=False)
     # Within a rollout torchrl resets as ever.

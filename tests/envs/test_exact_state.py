@@ -121,11 +121,11 @@ def test_gymnasium_passes_it_on():
         (lambda s: s.set("num_actions", s["num_actions"] + 1), "at most 3"),
         (
             lambda s: s.set("object_pose", s["object_pose"] + 1e-9),
-            "environment 0 does not lead to its object_pose",
+            "environment 0 do not lead to its object_pose",
         ),
     ],
 )
-def test_what_is_no_exact_state(change, message):
+def test_a_wrong_exact_state_is_refused(change, message):
     with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
         torch.manual_seed(0)
         env.rollout(3)

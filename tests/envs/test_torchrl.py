@@ -134,7 +134,7 @@ def test_a_bare_environment_takes_a_nested_state():
                 == expected.select(*start.keys(), strict=False)
             ).all()
         observed = start.set("state", state)
-        with pytest.raises(ValueError, match="say set_state=True"):
+        with pytest.raises(ValueError, match="pass set_state=True"):
             env.reset(observed)
 
 

@@ -117,7 +117,7 @@ def test_start_from_a_state(env):
             assert np.array_equal(observation[key], before[key])
         steps.append(env.step(-np.ones(3)))
     assert_equal(*steps)
-    with pytest.raises(ValueError, match=r"options are state, got .*speed"):
+    with pytest.raises(ValueError, match=r"accepted option is 'state', got .*speed"):
         env.reset(options={"speed": 1})
     with pytest.raises(ValueError, match="must have entries, got none"):
         env.reset(options={"state": TensorDict()})
@@ -215,7 +215,9 @@ def test_own_task():
         GoalEnv(batched)
     with (
         torch_panda.make("PandaReach-v1") as made,
-        pytest.raises(TypeError, match=r"\['from_pixels', 'sed'\] are for an id"),
+        pytest.raises(
+            TypeError, match=r"\['from_pixels', 'sed'\] are accepted with an id"
+        ),
     ):
         GoalEnv(made, sed=3, from_pixels=True, render_width=8)
 

@@ -244,7 +244,7 @@ def test_the_own_page_can_connect(viewer, host, origin):
 
 def test_a_version_of_viser_that_cannot_be_checked_is_refused(env, monkeypatch):
     monkeypatch.setattr(web_viewer.viser, "ViserServer", lambda **options: None)
-    with pytest.raises(RuntimeError, match="does not allow to check its requests"):
+    with pytest.raises(RuntimeError, match="cannot check web requests"):
         env.open_viewer(port=8765)
 
 

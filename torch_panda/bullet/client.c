@@ -1,8 +1,8 @@
 /* A step of one client: set the motors of its robot, advance time by substeps, and copy
    the state into the caller's memory.
 
-   Without this library, control.py, client.py and state.py do the same in Python and
-   compute the same numbers. */
+   Without the compiled library, control.py, client.py and state.py give the same
+   commands from Python and compute the same numbers. */
 
 #include "client.h"
 
@@ -32,6 +32,7 @@ handle client_submit(struct batch *batch, int env, handle command, int expected,
     return NULL;
 }
 
+/* Find the setpoints of the joints: copy them, or solve the inverse kinematics. */
 static int find_joints(struct batch *batch, int env, double *joints) {
     const struct functions *bullet = batch->bullet;
     const struct control *control = batch->control;
@@ -97,8 +98,8 @@ static int apply_torques(struct batch *batch, int env) {
 static int advance(struct batch *batch, int env, int num_substeps) {
     struct client *client = batch->clients[env];
     int has_torques = batch->control->arm_mode == TORQUES;
-    /* A client has one command buffer, which stepping does not change: submitting the
-       same command again steps again. */
+    /* One command serves all substeps: it lies in the client's command buffer, and a
+       substep does not overwrite this buffer. Other commands do. */
     handle command = batch->bullet->step_init(client->handle);
     for (; client->num_substeps < num_substeps; client->num_substeps++) {
         client->num_detections++;
@@ -113,7 +114,7 @@ static int advance(struct batch *batch, int env, int num_substeps) {
     return 1;
 }
 
-struct body_state { /* views of Bullet's memory, until the client's next command */
+struct body_state { /* views of Bullet's memory, valid until the next command */
     doubles q, u, link_poses, link_velocities;
 };
 

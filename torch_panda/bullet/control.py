@@ -1,4 +1,4 @@
-"""Control of a robot's motors, as a function or as data."""
+"""Control of a robot's motors: a Python function, or a `MotorControl` of numbers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,25 +19,24 @@ ArmMode = Literal["position", "velocity", "torque"]
 
 @dataclass(frozen=True)
 class MotorControl:
-    """Drives all movable joints of a robot.
+    """Drives all movable joints of a robot to setpoints.
 
-    It is a `Control` that consists of numbers only, so the native loop carries it out
-    without Python. The arm's joints are the first joints. A setpoint is a row of
-    numbers:
+    It is a `Control` that consists of numbers only, so the native loop can carry it out
+    in C. The arm's joints are the first joints of the robot.
 
-    * for the arm's joints, by ``arm_mode``: positions [rad], velocities [rad/s] or
-      torques [N m];
-    * or, with an ``ik_link``, the target of its centre of mass, world frame [m],
-      followed by its target orientation (quaternion xyzw) unless ``ik_orientation`` is
-      given;
-    * then the positions of the other joints [rad] or [m].
+    A setpoint is a row of numbers. Its first part is for the arm. Without ``ik_link``,
+    it has one number per joint of the arm: positions [rad], velocities [rad/s] or
+    torques [N m], depending on ``arm_mode``. With ``ik_link``, it is the target
+    position of that link's centre of mass, world frame [m], followed by the link's
+    target orientation (quaternion xyzw) unless ``ik_orientation`` fixes the
+    orientation. The second part has the positions of all other joints [rad] or [m].
 
     Attributes:
-        forces: Maximum force of every joint's motor [N m] or [N]. Torques of
+        forces: Maximum force of every joint's motor [N m] or [N]. The torques of
             ``arm_mode="torque"`` are not limited.
-        ik_link: Link for which inverse kinematics find the arm's joint positions; None
-            means that setpoints contain the arm's joints. It needs ``arm_mode``
-            "position" and ``num_arm_joints``.
+        ik_link: Link that inverse kinematics bring to the target; None means that
+            setpoints contain the arm's joints. It needs ``arm_mode`` "position" and
+            ``num_arm_joints``.
         ik_orientation: Orientation that this link keeps, quaternion xyzw in the world
             frame; None means that setpoints contain it.
         num_arm_joints: Number of the arm's joints.
@@ -58,8 +57,8 @@ class MotorControl:
         return self._pose_dim + len(self.forces) - self.num_arm_joints
 
     @property
-    def num_free_joints(self) -> int:
-        """Number of the first joints, which are driven by velocity or torque."""
+    def first_position_joint(self) -> int:
+        """Index of the first joint that is driven to a position."""
         return 0 if self.arm_mode == "position" else self.num_arm_joints
 
     @property
@@ -102,19 +101,19 @@ class MotorControl:
             orientation = self.ik_orientation or pose[3:].tolist()
             client.inverse_kinematics(body, self.ik_link, pose[:3], orientation, joints)
             joints[self.num_arm_joints :] = setpoint[self._pose_dim :]
-        first = self.num_free_joints  # first joint that is driven to a position
+        first = self.first_position_joint
         velocities = np.zeros(first)
         if self.arm_mode == "velocity":
             velocities = setpoint[:first]
         forces = self.forces
-        if self.arm_mode == "torque":  # the motors must not brake
+        if self.arm_mode == "torque":  # these joints have no motor force that brakes
             forces = (0.0,) * first + forces[first:]
         client.control_joints(body, joints[first:], forces, velocities)
 
     def advance(
         self, client: PhysicsClient, body: int, setpoint: Doubles, count: int
     ) -> None:
-        """Take ``count`` time steps after the motors were set."""
+        """Take ``count`` time steps, with the setpoint's torques if it has any."""
         if self.arm_mode != "torque":
             client.step(count)
             return

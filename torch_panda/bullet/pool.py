@@ -9,21 +9,23 @@ Work = Callable[[int], None]
 
 
 class _Job:
-    """One parallel loop: the indices from which threads draw, and their errors."""
+    """One parallel loop: the indices that threads take, and the errors they met."""
 
     def __init__(self, work: Work, indices: Sequence[int], num_threads: int) -> None:
         self.work = work
-        # Drawing from an iterator over a sequence is atomic under the GIL.
+        # Threads share this iterator without a lock: the GIL makes `next` on an
+        # iterator over a sequence atomic.
         self.indices: Iterator[int] = iter(indices)
         self.errors: list[tuple[int, Exception]] = []
         self._running = num_threads
         self._lock = threading.Lock()
-        # Locked until all work is done. A lock wakes its waiter faster than an Event.
+        # Locked until all work is done; `wait` acquires it. A lock wakes a waiting
+        # thread faster than a threading.Event.
         self._unfinished = threading.Lock()
         self._unfinished.acquire()
 
     def take_part(self) -> None:
-        """Work until no index is left. The last thread to leave ends the wait."""
+        """Work until no index is left. The last thread that finishes ends `wait`."""
         for index in self.indices:
             try:
                 self.work(index)
@@ -59,7 +61,8 @@ class _Worker:
     def _loop(self) -> None:
         while (job := self._jobs.get()) is not None:
             job.take_part()
-            # The job refers to the environment, which an idle thread must not keep.
+            # The job refers to the environment. Drop it, because an idle thread must
+            # not keep a forgotten environment alive.
             del job
 
 
@@ -79,7 +82,7 @@ class WorkerError(RuntimeError):
 class WorkerPool:
     """Persistent threads that run a function on many indices.
 
-    A thread that finishes an index draws the next one, so that a slow client does not
+    A thread that finishes an index takes the next one, so that a slow client does not
     delay the others.
 
     Args:
@@ -95,8 +98,8 @@ class WorkerPool:
     def run(self, work: Work, indices: Sequence[int]) -> None:
         """Call ``work(index)`` for every index, and return when all calls are done.
 
-        An exception in the calling thread (Ctrl-C) is raised when the running work is
-        done, so that no client remains in the middle of a step.
+        Ctrl-C raises only when all work is done, so that no client remains in the
+        middle of a step.
 
         Raises:
             WorkerError: ``work`` raised for at least one index. All other calls were
@@ -128,7 +131,10 @@ class WorkerPool:
             worker.join()
 
     def wait(self) -> None:
-        """Wait until no thread uses a client, even after a second Ctrl-C."""
+        """Wait until the last job is done.
+
+        It may still run although `run` has ended, if a second Ctrl-C interrupted `run`.
+        """
         if self._last_job is not None and self._process == os.getpid():
             self._last_job.wait()
         self._last_job = None

@@ -11,8 +11,9 @@ from torch_panda.tasks import Bodies, Task
 class RobotTaskBuilder:
     """Builds the same scene in any client.
 
-    It holds descriptions only. If it held the simulation, which holds the builder, the
-    cycle of references would keep a forgotten environment alive.
+    It refers to descriptions only. The simulation refers to the builder. If the builder
+    also referred to the simulation, this cycle of references would keep a forgotten
+    environment alive.
 
     Args:
         robot: The robot.
@@ -29,8 +30,8 @@ class RobotTaskBuilder:
         """Build the scene in a client.
 
         Raises:
-            TypeError: `Robot.build` or `Task.build` returns something else than the
-                ids of the bodies.
+            TypeError: `Robot.build` does not return a body id, or `Task.build` does not
+                return `Bodies`.
         """
         robot = self._robot
         body = robot.build(client)

@@ -17,14 +17,14 @@ GoalName = Literal["task", "observation"]
 
 
 def find_goal_indices(robot: Robot, task: Task) -> tuple[int, ...] | None:
-    """Indices of the observation's entries that are the achieved goal, (goal_dim,).
+    """Indices of the observation's entries that are the achieved goal.
 
     Returns:
-        None if the task does not declare them, or if a subclass overrides one of the
-        functions that the declaration describes without declaring the entries anew.
+        ``goal_dim`` indices. None if the task does not declare ``goal_entries``, or if
+        a subclass overrides a function that the declaration describes.
     """
     entries = task.goal_entries
-    if entries is None or not _is_current(task):
+    if entries is None or not _is_up_to_date(task):
         return None
     if entries.part == "robot" and type(robot).observation is not Robot.observation:
         return None
@@ -32,8 +32,12 @@ def find_goal_indices(robot: Robot, task: Task) -> tuple[int, ...] | None:
     return tuple(offset + index for index in entries.indices)
 
 
-def _is_current(task: Task) -> bool:
-    """Whether ``goal_entries`` is declared where, or below where, its functions are."""
+def _is_up_to_date(task: Task) -> bool:
+    """Whether ``goal_entries`` still describes the task's functions.
+
+    A subclass may override ``observation`` or ``achieved_goal``. Then it must also
+    declare ``goal_entries`` again, because the inherited indices may be wrong.
+    """
     classes = type(task).__mro__
     declared, observation, achieved_goal = (
         next(level for level, base in enumerate(classes) if name in vars(base))
@@ -59,7 +63,7 @@ class ObservationGoalFunction:
     observation_dim: int
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Call the function with the task's goals.
+        """Call the function with the task's goals, taken from the observations.
 
         Args:
             achieved_goal: (..., observation_dim).
@@ -83,13 +87,13 @@ class ObservationGoalFunction:
 
 
 class GoalObserver:
-    """Observations of states in which the desired goals are reached.
+    """Observes the states in which the desired goals are reached.
 
     In such a state the objects are at their goals and at rest. The hand is in its
-    neutral pose, or at the goal if that is a position of the hand.
+    neutral pose, or at the goal if the goal is a position of the hand.
 
-    The state is written into the tensors of the simulation, observed, and taken out
-    again. Bullet's clients are not touched.
+    `update` writes these states into the tensors of the simulation, observes them, and
+    restores the tensors. It does not change Bullet's clients.
 
     Args:
         robot: The robot.
@@ -132,7 +136,7 @@ class GoalObserver:
         simulation = self._simulation
         saved = simulation.state.rows.clone()
         try:
-            self._write(list(envs), goal)
+            self._write_goal_states(list(envs), goal)
             observation = torch.cat(
                 (
                     self._robot.observation(simulation),
@@ -143,11 +147,12 @@ class GoalObserver:
         finally:
             simulation.state.rows.copy_(saved)
         desired = observation[envs].float()
-        # Exactly the goal, also where it is the hand's or the observation rounds.
+        # Insert the goal itself, because the observation may round it. A goal for the
+        # hand is missing from the observation, because the hand is in its neutral pose.
         desired[:, self._goal_indices] = goal[envs].float()
         self.desired[envs] = desired
 
-    def _write(self, envs: list[int], goal: Tensor) -> None:
+    def _write_goal_states(self, envs: list[int], goal: Tensor) -> None:
         """Write the states in which the goals are reached into the tensors."""
         simulation = self._simulation
         objects = self._task.objects_at_goal(
@@ -165,7 +170,7 @@ class GoalObserver:
         simulation.object_pose[envs] = objects.pose
         simulation.object_joint_position[envs] = objects.joint_position
         simulation.object_joint_velocity[envs] = 0.0
-        simulation.object_state[envs] = 0.0  # also the velocities
+        simulation.object_state[envs] = 0.0  # includes the velocities
         simulation.object_state[envs, :, :3] = objects.pose[..., :3]
         for env, poses in zip(envs, objects.pose.tolist(), strict=True):
             for index, pose in enumerate(poses):

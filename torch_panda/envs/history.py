@@ -11,17 +11,18 @@ from torch import Tensor
 
 from torch_panda.bullet import BulletError
 
-# Keys that an exact state has beside those of a state.
-START = "start_"  # prefix of a key of the state
+# An exact state has these keys beside those of a plain state.
+START = "start_"  # prefix of the keys of the state at the start of the episode
 ACTIONS = "actions"
 NUM_ACTIONS = "num_actions"
 
-# Number of old steps that are dropped at a time.
+# Steps that no running episode needs are dropped when there are this many.
 _CHUNK = 1000
-# Longest episode that has an exact state [steps]. It bounds the memory of episodes that
-# never end.
+# Longest episode that has an exact state [steps]. This limit bounds the memory of
+# episodes that never end.
 _MAX_STEPS = 20_000
-_FORGOTTEN = -1
+# First step of an episode that became too long, so that its actions were dropped.
+_DROPPED = -1
 
 
 class History:
@@ -35,11 +36,11 @@ class History:
     def __init__(self, state: dict[str, Tensor], action_dim: int) -> None:
         self._start = {key: value.clone() for key, value in state.items()}
         self._action_dim = action_dim
-        # (n, action_dim) actions, and which environments took them, (n, 1) bool; None
-        # means all.
+        # Actions (n, action_dim), and a mask (n, 1) of the environments that took them;
+        # None means all.
         self._steps: list[tuple[Tensor, Tensor | None]] = []
-        # Index in _steps at which each environment's episode began.
-        self._begins = [0] * len(next(iter(state.values())))
+        # Index in _steps of the first step of each environment's episode.
+        self._first_steps = [0] * len(next(iter(state.values())))
 
     def begin(self, envs: Sequence[int], state: dict[str, Tensor]) -> None:
         """Record the starts of new episodes.
@@ -49,50 +50,53 @@ class History:
             state: The tensors of the state, (n, ...) by key.
         """
         for key, start in self._start.items():
-            # As arrays: indexing tensors takes three times as long.
+            # Index numpy arrays, because indexing tensors takes three times as long.
             start.numpy()[envs] = state[key].numpy()[envs]
         for env in envs:
-            self._begins[env] = len(self._steps)
-        if (unused := min(self._begins)) > _CHUNK:
+            self._first_steps[env] = len(self._steps)
+        if (unused := min(self._first_steps)) > _CHUNK:
             del self._steps[:unused]
-            self._begins = [begin - unused for begin in self._begins]
+            self._first_steps = [first - unused for first in self._first_steps]
 
-    def record(self, action: Tensor, stepped: Tensor | None) -> None:
+    def record(self, action: Tensor, step_mask: Tensor | None) -> None:
         """Record a step.
 
         Args:
             action: (n, action_dim) float32. The caller must not change it later.
-            stepped: Which environments take the step, (n, 1) bool; None means all.
+            step_mask: Mask of the environments that take the step, (n, 1) bool; None
+                means all.
         """
         if len(self._steps) == _MAX_STEPS:
             self._steps = []
-            self._begins = [_FORGOTTEN] * len(self._begins)
-        self._steps.append((action, None if stepped is None else stepped.clone()))
+            self._first_steps = [_DROPPED] * len(self._first_steps)
+        self._steps.append((action, None if step_mask is None else step_mask.clone()))
 
     def export(self) -> dict[str, Tensor]:
         """The recorded starts and actions.
 
         Returns:
             The starts under keys with the prefix ``start_``, ``actions`` (n, k,
-            action_dim) and ``num_actions`` (n, 1). The first ``num_actions[i]`` actions
-            of row i are those of environment i; the rest is zero.
+            action_dim) and ``num_actions`` (n, 1). Row i of ``actions`` holds the
+            ``num_actions[i]`` actions of environment i, followed by zeros.
 
         Raises:
             BulletError: An episode is too long for its actions to be kept.
         """
-        if forgotten := [i for i, begin in enumerate(self._begins) if begin < 0]:
+        first_steps = self._first_steps
+        if too_long := [i for i, first in enumerate(first_steps) if first == _DROPPED]:
             raise BulletError(
-                f"the episodes of environments {forgotten} are too long for an exact "
+                f"the episodes of environments {too_long} are too long for an exact "
                 f"state, which holds at most {_MAX_STEPS} actions"
             )
-        begins = torch.tensor(self._begins, device="cpu")
-        first = int(begins.min())
-        steps = self._steps[first:]
+        begins = torch.tensor(first_steps, device="cpu")
+        oldest = int(begins.min())
+        steps = self._steps[oldest:]
+        # By step: a mask of the environments that took it in their present episode.
         took_step = [
             (begins <= index)
-            if stepped is None
-            else (begins <= index) & stepped.flatten()
-            for index, (_, stepped) in enumerate(steps, start=first)
+            if step_mask is None
+            else (begins <= index) & step_mask.flatten()
+            for index, (_, step_mask) in enumerate(steps, start=oldest)
         ]
         counts = torch.zeros(len(begins), dtype=torch.int64, device="cpu")
         longest = int(sum(took_step, start=counts).max())

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.checks import check_output
-from torch_panda.envs.randomization import PHYSICS, DomainRandomizer
-from torch_panda.envs.state import EXACT_KEYS, PHYSICAL
+from torch_panda.envs.randomization import PHYSICS_KEYS, DomainRandomizer
+from torch_panda.envs.state import BODY_KEYS, EXACT_KEYS
 from torch_panda.rendering import VectorRenderer
 from torch_panda.robots import Robot
 from torch_panda.sensors import Entry, JointState, Observer, Sensor, join_entries
@@ -73,7 +73,7 @@ class EpisodeObserver:
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._readings, extra]
-        reserved = {*PHYSICAL, *PHYSICS, *EXACT_KEYS}
+        reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
         self.entries = join_entries(observers, reserved) | randomizer.entries

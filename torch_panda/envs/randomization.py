@@ -1,4 +1,4 @@
-"""Domain randomization: physics that are drawn anew for every episode.
+"""Domain randomization: the physics of every episode are drawn at random.
 
 `Randomization` holds the ranges. `PhysicsFactors` multiplies the physics of one client
 by factors. `DomainRandomizer` draws the factors of n environments and applies them.
@@ -30,16 +30,16 @@ PARAMETERS = (
     "joint_damping",
     "gravity",
 )
-# A factor on 0 has no effect. If the nominal value of these is 0, the drawn number is
-# the value itself.
+# No factor changes a nominal value of 0. If the nominal value of one of these
+# parameters is 0, the drawn number is therefore used as the value itself.
 _ABSOLUTE_AT_ZERO = ("object_restitution", "joint_damping")
 
 # Entries of a state that determine the physics of an episode.
 PHYSICS_SEED = "physics_seed"
 PHYSICS_PARAMETERS = "physics_parameters"
-PHYSICS = (PHYSICS_SEED, PHYSICS_PARAMETERS)
+PHYSICS_KEYS = (PHYSICS_SEED, PHYSICS_PARAMETERS)
 
-# Index of the constant factor 1, behind the drawn factors.
+# Index of the constant factor 1, which `PhysicsFactors.apply` appends to the factors.
 _CONSTANT = -1
 
 
@@ -47,28 +47,30 @@ _CONSTANT = -1
 class Randomization:
     """Ranges from which the physics of every episode are drawn.
 
-    A range is (lowest, highest) of a factor on the nominal value, the number of the
-    task, the robot or the URDF. Each environment draws the factors uniformly before
-    each of its episodes, from (seed, environment, episode number) only. None keeps the
-    nominal value. A range for something that the scene lacks has no effect.
+    A range is the lowest and the highest value of a factor. The factor multiplies the
+    nominal value, which the task, the robot or the URDF sets. None keeps the nominal
+    value. A range for something that the scene lacks has no effect.
+
+    Each environment draws new factors before each of its episodes, uniformly from these
+    ranges. The drawn factors depend on (seed, environment, episode number) only.
 
     Attributes:
         object_mass: Mass and inertia of all objects.
-        object_friction: Lateral friction of all objects and their links. Bullet
-            multiplies the friction of the two bodies in contact.
+        object_friction: Lateral friction of all objects and their links. For a
+            contact, Bullet multiplies the frictions of the two bodies.
         table_friction: Lateral friction of the table and all other fixed bodies.
         finger_friction: Lateral friction of the robot's ``finger_links``.
         object_restitution: Restitution of all objects. Where the nominal value is 0,
-            Bullet's default, the drawn number is the restitution itself. With this
-            range the table and all other fixed bodies get a restitution of 1, because
-            Bullet multiplies both.
+            which is Bullet's default, the drawn number is the restitution itself. This
+            range also gives the table and all other fixed bodies a restitution of 1,
+            because Bullet multiplies the restitutions of the two bodies in contact.
         joint_damping: Damping of the robot's joints. Where the nominal value is 0, as
             in the Panda, the drawn number is the damping itself [N m s/rad].
         gravity: Gravity of the world.
         joint_position: Largest offset of the arm's joints from neutral at the start
             [rad].
-        observe: Observe ``physics_parameters``, float32 (*batch, k): the drawn
-            factors, in the order above.
+        observe: Whether to observe ``physics_parameters``, float32 (*batch, k): the k
+            drawn factors, in the order above.
 
     Raises:
         ValueError: A range is not (lowest, highest), finite and at least 0.
@@ -106,11 +108,11 @@ class Randomization:
 
 
 class PhysicsFactors:
-    """Multiplies the physics of a client by factors.
+    """Multiplies physical properties of a client by factors.
 
     Args:
         names: Names of the factors, from `PARAMETERS`.
-        client: A client whose physics are still nominal.
+        client: A client whose physics still have their nominal values.
         scene: The scene that all clients hold.
         finger_links: The robot's ``finger_links``.
         physics: The integration parameters of the clients.
@@ -134,7 +136,8 @@ class PhysicsFactors:
         fingers = [(scene.robot, link) for link in finger_links]
         joints = [(scene.robot, joint) for joint in scene.joints]
         damping = {joint.index: joint.damping for joint in client.joints(scene.robot)}
-        # Argument of `set_dynamics`, (body, link) pairs, and their nominal value.
+        # By name of the factor: the argument of `set_dynamics`, the links as (body,
+        # link) pairs, and the function that reads a link's nominal value.
         targets: dict[
             str, tuple[str, list[tuple[int, int]], Callable[[int, int], float]]
         ] = {
@@ -146,7 +149,7 @@ class PhysicsFactors:
             "joint_damping": ("joint_damping", joints, lambda _, link: damping[link]),
         }
         self._gravity: tuple[int, float] | None = None
-        # (argument of `set_dynamics`, index of the factor, nominal value) by link.
+        # By link: (argument of `set_dynamics`, index of the factor, nominal value).
         self._changes: dict[tuple[int, int], list[tuple[str, int, float]]] = {}
         for index, name in enumerate(names):
             if name == "gravity":
@@ -176,9 +179,10 @@ class PhysicsFactors:
 class DomainRandomizer:
     """Draws the physics of n environments and changes their clients.
 
-    Two sources vary the physics: a `Randomization`, and the hook `Task.randomize`. The
-    numbers on which the physics depend are part of the state of an environment, so
-    that resetting to a state restores the physics too.
+    Two sources vary the physics: a `Randomization`, and the hook `Task.randomize`.
+
+    The drawn factors, and the seed for the hook, are part of the state of an
+    environment. A reset to a state therefore restores the physics too.
 
     Args:
         randomization: Ranges of the factors; None draws no factors.
@@ -241,7 +245,8 @@ class DomainRandomizer:
         """Draw the physics and the joint offsets of an environment's next episode.
 
         Args:
-            env: The environment. Its ``joint_position`` already holds the neutral pose.
+            env: The environment. Its row of ``joint_position`` must already hold the
+                neutral pose.
             seed: Seed of the physics of this episode.
         """
         if PHYSICS_SEED in self.state:
@@ -256,7 +261,7 @@ class DomainRandomizer:
             arm += torch.from_numpy(rng.uniform(-limit, limit, size=len(arm)))
 
     def apply(self, env: int) -> None:
-        """Change the physics of an environment's client to those of its state."""
+        """Set the physics of an environment's client from the environment's state."""
         client = self._simulation.clients[env]
         if self._factors is not None:
             self._factors.apply(client, self.state[PHYSICS_PARAMETERS][env].tolist())

@@ -22,7 +22,7 @@ from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, STATE_KEY, is_state, unpack_state
+from torch_panda.envs.state import EXACT_KEYS, NESTED_STATE, is_state, unpack_state
 from torch_panda.rendering import Camera, RendererName, Window, segmentation_ids
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -531,7 +531,7 @@ class RobotTaskEnv(EnvBase):
             frame = frame.f_back
         if wrapper is None or frame.f_code is not _METADATA_CODE:
             return True
-        return STATE_KEY in set(wrapper.state_spec.keys())
+        return NESTED_STATE in set(wrapper.state_spec.keys())
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         """Whether a tensordict has a state under "state"; `TransformedEnv` asks."""

@@ -39,7 +39,7 @@ class EpisodeSeeds:
         self._episodes = [0] * len(self._episodes)
 
     def restart_one(self, env: int, seed: int) -> None:
-        """Give one environment the sequence of environment 0 under a seed.
+        """Give one environment the episodes that environment 0 has under a seed.
 
         Raises:
             ValueError: The index is out of range, or the seed is negative.
@@ -59,10 +59,10 @@ class EpisodeSeeds:
         return generator
 
     def physics_seed(self, env: int) -> np.random.SeedSequence:
-        """The seed of the physics of the episode that `next_generator` began.
+        """The seed of the physics of the last episode for which `next_generator` ran.
 
-        Its stream differs from the generator's, so randomized physics do not change
-        the goals and objects that are drawn.
+        Goals and objects are drawn from that generator. This seed makes another stream,
+        so that randomized physics do not change the drawn goals and objects.
         """
         episode = (*self._streams[env], self._episodes[env] - 1)
         return np.random.SeedSequence(episode, spawn_key=(1,))
@@ -76,10 +76,10 @@ class EpisodeSeeds:
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state` returned.
+        """Continue with the seeds and episode numbers that `state` returned.
 
         Raises:
-            ValueError: The state holds another number of environments.
+            ValueError: The state is that of another number of environments.
         """
         streams, episodes = state["streams"], state["episodes"]
         if len(episodes) != len(self._episodes):

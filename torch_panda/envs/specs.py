@@ -8,15 +8,17 @@ from torch_panda.sensors import Entry
 
 
 class Specs:
-    """Specs of a batch of environments, from the sizes of robot, task and sensors.
+    """Specs of a batch of environments.
+
+    They follow from the sizes that the robot, the task and the sensors declare.
 
     Args:
         episodes: The environments.
         device: Device of the tensors.
-        observe_state: Whether ``observation`` is observed.
+        observe_state: Whether the observed entries include ``observation``.
 
     Attributes:
-        observation: Spec of what is observed.
+        observation: Spec of the observed entries.
         action: Spec of the action.
         reward: Spec of the reward.
         done: Spec of ``done``, ``terminated`` and ``truncated``.

@@ -46,7 +46,7 @@ class EpisodeStarts:
         self.step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
 
     def state(self) -> dict[str, Tensor]:
-        """The tensors of the state, (n, ...) by key. They are not copies."""
+        """The tensors of the state, (n, ...) by key, not copied."""
         simulation = self._simulation
         state = {
             "joint_position": simulation.joint_position,
@@ -70,14 +70,14 @@ class EpisodeStarts:
                 finite, or quaternions that are not unit quaternions.
         """
         start = self._task.sample_start(self._seeds.next_generator(env))
-        # Rows of arrays: indexing tensors takes three times as long.
+        # Index numpy arrays, because indexing tensors takes three times as long.
         row = {key: value.numpy()[env] for key, value in self.state().items()}
         row["step_count"][:] = 0
-        _fill(row["desired_goal"], start.goal, self._function("sample_goal"))
+        _fill(row["desired_goal"], start.goal, self._draw_function("sample_goal"))
         row["joint_position"][:] = self._robot.neutral_joint_position
         row["joint_velocity"][:] = 0.0
         if len(row["object_pose"]):
-            function = self._function("sample_objects")
+            function = self._draw_function("sample_objects")
             _fill(row["object_pose"], start.object_pose, function)
             for *_, x, y, z, w in row["object_pose"].tolist():
                 if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
@@ -88,8 +88,9 @@ class EpisodeStarts:
         if "object_joint_position" in row:
             joints = row["object_joint_position"]
             drawn = np.asarray(start.object_joint_position)
+            # A single number is the position of every joint.
             drawn = np.broadcast_to(drawn, joints.shape) if drawn.size == 1 else drawn
-            _fill(joints, drawn, self._function("sample_object_joints"))
+            _fill(joints, drawn, self._draw_function("sample_object_joints"))
             row["object_joint_velocity"][:] = 0.0
         if self._randomizer.is_active:
             self._randomizer.draw(env, self._seeds.physics_seed(env))
@@ -125,15 +126,22 @@ class EpisodeStarts:
             envs, randomizer.apply if randomizer.changes_physics else None
         )
 
-    def _function(self, name: str) -> str:
-        """The function of the task that draws, for errors."""
+    def _draw_function(self, name: str) -> str:
+        """Name of the task's function that draws an entry, for errors.
+
+        It is ``sample_start`` if the task overrides this, and ``name`` otherwise.
+        """
         if type(self._task).sample_start is not Task.sample_start:
             return "sample_start"
         return name
 
 
 def _fill(row: Doubles, values: object, function: str) -> None:
-    """Write into a row of a state tensor what the task drew."""
+    """Check the numbers that the task drew and write them into a state tensor's row.
+
+    Raises:
+        ValueError: The numbers have a wrong shape or are not finite.
+    """
     drawn = np.asarray(values, dtype=np.float64)
     if drawn.shape != row.shape or not np.isfinite(drawn).all():
         raise ValueError(

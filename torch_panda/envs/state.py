@@ -9,14 +9,15 @@ from torch import Tensor
 
 from torch_panda.checks import check_rotations, check_rows
 from torch_panda.envs.history import ACTIONS, NUM_ACTIONS, START
-from torch_panda.envs.randomization import PHYSICS
+from torch_panda.envs.randomization import PHYSICS_KEYS
 
 # Largest position, angle or velocity that a state may hold [m], [rad], [m/s], [rad/s].
-# It is far beyond any scene. Bullet returns NaN where squares overflow.
+# It is far larger than any number of a scene. Much larger numbers would make Bullet
+# return NaN, because their squares overflow.
 _LIMIT = 1e6
 
 # Positions and velocities of the robot, the objects and the objects' joints.
-PHYSICAL = (
+BODY_KEYS = (
     "joint_position",
     "joint_velocity",
     "object_pose",
@@ -24,11 +25,12 @@ PHYSICAL = (
     "object_joint_position",
     "object_joint_velocity",
 )
-STATE = (*PHYSICAL, "desired_goal", "step_count", *PHYSICS)
-# Key under which `StateTransform` carries a whole state.
-STATE_KEY = "state"
+# All entries that a state may have.
+ALL_KEYS = (*BODY_KEYS, "desired_goal", "step_count", *PHYSICS_KEYS)
+# Key under which `StateTransform` puts a whole state.
+NESTED_STATE = "state"
 # Entries that only an exact state has.
-EXACT_KEYS = (*(START + key for key in STATE), ACTIONS, NUM_ACTIONS)
+EXACT_KEYS = (*(START + key for key in ALL_KEYS), ACTIONS, NUM_ACTIONS)
 
 
 @dataclass
@@ -37,10 +39,12 @@ class StartState:
 
     Attributes:
         values: Entries of the state, (k, ...) by key.
-        start: Of an exact state, the start of the episode, (k, ...) by key; else empty.
-        actions: Of an exact state, the actions since, (k, length, action_dim) float32
-            in [-1, 1].
-        num_actions: Of an exact state, the number of actions of each row, (k, 1) int64.
+        start: State at the start of the episode, (k, ...) by key; empty unless the
+            state is exact.
+        actions: Actions since the start of the episode, (k, length, action_dim) float32
+            in [-1, 1]; None unless the state is exact.
+        num_actions: Number of actions of each row, (k, 1) int64; None unless the state
+            is exact.
     """
 
     values: dict[str, Tensor]
@@ -86,53 +90,58 @@ class StartState:
             differs = (value[envs] != self.values[key]).flatten(1).any(dim=1).nonzero()
             if len(differs):
                 raise ValueError(
-                    f"the exact state of environment {envs[int(differs[0])]} does not "
-                    f"lead to its {key}: the state was changed or belongs to another "
-                    f"environment; leave out its start and its actions to start from "
-                    f"the other entries"
+                    f"the actions in the exact state of environment "
+                    f"{envs[int(differs[0])]} do not lead to its {key}: the state was "
+                    f"changed or belongs to another environment; leave out its start "
+                    f"and its actions to start from the other entries"
                 )
 
 
 def is_state(
     entries: Mapping[str, Any] | None, observed_keys: Collection[str] = ()
 ) -> bool:
-    """Whether the argument of a reset is a state, if ``set_state`` is not given.
+    """Whether a reset without ``set_state`` should start from its argument.
 
-    The tensordict of an ordinary reset may hold a ``desired_goal`` too, and torchrl's
-    `StepCounter` writes a ``step_count`` into it. It then holds an ``achieved_goal``,
-    and entries of a state that the environment observes (the sensor "joint_state").
-    A state may also lie under the key ``state``, where `StateTransform` puts it.
+    torchrl may pass the last observations to any reset, so a state has to be told from
+    observations by its keys. The argument is a state in two cases:
+
+    * It has entries of `BODY_KEYS`, or a nested state under ``state``, where
+      `StateTransform` puts it.
+    * It has a ``desired_goal`` without an ``achieved_goal``. With an ``achieved_goal``
+      the two are observations.
+
+    A ``step_count`` alone is not a state: torchrl's `StepCounter` writes it too.
 
     Args:
         entries: The argument of the reset.
-        observed_keys: Keys of sensors, which are observations beside an
-            ``achieved_goal``.
+        observed_keys: Keys of sensors. Beside an ``achieved_goal``, such an entry is an
+            observation, for example a ``joint_position`` of the sensor "joint_state".
 
     Raises:
-        ValueError: The argument holds a state and observations.
+        ValueError: The argument holds both a state and observations.
     """
     keys = set() if entries is None else set(entries.keys())
     is_observed = "achieved_goal" in keys
     if is_observed:
         keys -= set(observed_keys)
     is_nested = entries is not None and unpack_state(entries) is not entries
-    if not is_nested and not keys.intersection(PHYSICAL):
+    if not is_nested and not keys.intersection(BODY_KEYS):
         return "desired_goal" in keys and not is_observed
     if is_observed:
         raise ValueError(
             f"the tensordict holds observations and a state (one of "
-            f"{', '.join(PHYSICAL)}, {STATE_KEY}): say set_state=True to start from "
-            f"it, set_state=False to start a new episode"
+            f"{', '.join(BODY_KEYS)}, {NESTED_STATE}): pass set_state=True to start "
+            f"from the state, or set_state=False to start a new episode"
         )
     return True
 
 
 def unpack_state(entries: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The state under the key ``state``, or else the entries themselves.
+    """The nested state under the key ``state``, or the entries if there is none.
 
-    A tensor under this key is an observation of a task or sensor.
+    A tensor under this key is not a state, but an observation of a task or a sensor.
     """
-    nested = entries.get(STATE_KEY, None)
+    nested = entries.get(NESTED_STATE, None)
     return entries if nested is None or isinstance(nested, Tensor) else nested
 
 
@@ -157,22 +166,24 @@ def read_state(
         Entries of shape (len(envs), ...), in the dtypes of ``present``.
 
     Raises:
-        ValueError: An entry has a wrong shape, is not finite, is above 1e6, or is not a
-            rotation; no entry of a state is present beside ``step_count``, which
-            torchrl's `StepCounter` has too; or an exact state lacks entries.
+        ValueError: An entry has a wrong shape, is not finite, is above 1e6, or should
+            be a rotation and is not; or there is no entry of a state, except perhaps
+            ``step_count``, which may be that of torchrl's `StepCounter`; or an exact
+            state lacks entries.
     """
-    if not {*PHYSICAL, "desired_goal", *PHYSICS}.intersection(state.keys()):
+    if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
         raise ValueError(
-            f"set_state=True needs a state with some of {', '.join(present)}; none "
-            "arrived. torchrl's TransformedEnv and ParallelEnv do not pass states on: "
-            "reset env.base_env, or add torch_panda.envs.StateTransform and give the "
-            f"state under the key {STATE_KEY!r}"
+            f"set_state=True needs a state with some of {', '.join(present)}, but the "
+            "environment got none. torchrl's TransformedEnv and ParallelEnv do not "
+            "pass states on: reset env.base_env, or add "
+            "torch_panda.envs.StateTransform and give the state under the key "
+            f"{NESTED_STATE!r}"
         )
 
     def read(prefix: str = "") -> dict[str, Tensor]:
         return {
-            key: _read_entry(prefix + key, state[prefix + key], batch_shape, own, envs)
-            for key, own in present.items()
+            key: _read_entry(prefix + key, state[prefix + key], batch_shape, now, envs)
+            for key, now in present.items()
             if state.get(prefix + key, None) is not None
         }
 
@@ -215,6 +226,6 @@ def _read_entry(
         check_rows(key, is_small, envs, f"finite and at most {_LIMIT:g}")
     else:
         check_rows(key, value >= 0, envs, "at least 0")
-    if key.endswith("object_pose"):
+    if key.endswith("object_pose"):  # also that of the start of an exact state
         check_rotations(key, value, envs)
     return value

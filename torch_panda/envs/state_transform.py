@@ -6,52 +6,53 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
 from torch_panda.envs.robot_task import RobotTaskEnv
-from torch_panda.envs.state import STATE_KEY
+from torch_panda.envs.state import NESTED_STATE
 
 
 class StateTransform(Transform):
     """Observes the state under ``state``, and lets resets start from it.
 
-    torchrl's `TransformedEnv` and `ParallelEnv` pass only those entries on to the
-    environment that its ``state_spec`` names. This transform names the state, also in
-    the workers of a `ParallelEnv`::
+    torchrl's `TransformedEnv` and `ParallelEnv` pass only those entries of a reset on
+    to the environment that ``state_spec`` names. This transform adds the state to
+    ``state_spec``. It also works in the workers of a `ParallelEnv`::
 
         env = TransformedEnv(make(...), Compose(StateTransform(), StepCounter()))
         td = env.rollout(10)[..., -1]
         env.reset(td.select("state"), set_state=True)
 
-    The state lies under a key of its own, because `StepCounter` writes a ``step_count``
-    too. It has the entries of `RobotTaskEnv.get_state`, without those that only an
-    exact state has: their number of actions varies.
+    The state is nested under ``state``, because it has an entry ``step_count``, which
+    torchrl's `StepCounter` writes too. It has the entries of `RobotTaskEnv.get_state`.
+    Exact states are not supported: specs have fixed shapes, but an exact state gets
+    more actions with every step.
     """
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the state to what is observed."""
+        """Add the state to the observed entries."""
         assert isinstance(observation_spec, Composite)
-        observation_spec[STATE_KEY] = self._state_spec()
+        observation_spec[NESTED_STATE] = self._state_spec()
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Add the state to the entries that a reset passes on."""
         assert isinstance(input_spec, Composite)
         if input_spec["full_state_spec"] is None:
-            # `device` is annotated as what its setter accepts.
+            # mypy takes the type of `device` from its setter, which accepts more types.
             input_spec["full_state_spec"] = Composite(
                 shape=input_spec.shape,
                 device=input_spec.device,  # type: ignore[arg-type]
             )
-        input_spec["full_state_spec", STATE_KEY] = self._state_spec()
+        input_spec["full_state_spec", NESTED_STATE] = self._state_spec()
         return input_spec
 
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        return next_tensordict.set(STATE_KEY, self._env().get_state())
+        return next_tensordict.set(NESTED_STATE, self._env().get_state())
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return tensordict_reset.set(STATE_KEY, self._env().get_state())
+        return tensordict_reset.set(NESTED_STATE, self._env().get_state())
 
     def _env(self) -> RobotTaskEnv:
         """The environment that the transform wraps."""

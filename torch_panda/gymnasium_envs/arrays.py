@@ -14,14 +14,15 @@ from torch_panda.envs import RobotTaskEnv
 
 Observation = dict[str, NDArray[Any]]
 
-# Entries that Gymnasium returns beside the observation or in the infos.
+# Entries that Gymnasium returns outside the observation.
 _OUTCOME = {"success", "reward", "terminated", "truncated", "done"}
 
 
 def observation_space(env: RobotTaskEnv) -> spaces.Space[Any]:
     """Space of the observations and goals of one environment.
 
-    float32 entries have no bounds. Integers and booleans have those of their type.
+    float32 entries have no bounds. The bounds of integers and booleans are those of
+    their type.
     """
     boxes: dict[str, spaces.Space[Any]] = {}
     for key in observed_keys(env):
@@ -47,19 +48,24 @@ def observed_keys(env: RobotTaskEnv) -> list[str]:
 
 
 def action(values: ArrayLike) -> Tensor:
-    """Convert an action of any real dtype. The environment checks its values."""
+    """Convert an action of any real dtype; the environment checks its values."""
     return torch.from_numpy(np.asarray(values).astype(np.float64))
 
 
 def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
-    """Read the state to start from in the options of a reset; None if there is none.
+    """Read the state to start from in the options of a reset.
+
+    Returns:
+        The state as tensors; None if the options have no ``state``.
 
     Raises:
-        ValueError: The options hold something else, or the state has no entries.
+        ValueError: An option has another name, or the state has no entries.
         TypeError: The state is not a mapping of names to arrays of numbers.
     """
     if unknown := set(options) - {"state"}:
-        raise ValueError(f"accepted options are state, got {sorted(map(str, unknown))}")
+        raise ValueError(
+            f"the only accepted option is 'state', got {sorted(map(str, unknown))}"
+        )
     if "state" not in options:
         return None
     state = options["state"]
@@ -73,7 +79,11 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
 
 
 class GoalFunctions:
-    """Pure functions of goals, as Gymnasium-Robotics' goal environments have them."""
+    """The pure functions of goals that Gymnasium-Robotics' goal environments have.
+
+    Attributes:
+        torch_env: The `RobotTaskEnv` whose reward and success they compute.
+    """
 
     torch_env: RobotTaskEnv
 
@@ -116,7 +126,7 @@ class GoalFunctions:
         desired_goal: ArrayLike,
         info: Any = None,  # noqa: ANN401
     ) -> NDArray[np.bool_]:
-        """False, (...): only the number of steps truncates an episode."""
+        """Always false, (...): a goal never truncates an episode, only its length."""
         goals = _tensor(achieved_goal), _tensor(desired_goal)
         return _array(torch.zeros_like(self.torch_env.is_success(*goals)))
 

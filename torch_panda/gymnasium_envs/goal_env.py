@@ -24,23 +24,24 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
     """A goal environment: ``gymnasium.make("torch_panda/PandaPush-v1")``.
 
     An observation is a dictionary of ``observation``, ``achieved_goal`` and
-    ``desired_goal``, float32, and of the entries of cameras and sensors.
-    ``info["is_success"]`` is whether the goal is reached.
+    ``desired_goal``, float32, and of the entries of cameras and other sensors.
+    ``info["is_success"]`` says whether the goal is reached.
 
     Args:
-        env: An id, whose episodes ``gymnasium.make`` truncates, or a `RobotTaskEnv` of
-            batch size [].
+        env: An id, or a `RobotTaskEnv` of batch size []. An environment that is made
+            from an id never truncates an episode, because ``gymnasium.make`` does.
         render_mode: "rgb_array" or None.
         render_camera: Camera of `render`; None means panda-gym's view in 720 x 480
             pixels.
-        **arguments: Arguments of `torch_panda.make`, if ``env`` is an id; and
-            panda-gym's arguments of the camera: ``render_width``, ``render_height``,
-            ``render_target_position``, ``render_distance``, ``render_yaw``,
-            ``render_pitch`` and ``render_roll``.
+        **arguments: panda-gym's arguments of the camera: ``render_width``,
+            ``render_height``, ``render_target_position``, ``render_distance``,
+            ``render_yaw``, ``render_pitch`` and ``render_roll``. If ``env`` is an id,
+            also arguments of `torch_panda.make`.
 
     Raises:
         ValueError: The `RobotTaskEnv` is batched, or the render mode is unknown.
-        TypeError: Arguments of `torch_panda.make` accompany a `RobotTaskEnv`.
+        TypeError: ``env`` is a `RobotTaskEnv`, but there are arguments of
+            `torch_panda.make`.
 
     Attributes:
         torch_env: The `RobotTaskEnv` behind this environment.
@@ -81,7 +82,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Start an episode.
 
         Args:
-            seed: Restarts the sequence of episodes, as the seed of `RobotTaskEnv`.
+            seed: Seed with which the sequence of episodes starts again, as with a new
+                `RobotTaskEnv` of this seed; None continues the sequence.
             options: May hold ``state``, the state to start from, as
                 `RobotTaskEnv.get_state` returns it, or some of its entries.
 
@@ -100,7 +102,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: ArrayLike
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for one step. It raises the errors of `RobotTaskEnv`."""
+        """Act for one step; see `RobotTaskEnv` for the errors."""
         after = self.torch_env.episodes.step(arrays.action(action))
         return (
             self._observation(after),
@@ -125,8 +127,9 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _info(observed: Observed) -> dict[str, Any]:
-    # An array of shape (), as in panda-gym. torchrl's readers of infos need a dtype,
-    # and Gymnasium's vector environments join arrays, but not numpy's scalars.
+    # An array of shape (), as in panda-gym: torchrl reads the dtype of infos, which a
+    # bool does not have, and Gymnasium's vector environments do not stack numpy
+    # scalars.
     return {"is_success": np.array(observed["success"].item())}
 
 
@@ -136,10 +139,13 @@ def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:
 
 
 def check_no_arguments(arguments: dict[str, Any]) -> None:
-    """Check that no arguments of `torch_panda.make` accompany a `RobotTaskEnv`.
+    """Check that there are no arguments of `torch_panda.make`, for a `RobotTaskEnv`.
 
     Raises:
-        TypeError: An argument accompanies it.
+        TypeError: There is such an argument.
     """
     if arguments:
-        raise TypeError(f"{sorted(arguments)} are for an id, not for an environment")
+        raise TypeError(
+            f"{sorted(arguments)} are accepted with an id only: pass them to the "
+            f"RobotTaskEnv instead"
+        )

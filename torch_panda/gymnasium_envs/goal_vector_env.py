@@ -25,26 +25,29 @@ class GoalVectorEnv(
     GoalFunctions,
     VectorEnv[Observation, NDArray[np.float32], NDArray[Any]],
 ):
-    """``gymnasium.make_vec("torch_panda/PandaPush-v1", num_envs=16)``.
+    """Goal environments stepped in parallel, in one process.
 
-    It returns the same values as ``SyncVectorEnv`` over as many `GoalEnv`, in all
-    autoreset modes. A ``seed`` therefore seeds environment i with ``seed + i``.
+    ``gymnasium.make_vec("torch_panda/PandaPush-v1", num_envs=16)`` makes one. It
+    returns the same values as a ``SyncVectorEnv`` of `GoalEnv`, in all autoreset modes.
+    Environment i therefore gets the seed ``seed + i``.
 
     Args:
         env: An id, or a `RobotTaskEnv` of batch size [num_envs].
         num_envs: Number of environments, for an id; None means 1.
-        autoreset_mode: When an environment is reset after its episode ended. NEXT_STEP
-            resets it instead of its next step. SAME_STEP resets it within the last
-            step, with ``final_obs`` and ``final_info`` in the infos. DISABLED leaves
-            it to `reset` with ``options={"reset_mask": ...}``. torchrl's `GymWrapper`
-            takes SAME_STEP and DISABLED.
+        autoreset_mode: When an environment is reset after its episode ended.
+            NEXT_STEP: the next call of `step` resets it, and ignores its action.
+            SAME_STEP: the step that ends the episode also resets it. The infos then
+            hold ``final_obs`` and ``final_info``. DISABLED: the caller resets it with
+            ``reset(options={"reset_mask": ...})``. torchrl's `GymWrapper` supports
+            SAME_STEP and DISABLED.
         render_mode: "rgb_array" or None.
         render_camera: Camera of `render`, as for `GoalEnv`.
         **arguments: Further arguments of `GoalEnv`.
 
     Raises:
         ValueError: The `RobotTaskEnv` is not batched, or a mode is unknown.
-        TypeError: Arguments of `torch_panda.make` accompany a `RobotTaskEnv`.
+        TypeError: ``env`` is a `RobotTaskEnv`, but there are arguments of
+            `torch_panda.make`.
 
     Attributes:
         torch_env: The `RobotTaskEnv` behind these environments.
@@ -61,7 +64,7 @@ class GoalVectorEnv(
         render_camera: Camera | None = None,
         **arguments: Any,  # noqa: ANN401 (of GoalEnv)
     ) -> None:
-        self.closed = True  # until everything is built, nothing needs closing
+        self.closed = True  # nothing needs closing until everything is built
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         check_render_mode(render_mode)
         camera, arguments = take_camera(render_camera, arguments)
@@ -99,8 +102,8 @@ class GoalVectorEnv(
         """Start episodes.
 
         Args:
-            seed: Seed of environment 0, with ``seed + i`` for environment i; or one
-                seed per environment.
+            seed: A number gives environment i the seed ``seed + i``. A sequence holds
+                one seed per environment. None continues the sequences of episodes.
             options: May hold ``reset_mask``, the environments to reset, (num_envs,)
                 bool; and ``state``, the state to start from, as
                 `RobotTaskEnv.get_state` returns it.
@@ -111,9 +114,9 @@ class GoalVectorEnv(
             TypeError: An option or a seed has a wrong type.
             gymnasium.error.Error: The seed is negative.
         """
-        rest = dict(options or {})
-        mask = self._read_mask(rest.pop("reset_mask", None))
-        state = arrays.read_state(rest)
+        other_options = dict(options or {})
+        mask = self._read_mask(other_options.pop("reset_mask", None))
+        state = arrays.read_state(other_options)
         seeds = self._read_seeds(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         for index in _indices(mask):
@@ -134,7 +137,7 @@ class GoalVectorEnv(
         NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """Act for one step. It also raises the errors of `RobotTaskEnv`.
+        """Act for one step; see `RobotTaskEnv` for further errors.
 
         Raises:
             ResetNeeded: `reset` was not called yet; or, in the mode DISABLED, an
@@ -147,10 +150,11 @@ class GoalVectorEnv(
             )
         resets_now = mode is AutoresetMode.NEXT_STEP and bool(ended.any())
         episodes = self.torch_env.episodes
-        stepped = ~ended.unsqueeze(1) if resets_now else None
-        after = episodes.step(arrays.action(actions), stepped)
+        step_mask = ~ended.unsqueeze(1) if resets_now else None
+        after = episodes.step(arrays.action(actions), step_mask)
         if resets_now:
-            # For the other environments this repeats the results of the step.
+            # The reset returns entries of all environments. Those of the environments
+            # that took the step are the same as before.
             after |= episodes.reset(_indices(ended))
         outcome = (
             after["reward"].squeeze(1).double().numpy(),
@@ -203,7 +207,8 @@ class GoalVectorEnv(
             raise TypeError(f"reset_mask must be an array of bool, got {mask!r}")
         if mask.shape != shape or not mask.any():
             raise ValueError(
-                f"reset_mask must have shape {shape} and a True, got {mask!r}"
+                f"reset_mask must have shape {shape} and be True for at least one "
+                f"environment, got {mask!r}"
             )
         return torch.from_numpy(mask.copy())
 
@@ -216,7 +221,10 @@ class GoalVectorEnv(
         if isinstance(seed, int | np.integer):
             return [int(seed) + index for index in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(f"there must be {self.num_envs} seeds, got {len(seed)}")
+            raise ValueError(
+                f"seed must be a number or a sequence of {self.num_envs} seeds, got "
+                f"{len(seed)} seeds"
+            )
         return seed
 
 

@@ -7,8 +7,8 @@ from torch_panda.rendering import Camera
 
 RENDER_MODES = ("rgb_array",)
 
-# Fields of a camera, by panda-gym's arguments.
-_CAMERA = {
+# Fields of `Camera`, by the names of panda-gym's arguments.
+_CAMERA_FIELDS = {
     "render_width": "width",
     "render_height": "height",
     "render_target_position": "target",
@@ -38,24 +38,30 @@ def take_camera(
     """Separate the camera arguments of panda-gym from other arguments.
 
     Args:
-        camera: The camera that these arguments change; None means panda-gym's.
+        camera: The camera that these arguments change; None means `Camera`'s defaults,
+            which are panda-gym's.
         arguments: Keyword arguments, among them ``render_width``, ``render_height``,
             ``render_target_position``, ``render_distance``, ``render_yaw``,
             ``render_pitch`` or ``render_roll``.
 
     Returns:
-        The camera and the other arguments.
+        The changed camera, or ``camera`` itself if there are no such arguments; and the
+        other arguments.
 
     Raises:
         ValueError: A camera argument is out of range.
     """
     changes = {
-        _CAMERA[name]: value for name, value in arguments.items() if name in _CAMERA
+        _CAMERA_FIELDS[name]: value
+        for name, value in arguments.items()
+        if name in _CAMERA_FIELDS
     }
     if "target" in changes:
         x, y, z = changes["target"]
         changes["target"] = (float(x), float(y), float(z))
-    rest = {name: value for name, value in arguments.items() if name not in _CAMERA}
+    others = {
+        name: value for name, value in arguments.items() if name not in _CAMERA_FIELDS
+    }
     if changes:
         camera = dataclasses.replace(camera or Camera(), **changes)
-    return camera, rest
+    return camera, others

@@ -24,8 +24,9 @@ from torch_panda.gymnasium_envs.goal_vector_env import GoalVectorEnv
 class SB3VecEnv(VecEnv):
     """A `GoalVectorEnv` for Stable-Baselines3.
 
-    The environments share one object. `get_attr` reads it, `env_method` calls it, and
-    both repeat the result once per index.
+    All environments share one object, ``vector_env``. `get_attr` and `env_method`
+    therefore read its attributes and call its methods, and return a list in which the
+    same result stands once per index.
 
     Args:
         env: An id, or a `RobotTaskEnv` of batch size [num_envs].
@@ -75,7 +76,8 @@ class SB3VecEnv(VecEnv):
             self._actions
         )
         done = terminated | truncated
-        # Where an episode ended, report the success of its last step.
+        # If an episode ended, report the success of its last step, not that of the
+        # reset.
         success = np.where(
             done,
             infos.get("final_info", {}).get("is_success", False),
@@ -135,7 +137,7 @@ class SB3VecEnv(VecEnv):
         wrapper_class: type[gymnasium.Wrapper],
         indices: VecEnvIndices = None,
     ) -> list[bool]:
-        """False: no wrapper surrounds a single environment."""
+        """Always false, because single environments cannot have wrappers."""
         return [False] * self._count(indices)
 
     def _count(self, indices: VecEnvIndices) -> int:

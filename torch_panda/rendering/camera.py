@@ -27,8 +27,8 @@ class Camera:
         fov: Vertical angle of view [degrees].
         width: Width of the image [pixels].
         height: Height of the image [pixels].
-        near: Minimum distance along the line of sight of anything visible [m].
-        far: Maximum distance along the line of sight of anything visible [m].
+        near: Distance below which nothing is visible [m], along the line of sight.
+        far: Distance above which nothing is visible [m], along the line of sight.
         shadows: Whether bodies cast shadows. Bullet's software renderer draws the scene
             twice for them, so a picture without shadows takes half the time.
 
@@ -67,16 +67,17 @@ class Camera:
 class HandCamera(Camera):
     """A camera that moves with the end-effector.
 
-    Its position and direction are given in the frame of the end-effector. The Panda's
-    frame lies between its fingertips, with z pointing out of the hand and y from finger
-    to finger. By default the camera looks past both fingers.
+    Its position and direction are given in the frame of the end-effector. The origin of
+    the Panda's frame lies between the fingertips. Its z axis points out of the hand,
+    and its y axis points from one finger to the other. By default the camera sees both
+    fingers.
 
     Attributes:
         eye: Position of the camera [m].
         target: Point at which the camera looks [m].
         up: Direction that is up in the picture.
-        distance: Distance from eye to target, computed from them. ``yaw``, ``pitch``
-            and ``roll`` are not used.
+        distance: Distance from ``eye`` to ``target``, computed from the two. ``yaw``,
+            ``pitch`` and ``roll`` are not used.
 
     Raises:
         ValueError: ``up`` is parallel to the line of sight, or an argument of `Camera`
@@ -120,7 +121,7 @@ class HandCamera(Camera):
 
 
 def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """The same view in another size.
+    """Copy a camera with another size of the image.
 
     Args:
         camera: The camera.
@@ -145,7 +146,7 @@ def to_metres(
 ) -> npt.NDArray[np.float32]:
     """Convert the depth of an `Image` to distances along the line of sight [m].
 
-    This is the inverse of OpenGL's perspective projection.
+    This is the inverse of OpenGL's perspective projection. The background gets ``far``.
     """
     near, far = np.float32(camera.near), np.float32(camera.far)
     metres = near * far / (far - (far - near) * depth)

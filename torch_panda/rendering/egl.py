@@ -11,8 +11,8 @@ from torch_panda.checks import check_choice
 RendererName = Literal["tiny", "egl"]
 RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
 
-# Draws a box before the background and checks that the picture has both. It uses
-# pybullet, which is imported much faster than torch.
+# Draws a box in front of the background and checks that the picture shows both. The
+# code uses pybullet instead of this package, because importing torch takes much longer.
 _EGL_PROBE = """
 import importlib.util, numpy, pybullet as p
 p.connect(p.DIRECT)
@@ -40,7 +40,7 @@ def check_renderer(renderer: str) -> None:
 
 @functools.cache
 def _check_egl() -> None:
-    # In another process, because Bullet ends the process if EGL fails.
+    # Try it in another process, because Bullet ends its process if EGL fails.
     if reason := probe(_EGL_PROBE):
         raise RuntimeError(
             f"renderer='egl' does not work on this machine: use 'tiny' ({reason})"
@@ -51,7 +51,7 @@ def probe(code: str) -> str | None:
     """Run Python code in another process.
 
     Returns:
-        The last line of its output if it failed, otherwise None.
+        None if the code succeeded, otherwise the last line of its output.
     """
     process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True

@@ -15,14 +15,15 @@ BACKGROUND = -1  # body id in a segmentation
 class EnvRenderer:
     """Draws one environment at a time, in a copy of the scene with visual shapes.
 
-    Physics clients therefore need no visual shapes, and one renderer draws many
+    The physics clients therefore need no visual shapes, and one renderer serves many
     environments.
 
     Args:
         simulation: The simulation whose scene and state are drawn.
-        renderer: "tiny" or "egl", the renderer of solid bodies.
-        mesh_cell: Edge length of the cells to which meshes are coarsened [m]; see
-            `VisualClient`.
+        renderer: Renderer of the solid bodies, "tiny" or "egl". Markers are always
+            drawn by "tiny".
+        mesh_cell: Edge length of the cubes in which the vertices of a mesh are merged
+            [m]; see `VisualClient`.
     """
 
     def __init__(
@@ -59,15 +60,15 @@ class EnvRenderer:
             self._markers.close()
 
     def draw(self, env: int, camera: Camera, frames: Frames, row: int) -> None:
-        """Draw an environment in the state of the simulation's tensors.
+        """Draw an environment in its current state.
 
-        Depth and segmentation contain the robot and the solid bodies. Markers appear in
-        the pixels only, because they show the goal instead of the world.
+        Depth and segmentation contain the robot and the solid bodies only. Markers
+        appear only in the pixels, because they show the goal and are not real bodies.
 
         Args:
             env: Index of the environment.
             camera: The camera.
-            frames: Output, in the size of the camera.
+            frames: The pictures to write into, in the size of the camera.
             row: Row of ``frames`` that receives the picture.
         """
         scene, state = self._simulation.scene, self._simulation.state
@@ -95,7 +96,7 @@ class EnvRenderer:
 
 
 def segmentation_ids(simulation: VectorSimulation) -> dict[str, int]:
-    """Names of the body ids in segmentations."""
+    """The body ids in segmentations, by name of the body."""
     scene = simulation.scene
     names = {scene.robot: "robot"}
     for k, body in enumerate(scene.objects):

@@ -16,8 +16,8 @@ class Frames:
 
     Attributes:
         pixels: (n, height, width, 3) uint8.
-        depth: (n, height, width, 1) float32 [m], or None.
-        segmentation: (n, height, width, 1) int32, or None.
+        depth: (n, height, width, 1) float32 [m]; None if it is not drawn.
+        segmentation: (n, height, width, 1) int32, body ids; None if it is not drawn.
     """
 
     pixels: Tensor
@@ -28,7 +28,7 @@ class Frames:
     def allocate(
         cls, n: int, camera: Camera, *, depth: bool = False, segmentation: bool = False
     ) -> "Frames":
-        """Black pictures of a camera's size."""
+        """Allocate n black pictures of a camera's size."""
 
         def zeros(channels: int, dtype: torch.dtype) -> Tensor:
             shape = (n, camera.height, camera.width, channels)

@@ -26,7 +26,8 @@ Integers = npt.NDArray[np.int64]
 def decimated_urdf(urdf: str, cell: float) -> Path:
     """Write a copy of a URDF with coarse visual meshes and no collision shapes.
 
-    In meshes of Wavefront's format (.obj), the vertices in a cube become one vertex.
+    In .obj meshes, all vertices within a cube of a grid are merged into one vertex.
+    Meshes of other formats stay as they are.
 
     Args:
         urdf: The original file.
@@ -81,8 +82,8 @@ def merge_vertices(
     """Merge the vertices in each cube of a grid into their mean.
 
     The method is that of Rossignac and Borrel, "Multi-resolution 3D approximations for
-    rendering complex scenes", 1993. Vertices of different colours get the same position
-    but remain separate vertices.
+    rendering complex scenes", 1993. Vertices with different texture coordinates get the
+    same position but are not merged, because they have different colours.
 
     Args:
         vertices: Positions (n, 3) [m].
@@ -99,12 +100,14 @@ def merge_vertices(
     sums = np.stack([np.bincount(cube, column) for column in vertices.T], axis=1)
     means: Floats = sums / np.bincount(cube)[:, None]
     color = np.floor(coordinates / _TEXTURE_CELL).astype(np.int64)
-    # A new vertex for each cube and colour, with the texture coordinates of one corner.
+    # Make a new vertex for each pair of cube and colour. Its texture coordinates are
+    # those of one of the corners that it replaces.
     flat = corners.reshape(-1, 2)
     keys = np.column_stack((cube[flat[:, 0]], color[flat[:, 1]]))
     keys, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1, 3)
-    # Remove duplicates, and triangles that shrank to a line or a point.
+    # Remove triangles that shrank to a line or a point. Then remove duplicates: turn
+    # each triangle so that its lowest cube comes first, and keep one of equal ones.
     in_cubes = keys[faces, 0]
     has_area = (in_cubes != np.roll(in_cubes, 1, axis=1)).all(axis=1)
     faces, in_cubes = faces[has_area], in_cubes[has_area]
@@ -128,7 +131,7 @@ def _normals(positions: Floats, faces: Integers) -> Floats:
 def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
     """Vertices (n, 3), texture coordinates (m, 2), corners (f, 3, 2) of an .obj file.
 
-    Corners without a texture coordinate refer to the first coordinate, (0, 0).
+    Texture coordinate 0 is (0, 0), for corners that have none in the file.
     """
     vertices: list[list[float]] = []
     coordinates = [[0.0, 0.0]]
@@ -153,7 +156,7 @@ def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
 
 
 def _texture_of(path: Path) -> Path | None:
-    """The first texture of an .obj file's materials, which Bullet uses."""
+    """The first texture in the materials of an .obj file; Bullet uses no other."""
     for library in _values(path, "mtllib"):
         materials = path.with_name(library)
         if materials.is_file():
@@ -164,6 +167,7 @@ def _texture_of(path: Path) -> Path | None:
 
 
 def _values(path: Path, key: str) -> Iterator[str]:
+    """The last words of the lines of a text file that begin with ``key``."""
     with path.open() as lines:
         for line in lines:
             if line.startswith(key + " "):

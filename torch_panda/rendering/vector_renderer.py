@@ -12,21 +12,22 @@ from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.env_renderer import EnvRenderer
 from torch_panda.rendering.frames import Frames
 
-# Smallest size of cells to which meshes are coarsened [m].
+# Smallest cells in which merging the vertices of a mesh saves time [m].
 _FINEST_CELL = 0.004
 
 
 class VectorRenderer:
-    """Draws the environments of a simulation, each thread with an `EnvRenderer`.
+    """Draws the environments of a simulation in parallel.
 
-    The first picture builds the renderers that it needs. In small pictures, the robot's
-    meshes are coarsened to cells of half a pixel (see `mesh_cell`).
+    Each thread uses an `EnvRenderer` of its own. The first picture builds the renderers
+    that it needs. For small pictures, the robot's meshes are coarsened to cells of half
+    a pixel (see `mesh_cell`).
 
     Args:
-        simulation: The simulation whose environments are drawn, by its threads.
-        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer,
-            which runs in one thread of its own, because a context of OpenGL belongs to
-            a thread.
+        simulation: The simulation whose environments are drawn. Its threads also draw.
+        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
+            "egl" draws in one separate thread, because an OpenGL context belongs to one
+            thread.
     """
 
     def __init__(
@@ -37,7 +38,8 @@ class VectorRenderer:
     ) -> None:
         self._simulation = simulation
         self._renderer: RendererName = renderer
-        # Idle renderers by mesh cell. The GIL makes pop and append of lists atomic.
+        # Idle renderers by mesh cell. Threads share these lists without a lock, because
+        # the GIL makes `pop` and `append` atomic.
         self._idle: dict[float, list[EnvRenderer]] = {}
         self._gl_thread = WorkerPool(1) if renderer == "egl" else None
 
@@ -78,14 +80,15 @@ class VectorRenderer:
         if self._gl_thread is None:
             for renderer in renderers:
                 renderer.close()
-        elif not sys.is_finalizing():  # then Python has ended its threads already
+        elif not sys.is_finalizing():  # else Python has ended the thread already
             self._gl_thread.run(lambda k: renderers[k].close(), range(len(renderers)))
             self._gl_thread.close()
 
     def _provide(self, cell: float, count: int) -> list[EnvRenderer]:
-        """The idle renderers of a cell size, after making them up to ``count``.
+        """The idle renderers for a mesh cell, at least ``count`` of them.
 
-        They are made one by one, because Bullet's importer is not thread-safe.
+        Missing renderers are made one by one, because Bullet's importer is not
+        thread-safe.
         """
         renderers = self._idle.setdefault(cell, [])
 
@@ -108,9 +111,10 @@ class VectorRenderer:
 
 
 def mesh_cell(camera: Camera) -> float:
-    """Half the size of a pixel at a camera's target, rounded to millimetres [m].
+    """Mesh cell that suits a camera's pictures [m].
 
-    It is 0, for all details, if that is finer than the meshes are worth coarsening.
+    It is half the size of a pixel at the camera's target, rounded to millimetres. It is
+    0, which draws all details, if such small cells would not save time.
     """
     pixel = 2 * camera.distance * math.tan(math.radians(camera.fov) / 2) / camera.height
     cell = round(pixel / 2, 3)

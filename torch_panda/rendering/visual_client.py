@@ -1,4 +1,4 @@
-"""A client of Bullet that holds the visual shapes of a scene, and draws them."""
+"""A client of Bullet that holds the visual shapes of a scene and draws them."""
 
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
@@ -26,12 +26,14 @@ _NOT_SHINY = doubles((0.0, 0.0, 0.0))
 
 
 class Image(NamedTuple):
-    """A camera's image, valid until the client's next command.
+    """A camera's image, in views of Bullet's memory.
+
+    The views are valid until the client's next command.
 
     Attributes:
         rgb: (height, width, 3) uint8.
-        depth: (height, width) float32, from 0 at ``near`` to 1 at ``far``, not linear;
-            see `camera.to_metres`.
+        depth: (height, width) float32, from 0 at ``near`` to 1 at ``far``, but not
+            linear in between; `camera.to_metres` converts it.
         segmentation: (height, width) int32, body id of every pixel, -1 for the
             background; None if it was not requested.
     """
@@ -42,20 +44,23 @@ class Image(NamedTuple):
 
 
 class VisualClient:
-    """A client that holds the visual shapes of a scene. It draws and is never stepped.
+    """A client that holds the visual shapes of a scene and draws them.
 
-    Bullet's software renderer has no translucency. Opaque bodies and translucent
-    markers are therefore two layers, each in a client of its own, which the caller
-    blends. In every layer, bodies have the ids that they have in physics clients.
+    It has no physics and takes no steps: `pose` moves the bodies.
+
+    Bullet's software renderer has no translucency. Two clients therefore draw the
+    scene in two layers, one with the opaque bodies and one with the translucent
+    markers, and the caller blends the two pictures. In every layer, bodies have the
+    same ids as in the physics clients.
 
     Args:
         blueprint: Commands that built the scene in a physics client.
-        layer: Bodies to draw: "solids", "markers", or "all" for a renderer that draws
-            markers translucent itself.
-        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer,
-            whose client must be made, used and closed by one thread.
-        mesh_cell: Merge the vertices of meshes in cubes of this edge length [m]; see
-            `decimated_urdf`. 0 draws all details.
+        layer: Bodies to draw: "solids", "markers", or "all". "all" needs a renderer
+            that supports translucency.
+        renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer. One
+            thread must make, use and close a client of "egl".
+        mesh_cell: Edge length of the cubes in which the vertices of a mesh are merged
+            [m]; see `decimated_urdf`. 0 draws all details.
         connection: Connection to a client with a window; None makes one without.
     """
 
@@ -71,8 +76,9 @@ class VisualClient:
         self._connection = connect() if connection is None else connection
         self._layer = layer
         self._mesh_cell = mesh_cell
-        # The shadows of the first two pictures of Bullet's OpenGL renderer are wrong.
-        self._warm_up = 2 if renderer == "egl" else 0
+        # Number of pictures to draw and discard first: the shadows in the first two
+        # pictures of Bullet's OpenGL renderer are wrong.
+        self._num_discarded = 2 if renderer == "egl" else 0
         try:
             if renderer == "egl":
                 self._load_egl()
@@ -131,10 +137,11 @@ class VisualClient:
         """Draw what a camera sees.
 
         Args:
-            camera: the camera.
-            hand: (7,), where a `HandCamera` is mounted; see `HandCamera.placed`.
-            segmentation: whether to tell the bodies apart.
-            shadow: whether bodies cast shadows.
+            camera: The camera.
+            hand: Pose of the end-effector (7,), which only a `HandCamera` needs; see
+                `HandCamera.placed`.
+            segmentation: Whether the image has a segmentation.
+            shadow: Whether bodies cast shadows.
         """
         view, projection = (c_float * 16)(), (c_float * 16)()
         if isinstance(camera, HandCamera):
@@ -153,8 +160,8 @@ class VisualClient:
             )
         aspect = camera.width / camera.height
         capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
-        while self._warm_up:
-            self._warm_up -= 1
+        while self._num_discarded:
+            self._num_discarded -= 1
             self.draw(camera, hand, shadow=shadow)
         command = capi.camera_init(self._connection.handle)
         capi.camera_set_matrices(command, view, projection)
@@ -191,7 +198,8 @@ class VisualClient:
         for command in blueprint:
             match command:
                 case LoadURDF(body) | CreateBody(body):
-                    # Ids of bodies that physics clients failed to build stay unused.
+                    # If a physics client failed to build a body, the body's id stays
+                    # unused there. Use it up here too, with an empty body.
                     for _ in range(num_bodies, body):
                         building.create_body(connection, building.ORIGIN)
                     self._build_body(command)
@@ -202,7 +210,7 @@ class VisualClient:
                     self._set_joints(body, joints, positions)
 
     def _build_body(self, command: LoadURDF | CreateBody) -> None:
-        """Build a body with its visual shapes, or without if another layer has it."""
+        """Build a body: with visual shapes if this layer draws it, else without."""
         is_marker = isinstance(command, CreateBody) and command.is_marker
         if self._layer != "all" and is_marker != (self._layer == "markers"):
             building.create_body(self._connection, command.position)
@@ -225,7 +233,8 @@ class VisualClient:
         )
 
     def _create_body(self, command: CreateBody) -> None:
-        # Bullet would draw a collision shape where there is no visual shape.
+        # Give the body no collision shape, because Bullet draws the collision shape of
+        # a body that has no visual shape.
         shape = building.NO_SHAPE
         if command.shape is not None:
             shape = self._create_shape(command.shape, command)
@@ -285,7 +294,7 @@ def add_textured_box(
     indices: list[int] = []
     for row, sign in enumerate((1.0, -1.0)):
         for axis in range(3):
-            # Right and up on the face, so that right x up points outwards.
+            # Axes along the face, which point right and up as seen from outside.
             right, up = (axis + 1) % 3, (axis + 2) % 3
             first = len(vertices) // 3
             for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)):

@@ -1,8 +1,10 @@
 """Refuses web requests that do not come from the viewer's own page.
 
-Any web page that a browser shows may open connections to servers on the same machine.
-Browsers name that page in the header ``Origin``. A page whose name is made to resolve
-to this machine (DNS rebinding) gives itself away by the header ``Host``.
+Any web page that a browser shows may open connections to a server on the same machine.
+Two headers of a request tell whether it comes from the viewer's own page. ``Origin``
+names the page that opened the connection. ``Host`` names the server as the page knows
+it. It reveals a page of another site whose domain name was made to resolve to this
+machine (DNS rebinding).
 """
 
 import contextlib
@@ -19,20 +21,23 @@ from websockets.datastructures import Headers, MultipleValuesError
 from websockets.http11 import Request, Response
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
-WILDCARDS = ("0.0.0.0", "::", "")  # addresses that name no machine
+# Addresses that stand for all addresses of the machine, so they are not names of it.
+WILDCARDS = ("0.0.0.0", "::", "")
 
-_patching = threading.Lock()
+_PATCH_LOCK = threading.Lock()
 
 
 def allowed_names(address: str, listed: Sequence[str]) -> frozenset[str]:
-    """Names under which a server may be called: loopback, its own and listed ones.
+    """Names under which browsers may reach a server.
+
+    They are the loopback names, the server's address and further listed names.
 
     Args:
-        address: Address at which it serves.
+        address: Address at which the server listens.
         listed: Further names.
     """
-    own = () if address in WILDCARDS else (address,)
-    return frozenset(x.lower() for x in (*LOOPBACK_NAMES, *own, *listed))
+    own_name = () if address in WILDCARDS else (address,)
+    return frozenset(x.lower() for x in (*LOOPBACK_NAMES, *own_name, *listed))
 
 
 def reason_to_refuse(headers: Headers, names: frozenset[str]) -> str | None:
@@ -46,7 +51,8 @@ def reason_to_refuse(headers: Headers, names: frozenset[str]) -> str | None:
         host, origin = headers.get("Host", "").lower(), headers.get("Origin")
     except MultipleValuesError:
         return "the request has two Host or two Origin headers"
-    # A name or address, in brackets if it is of IPv6, and any port: tunnels change it.
+    # A name or an address, in brackets if it is an IPv6 address. Accept any port,
+    # because a tunnel may have changed it.
     match = re.fullmatch(r"(?:\[([^\]@]+)\]|([^\[\]@:/]+))(?::\d+)?", host)
     name = None if match is None else match[1] or match[2]
     if name not in names:
@@ -61,14 +67,15 @@ def reason_to_refuse(headers: Headers, names: frozenset[str]) -> str | None:
 
 @contextlib.contextmanager
 def restricted_servers(names: frozenset[str]) -> Iterator[None]:
-    """Let the viser server that is made in this context check every request.
+    """Context manager in which a new viser server checks every request.
 
-    viser has no setting for it. It calls `websockets.asyncio.server.serve`, to which
-    this adds the check.
+    viser has no setting for such a check, but it starts its server by calling
+    `websockets.asyncio.server.serve`. This context manager replaces that function by
+    one that adds the check.
 
     Raises:
-        RuntimeError: no server was made through this function, so that its requests
-            would go unchecked.
+        RuntimeError: viser did not start a server through that function, so requests
+            would not be checked.
     """
     serve = websockets.asyncio.server.serve
     checked = []
@@ -82,20 +89,23 @@ def restricted_servers(names: frozenset[str]) -> Iterator[None]:
             checked.append(handler)
         return serve(handler, *args, **options)
 
-    with _patching:
+    with _PATCH_LOCK:
         websockets.asyncio.server.serve = serve_checked  # type: ignore[assignment,misc]
         try:
             yield
         finally:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
     if not checked:
-        raise RuntimeError("this version of viser does not allow to check its requests")
+        raise RuntimeError(
+            "the viewer cannot check web requests with this version of viser: install "
+            "the version that pyproject.toml lists"
+        )
 
 
 def _check_first(
     names: frozenset[str], process_request: Callable[..., Any] | None
 ) -> Callable[..., Any]:
-    """A function that processes requests only if they are allowed."""
+    """Wrap ``process_request`` so that it is called for allowed requests only."""
 
     def process(connection: Any, request: Request) -> Any:  # noqa: ANN401 (websockets')
         reason = reason_to_refuse(request.headers, names)

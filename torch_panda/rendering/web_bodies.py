@@ -16,11 +16,13 @@ from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase
 from torch_panda.bullet.shapes import LIGHT_GREY
 from torch_panda.rendering.mesh_decimation import decimated_urdf
 
-MESH_CELL = 0.003  # size of the cells to which meshes are coarsened [m]
+MESH_CELL = 0.003  # edge length of the cells in which vertices are merged [m]
 YELLOW = (255, 190, 0)
 
 Floats = npt.NDArray[np.float64]
-Joint = tuple[Any, Floats, SO3, Floats, bool]  # see WebBodies._add_urdf
+# Of a movable joint: node of the link that it moves, origin and rotation in the
+# parent's frame, axis, and whether the link slides instead of turning.
+Joint = tuple[Any, Floats, SO3, Floats, bool]
 
 
 class WebBodies:
@@ -28,7 +30,7 @@ class WebBodies:
 
     Args:
         server: The server.
-        client: Client of the scene, from which blueprint and joints are read.
+        client: A physics client with the scene, which has the blueprint and the joints.
         scene: Body ids of the scene.
     """
 
@@ -103,13 +105,17 @@ class WebBodies:
     # ---- building ----------------------------------------------------------------
 
     def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
-        """Add a body's links, each as a child of its parent's node.
+        """Add a node for each link of a body, as a child of its parent link's node.
 
-        The scene tree then computes the kinematics.
+        The browser then computes the poses of the links from those of the joints.
+
+        Args:
+            root: Name of the body's node.
+            file: Path of the URDF.
+            movable: Names of the movable joints.
 
         Returns:
-            For each movable joint by name: the link's node, the joint's origin and
-            rotation in the parent's frame, its axis, and whether it slides.
+            The movable joints, by name.
         """
         source = decimated_urdf(file, MESH_CELL)
         tree = ElementTree.parse(source)
@@ -122,8 +128,8 @@ class WebBodies:
         names: dict[str, str] = {}
         handles: dict[str, Joint] = {}
 
-        def path(link: str) -> str:
-            """Name of a link's node, which is added if it does not exist."""
+        def node_path(link: str) -> str:
+            """Name of a link's node. Adds the node if it does not exist."""
             if link in names:
                 return names[link]
             joint = joints.get(link)
@@ -131,7 +137,7 @@ class WebBodies:
                 names[link] = root
                 return root
             parent = joint.find("parent").get("link")  # type: ignore[union-attr]
-            names[link] = f"{path(parent)}/{link}"  # type: ignore[arg-type]
+            names[link] = f"{node_path(parent)}/{link}"  # type: ignore[arg-type]
             origin, rotation = _origin(joint)
             node = self._tree.add_frame(
                 names[link], show_axes=False, position=origin, wxyz=rotation.wxyz
@@ -146,7 +152,7 @@ class WebBodies:
             return names[link]
 
         for link in tree.findall("link"):
-            parent = path(str(link.get("name")))
+            parent = node_path(str(link.get("name")))
             for k, visual in enumerate(link.findall("visual")):
                 material = visual.find("material")
                 name = None if material is None else material.get("name")
@@ -168,29 +174,29 @@ class WebBodies:
         return handles
 
     def _add_shape(self, name: str, body: CreateBody) -> Any:  # noqa: ANN401 (viser's)
-        """Add a body of one shape and return its node; None if it has no shape."""
+        """Add a body of one shape; return its node, or None if it is invisible."""
         visual, shape = body.visual, body.shape
         if isinstance(shape, Box) and visual.texture is not None and not body.is_marker:
             return self._tree.add_mesh_trimesh(
                 name, textured_box(shape, visual.texture)
             )
-        look: dict[str, Any] = {
+        appearance: dict[str, Any] = {
             "color": visual.color if visual.texture is None else LIGHT_GREY,
             "opacity": visual.opacity if body.is_marker else None,
         }
         match shape:
             case Box(half_extents):
                 size = tuple(2 * x for x in half_extents)
-                return self._tree.add_box(name, dimensions=size, **look)
+                return self._tree.add_box(name, dimensions=size, **appearance)
             case Cylinder(radius, height):
-                return self._tree.add_cylinder(name, radius, height, **look)
+                return self._tree.add_cylinder(name, radius, height, **appearance)
             case Sphere(radius):
-                return self._tree.add_icosphere(name, radius, **look)
+                return self._tree.add_icosphere(name, radius, **appearance)
         return None
 
 
 def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
-    """A box whose faces have the colours of a texture's six squares; see `Visual`."""
+    """A box, each face in the colour at the centre of its square; see `Visual`."""
     mesh = trimesh.creation.box(extents=[2 * x for x in box.half_extents])
     mesh.unmerge_vertices()
     axis = np.abs(mesh.face_normals).argmax(axis=1)
@@ -198,7 +204,8 @@ def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
     middle = np.stack(((axis + 0.5) / 3, np.where(below, 0.25, 0.75)), axis=1)
     mesh.visual = trimesh.visual.TextureVisuals(
         uv=np.repeat(middle, 3, axis=0),
-        # Without reflections, metal is black.
+        # A metallic material would look black, because the scene has nothing to
+        # reflect.
         material=trimesh.visual.material.PBRMaterial(
             baseColorTexture=Image.open(texture).convert("RGB"),
             metallicFactor=0.0,
@@ -229,9 +236,10 @@ def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | Non
 
 
 def _has_texture(mesh: trimesh.Trimesh) -> bool:
-    """Whether a mesh has a texture; trimesh's placeholder has 2 x 2 pixels."""
+    """Whether a mesh has a texture of its own."""
     if mesh.visual.kind != "texture":
         return False
+    # A mesh without a texture has a placeholder of 2 x 2 pixels.
     image = mesh.visual.material.image
     return image is not None and image.width > 2
 

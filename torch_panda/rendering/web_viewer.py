@@ -1,4 +1,4 @@
-"""A viewer in the browser that shows episodes live and lets one go back.
+"""A viewer in the browser that shows episodes live and can go back to earlier steps.
 
 This module needs the extra ``viewer``.
 """
@@ -22,13 +22,21 @@ from torch_panda.rendering.web_access import (
 )
 from torch_panda.rendering.web_bodies import WebBodies
 
-POSITION = 3  # numbers per object in a goal of positions
-ARROW_LENGTH = 0.005  # length of an arrow per contact force [m/N]
+POSITION_SIZE = 3  # numbers in a position
+ARROW_LENGTH = 0.005  # length of an arrow per newton of contact force [m/N]
 LONGEST_ARROW = 0.12  # [m]
 
 
 class Frame(NamedTuple):
-    """The state of an environment at one step; see `WebBodies.show`."""
+    """What the page shows of an environment at one step; see `WebBodies.show`.
+
+    Attributes:
+        joint_position: Positions of the robot's joints.
+        object_pose: Poses of the objects.
+        marker_pose: Poses of the markers.
+        forces: Contact points [m] and forces [N] (n, 2, 3); see `read_forces`.
+        status: Text beside the scene; see `describe`.
+    """
 
     joint_position: npt.NDArray[np.float64]
     object_pose: npt.NDArray[np.float64]
@@ -40,9 +48,9 @@ class Frame(NamedTuple):
 class WebViewer:
     """Serves a page that shows one environment of a simulation.
 
-    See `RobotTaskEnv.open_viewer`. Call `update` after each reset and step, in the
-    thread that steps. The page then shows the new state, and its slider goes back to
-    earlier ones.
+    `RobotTaskEnv.open_viewer` makes one. Call `update` after each reset and step, in
+    the thread that steps. The page then shows the new state. Its slider goes back to
+    earlier steps of the episode.
 
     Args:
         simulation: The simulation whose state is shown.
@@ -51,7 +59,7 @@ class WebViewer:
         max_episode_steps: Maximum of the slider.
         title: Title of the page.
         camera: Camera with which the view starts.
-        host: Address at which it serves.
+        host: Address at which the server listens.
         port: First port to try; the viewer takes the next free one.
         allowed_hosts: Names of this machine under which browsers may open the page,
             beside ``host`` and the loopback names.
@@ -111,19 +119,19 @@ class WebViewer:
         return not self._resumed.is_set()
 
     def update(self) -> None:
-        """Record all environments and, unless paused, show the chosen one.
+        """Record the state of all environments; unless paused, show the chosen one.
 
-        At step 0, an environment's recording starts anew.
+        At step 0 of an environment, its recording starts again.
         """
         simulation, now = self._simulation, self._observe()
         envs = range(simulation.num_envs)
         steps = now["step_count"].flatten().tolist()
         forces: list[npt.NDArray[np.float64]] = [np.zeros((0, 2, 3)) for _ in envs]
 
-        def feel(env: int) -> None:
+        def read_env_forces(env: int) -> None:
             forces[env] = read_forces(simulation.clients[env], simulation)
 
-        simulation.run(feel, [env for env in envs if steps[env] > 0])
+        simulation.run(read_env_forces, [env for env in envs if steps[env] > 0])
         with self._lock:
             for env in envs:
                 if steps[env] == 0:
@@ -195,14 +203,18 @@ class WebViewer:
 
 
 def _clamped(index: int, count: int) -> int:
-    """An index that a browser sent, moved into 0 to count - 1."""
+    """Limit an index that a browser sent to the range from 0 to ``count`` - 1."""
     return max(0, min(index, count - 1))
 
 
 def read_forces(
     client: PhysicsClient, simulation: VectorSimulation
 ) -> npt.NDArray[np.float64]:
-    """Contact points [m] and forces [N] on objects, or else on the robot (n, 2, 3)."""
+    """Contact points [m] and forces [N] of the last step, (n, 2, 3).
+
+    The force of a contact is the one on the object, if the contact has an object, and
+    otherwise the one on the robot. Other contacts are left out.
+    """
     scene = simulation.scene
     rank = {body: 2 for body in scene.objects} | {scene.robot: 1}
     forces = []
@@ -211,7 +223,7 @@ def read_forces(
             contact = contact.swapped()
         if contact.body_a in rank and contact.normal_force > 0:
             forces.append((contact.position_on_a, contact.force_on_a))
-    return np.array(forces, dtype=float).reshape(-1, 2, POSITION)
+    return np.array(forces, dtype=float).reshape(-1, 2, POSITION_SIZE)
 
 
 def arrows(forces: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -226,8 +238,8 @@ def describe(step: int, state: dict[str, Tensor]) -> str:
     """Step, success and distance from the goal, in Markdown."""
     lines = [f"step {step}", "**success**" if state["success"] else "no success yet"]
     difference = (state["achieved_goal"] - state["desired_goal"]).double()
-    if len(difference) % POSITION == 0:  # a position per object
-        distance = difference.reshape(-1, POSITION).norm(dim=1).max()
+    if len(difference) % POSITION_SIZE == 0:  # a position per object
+        distance = difference.reshape(-1, POSITION_SIZE).norm(dim=1).max()
         lines.append(f"{100 * distance:.1f} cm from the goal")
     return "  \n".join(lines)
 

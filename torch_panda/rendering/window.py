@@ -11,7 +11,7 @@ from torch_panda.rendering.egl import probe
 from torch_panda.rendering.visual_client import VisualClient
 
 # enum b3ConfigureDebugVisualizerEnum
-_COV_ENABLE_GUI = 1  # the panels beside the view
+_COV_ENABLE_GUI = 1  # the panels at the sides of the window
 _COV_ENABLE_KEYBOARD_SHORTCUTS = 9
 _COV_ENABLE_MOUSE_PICKING = 10
 
@@ -21,12 +21,13 @@ _PROBE = "import pybullet as p; p.connect(p.GUI); p.disconnect()"
 class Window:
     """pybullet's GUI on a copy of the scene; see `RobotTaskEnv.open_window`.
 
-    A thread of Bullet draws the window. With Ctrl or Alt held, the mouse turns and
-    moves the view; its wheel zooms.
+    A thread of Bullet draws the window. Dragging the mouse with Ctrl or Alt held turns
+    and moves the view, and the mouse wheel zooms.
 
     Args:
         simulation: The simulation whose state is shown.
-        camera: Where the view starts. Roll, field of view and size are not used.
+        camera: Camera with which the view starts. Its ``roll``, ``fov``, ``width`` and
+            ``height`` are not used.
 
     Raises:
         BulletError: there is no display, or no OpenGL on it.
@@ -92,9 +93,9 @@ class Window:
 
 
 def _check_display() -> None:
-    # In another process, because Bullet ends the process if there is no display.
+    # Try it in another process, because Bullet ends its process if there is no display.
     if reason := probe(_PROBE):
         raise BulletError(
-            f"Bullet could not open a window: it needs a display with OpenGL, which "
-            f"env.open_viewer() does not need ({reason})"
+            f"Bullet could not open a window: a window needs a display with OpenGL "
+            f"({reason}). Without a display, use env.open_viewer()"
         )

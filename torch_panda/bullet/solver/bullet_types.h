@@ -1,11 +1,12 @@
 /*
- * The few of Bullet's structs that the solver reads or writes.
+ * Those structs of Bullet that the solver reads or writes.
  *
- * These are declarations of our own. They name only the fields that are used; the
- * bytes between are padding. Each offset is the one of pybullet 3.2.7 on x86-64,
- * built in double precision (BT_USE_DOUBLE_PRECISION), as its debug information
- * gives it. The assertions below hold the declarations to these offsets, and the
- * layout probe of hook.c compares the fields with a known scene at run time.
+ * These declarations were written for this package. They name only the fields that it
+ * uses; the bytes between are padding. The offsets are those of pybullet 3.2.7 on
+ * x86-64, built in double precision (BT_USE_DOUBLE_PRECISION), and come from its debug
+ * information. The assertions below compare the declarations with these offsets when the
+ * library is compiled. The layout probe, probe.c, compares the fields with a known scene
+ * when the program runs.
  */
 #ifndef TORCH_PANDA_BULLET_TYPES_H
 #define TORCH_PANDA_BULLET_TYPES_H
@@ -88,7 +89,7 @@ struct contact_point {
     int flags;
     double impulse, previous_rhs;
     char pad1[32];
-    double cfm_or_stiffness, erp_or_damping; /* which of the two, say the flags */
+    double cfm_or_stiffness, erp_or_damping; /* `flags` says which of the two */
     char pad2[16];
     struct vector3 lateral_1, lateral_2;
 };

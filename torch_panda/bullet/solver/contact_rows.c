@@ -15,14 +15,13 @@
  *
  * Why the results are the same bits
  * ---------------------------------
- * Bullet creates the rows of a contact one after the other. Each time it turns the
- * contact into the frame of each link, and prepares loops over all links. Here, what the
- * rows of a contact share is computed once, and a body without links has no loops. The
- * other operations are Bullet's, in Bullet's order. responses.c explains the case of
- * a body with links.
+ * Bullet creates the rows of a contact one after the other. For every row, it transforms
+ * the contact into the frame of each link again. Here, one transformation serves all
+ * rows of a contact, and a body without links skips the loops over links. All other
+ * operations are Bullet's, in Bullet's order. For bodies with links, see responses.c.
  *
- * Bullet converts manifolds of bodies that are not as simple as assumed, with rolling or
- * anisotropic friction, or with numbers that are not finite.
+ * Bullet's function creates the rows of a manifold if find_side refuses a body, if there
+ * is rolling or anisotropic friction, or if a number is not finite.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"
@@ -94,7 +93,7 @@ static int is_static(const struct multi_body *body) {
                                 body->base_collider->flags & (STATIC | KINEMATIC));
 }
 
-/* The change of velocity of a body by a unit impulse along a Jacobian. */
+/* Computes the change of velocity of a body by a unit impulse along a Jacobian. */
 static void respond(const struct multi_body *body, const double *jacobian,
                     double *unit) {
     const struct matrix3 *rotation = body->matrix_buffer.data;
@@ -141,7 +140,7 @@ static struct matrix3 matrix(const struct vector3 *q) {
                              {xz - wy, yz + wx, 1.0 - (xx + yy), 0.0}}};
 }
 
-/* A row of a contact: its directions, and its parts for both bodies. */
+/* A row of a contact while it is created: its directions and its parts, by body. */
 struct direction {
     struct vector3 angular[2], linear[2];
     double *jacobian[2], *unit[2];
@@ -158,7 +157,7 @@ struct side {
     const struct vector3 *position;
 };
 
-/* The Jacobians of all rows of a contact, for one of its bodies. */
+/* Fills the Jacobians of all rows of a contact, for one of its bodies. */
 static void fill_jacobians(const struct side *side, struct direction *rows,
                            int num_rows, int part) {
     const struct multi_body *body = side->body;
@@ -208,7 +207,7 @@ static void fill_jacobians(const struct side *side, struct direction *rows,
     }
 }
 
-/* The responses of a body to unit impulses along all rows of a contact. */
+/* Fills the unit responses of all rows of a contact, for one of its bodies. */
 static void fill_responses(const struct side *side, struct direction *rows,
                            int num_rows, int part) {
     if (side->responses == NULL) {
@@ -235,7 +234,8 @@ static double product(const double *a, const double *b, int count) {
     return sum;
 }
 
-/* Fills the fields that all kinds of rows have; returns the velocity along the row. */
+/* Fills the fields that contact, friction and spinning rows share. Returns the velocity
+   along the row. */
 static double finish_row(const struct side *sides, const struct direction *direction,
                          double cfm, const struct solver_info *info) {
     struct constraint_row *row = direction->row;
@@ -256,7 +256,7 @@ static double finish_row(const struct side *sides, const struct direction *direc
     return velocity;
 }
 
-/* Where the contact is, seen from the link's centre of mass. */
+/* Vector from the link's centre of mass to the contact. */
 static struct vector3 link_arm(const struct side *side) {
     const struct link *links = side->body->links.data;
     return minus(side->position, side->link < 0 ? &side->body->base_position
@@ -507,7 +507,7 @@ int convert_manifold(struct responses **responses, struct solver *solver,
             point->impulse = 0.0;
             point->previous_rhs = 0.0;
         } else if (!convert_point(solver, sides, point, info)) {
-            /* Back to the start: Bullet creates all rows of the manifold. */
+            /* Remove the rows again, so that Bullet creates all rows of the manifold. */
             for (int k = 0; k < 6; k++) arrays[k]->size = before[k];
             for (int part = 0; part < 2; part++)
                 sides[part].body->companion_id = companions[part];

@@ -1,4 +1,4 @@
-"""Symbols of an ELF file that the dynamic linker does not know."""
+"""Symbols of an ELF file, also those that the file does not export."""
 
 import mmap
 import struct
@@ -13,7 +13,7 @@ _MAGIC = b"\x7fELF\x02\x01"  # 64 bits, little-endian
 
 
 class Symbol(NamedTuple):
-    """A symbol: its address in the file's own numbering, and its size in bytes."""
+    """A symbol: its address relative to the load address, and its size in bytes."""
 
     address: int
     size: int
@@ -27,7 +27,7 @@ def read_symbols(path: str, names: Iterable[str]) -> dict[str, Symbol]:
         names: Mangled names of the symbols.
 
     Returns:
-        The symbols that the library has.
+        The symbols by name. Names that the library does not have are left out.
 
     Raises:
         ValueError: The file is not a 64-bit ELF file, or its ``.symtab`` was stripped.
@@ -49,7 +49,8 @@ def read_symbols(path: str, names: Iterable[str]) -> dict[str, Symbol]:
         symbols = data[offset : offset + size]
         _, offset, size, _ = sections[strings]
         text = data[offset : offset + size]
-    # Searching the text for the names is faster than decoding every name.
+    # A symbol holds the offset of its name in the text. Search the text for the names
+    # and compare offsets, which is faster than decoding the name of every symbol.
     wanted = {text.find(b"\0%b\0" % name.encode()) + 1: name for name in names}
     return {
         wanted[name]: Symbol(address, size)

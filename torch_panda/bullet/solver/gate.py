@@ -1,22 +1,23 @@
-"""Decides whether parts of Bullet's solver are replaced, and replaces them.
+"""Decides whether this package's solver replaces Bullet's, and installs it.
 
 The replacement depends on the layout of Bullet's objects in memory. It is used only if
 all of these conditions hold; otherwise Bullet's own functions run:
 
 1. ``TORCH_PANDA_SOLVER`` is not ``bullet``.
-2. The process runs on x86-64 Linux. Compilers for other platforms fuse multiply-adds,
-   which changes bits.
+2. The process runs on x86-64 Linux. Compilers for other platforms fuse a multiplication
+   with an addition, which rounds differently.
 3. The installed pybullet has the supported version.
 4. torch_panda was installed with its C library, compiled from the same sources.
 5. pybullet's extension module has the symbols that are needed, and each table of
    virtual functions (vtable) has exactly one slot with the function to replace.
-6. Bullet's objects in a known scene are laid out as ``bullet_types.h`` declares.
-7. The same scene comes out the same with and without the replacement, bit for bit.
+6. In a known scene, Bullet's objects have the layout that ``bullet_types.h`` declares.
+7. In the same scene, Bullet and the replacement compute the same states, bit for bit.
 
-The last two conditions are the self-test; see `self_test.py`. Until it has passed, the
-replacement runs in the thread of the self-test only.
+The self-test checks the last two conditions; see ``self_test.py``. Until it has passed,
+only the thread of the self-test runs the replacement.
 
-A slot of a table of virtual functions is a pointer in data. No code is changed.
+To replace a function means to store another pointer in a slot of a vtable, which is
+data. No machine code is changed.
 """
 
 import ctypes
@@ -52,7 +53,8 @@ _CREATE_ROWS = (
     "20createConstraintRowsER20btAlignedObjectArrayI27btMultiBodySolverConstraint"
     "ER23btMultiBodyJacobianDataRK19btContactSolverInfo"
 )
-# Tables of virtual functions and the functions to replace, in the order of hook.c.
+# The vtables and the functions in them to replace, as mangled names, in the order of
+# hook.c.
 _REPLACED = (
     (
         _SOLVER,
@@ -68,7 +70,8 @@ _REPLACED = (
     (_MOTOR, "_ZN21btMultiBodyJointMotor" + _CREATE_ROWS),
     (_LIMIT, "_ZN31btMultiBodyJointLimitConstraint" + _CREATE_ROWS),
 )
-# An exported function: ctypes knows its address, which gives the load address.
+# ctypes knows the address of an exported function. Comparing it with the address in the
+# file gives the load address of the library.
 _EXPORTED = "b3ConnectPhysicsDirect"
 
 
@@ -176,18 +179,18 @@ def check_version() -> None:
 
 def load_library() -> SolverLibrary:
     """Load the compiled library."""
-    # setuptools builds it like an extension module, but ctypes loads it.
+    # The file has the name of an extension module, because setuptools builds it.
     spec = importlib.util.find_spec(_LIBRARY)
     if spec is None or spec.origin is None:
         raise GateError(
-            "the packed solver is not compiled: install torch_panda again where there "
-            "is a C compiler"
+            "the packed solver is not compiled: install a C compiler, then install "
+            "torch_panda again"
         )
     return SolverLibrary(spec.origin)
 
 
 def find_replacements(path: str) -> list[Replacement]:
-    """Find the functions that are replaced, in the order of ``hook.c``.
+    """Find the functions to replace, in the order of ``hook.c``.
 
     Args:
         path: Path of pybullet's extension module.
@@ -214,7 +217,6 @@ def find_replacements(path: str) -> list[Replacement]:
                 f"{table_name} holds the function to replace {len(slots)} times, "
                 f"expected once"
             )
-        # Objects point behind the first two words of the table, which are not
-        # functions.
+        # The first two words of a vtable are not functions. Objects point to the third.
         replacements.append(Replacement(table + 16, table + 8 * slots[0], function))
     return replacements

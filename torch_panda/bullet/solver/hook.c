@@ -1,9 +1,8 @@
 /*
- * Replaces functions in Bullet's tables of virtual functions.
+ * Replaces functions in Bullet's tables of virtual functions (vtables).
  *
- * Only pointers in data are replaced: no code is changed, and nothing on disk. The
- * tables lie in pages that the loader made read-only, so a page is writable for the
- * moment of the replacement.
+ * It replaces pointers in memory. It changes no machine code and no file. The loader made
+ * the pages of the vtables read-only, so `store` makes a page writable for a moment.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #define _GNU_SOURCE
@@ -29,12 +28,12 @@ typedef void convert_function(struct solver *, struct manifold **, int,
 typedef void rows_function(void *, struct array *, struct jacobian_data *,
                            const struct solver_info *);
 
-/* Who solves the groups of a thread. */
+/* The solver that solves the groups of a thread. */
 enum mode {
-    FOLLOW, /* as all threads do */
-    PROBE,  /* Bullet, and the layout is probed */
+    FOLLOW, /* the solver that solver_enable chose for the process */
+    PROBE,  /* Bullet's solver, while the layout of Bullet's structs is checked */
     SOLVE,  /* this solver */
-    LEAVE,  /* Bullet */
+    LEAVE,  /* Bullet's solver */
 };
 
 /* Counts of a thread that is not in mode FOLLOW. */
@@ -53,11 +52,11 @@ struct counts {
 
 static void *bullet[NUM_FUNCTIONS];
 static void **slots[NUM_FUNCTIONS];
-static int enabled; /* for all threads in mode FOLLOW */
+static int enabled; /* whether threads in mode FOLLOW use this solver */
 static __thread enum mode mode;
 static __thread struct counts counts;
 static __thread struct expectation expectation;
-/* The responses of the group that this thread converts, or NULL: see `convert`. */
+/* The responses of the group whose rows `convert` creates in this thread, else NULL. */
 static __thread struct responses **responses;
 
 static int is_active(void) {
@@ -93,11 +92,12 @@ static double iterations(struct solver *solver, struct collision_object **bodies
 }
 
 /*
- * The rows of a group: those of contacts, then those of joints.
+ * Creates the rows of a group: first those of contacts, then those of joints.
  *
- * A manifold that is not converted here is handed to Bullet's function alone, without
- * the constraints of the group. Bullet's function then goes through the constraints;
- * the rows of their joints share the responses of their bodies.
+ * Bullet's function creates both in one call. Here, it is called for each manifold that
+ * convert_manifold refuses, without joints. A last call without manifolds creates the
+ * rows of the joints: in it, Bullet calls motor_rows and limit_rows below for each
+ * joint. They share the responses of the bodies through the variable `responses`.
  */
 static void convert(struct solver *solver, struct manifold **manifolds,
                     int num_manifolds, const struct solver_info *info) {
@@ -147,7 +147,8 @@ static void limit_rows(void *limit, struct array *rows, struct jacobian_data *da
     ((rows_function *)bullet[LIMIT_ROWS])(limit, rows, data, info);
 }
 
-/* Stores a function in a slot of a table; returns 0, or 1 if the page is locked. */
+/* Stores a function in a slot of a vtable. Returns 0, or 1 if the system does not make
+   the page writable. */
 static int store(void **slot, void *function) {
     const uintptr_t page_size = (uintptr_t)sysconf(_SC_PAGESIZE);
     void *page = (void *)((uintptr_t)slot & ~(page_size - 1));
@@ -165,7 +166,8 @@ void solver_uninstall(void) {
         if (slots[i] != NULL) store(slots[i], bullet[i]);
 }
 
-/* Replaces Bullet's functions in their slots; returns 0, or 1 if a page is locked. */
+/* Replaces Bullet's functions in their slots. Returns 0, or 1 if the system does not
+   make a page writable. */
 int solver_install(void **const *new_slots, void *const *functions) {
     void *const replacements[] = {(void *)iterations, (void *)convert,
                                   (void *)motor_rows, (void *)limit_rows};
@@ -181,10 +183,10 @@ int solver_install(void **const *new_slots, void *const *functions) {
     return 0;
 }
 
-/* Switches all threads in mode FOLLOW to this solver, or to Bullet's function. */
+/* Makes all threads in mode FOLLOW use this solver, or Bullet's. */
 void solver_enable(int on) { __atomic_store_n(&enabled, on, __ATOMIC_RELAXED); }
 
-/* Sets the mode of the calling thread, and starts its counts. */
+/* Sets the mode of the calling thread, and resets its counts to zero. */
 void solver_set_mode(enum mode new_mode, const struct expectation *expected) {
     mode = new_mode;
     counts = (struct counts){0};

@@ -26,20 +26,20 @@
  *    are finite. The sum starts at +0, a sum that starts at +0 never becomes -0, and
  *    adding a zero of either sign to any other number returns this number.
  * 2. Velocities whose unit response is exactly zero, for the same reason. Velocities
- *    start at +0 or as sums, so none is -0. Bullet solves a group that has a -0.
+ *    start at +0 or as sums, so none is -0. If one is -0, Bullet solves the group.
  * 3. The second accumulator. The solver's m_deltaVelocities and the body's m_deltaV
- *    begin equal and receive the same additions. One is computed and copied.
- *    Bullet solves a group in which they begin different.
+ *    begin equal and receive the same additions, so one is computed and copied to the
+ *    other. If they do not begin equal, Bullet solves the group.
  * 4. atan2, sin and cos where the friction limit is 0. They only scale this zero.
  *
- * The reasons hold for finite numbers. An infinite or undefined number in an impulse
- * or a velocity stays infinite or undefined to the last iteration, because limits are
- * finite. The result is therefore checked once, at the end. If it is not finite, it is
- * thrown away, and Bullet's function computes the group from the start.
+ * These reasons hold for finite numbers only. An infinity or a NaN in an impulse or a
+ * velocity would stay infinite or NaN until the last iteration, because limits are
+ * finite. It is therefore enough to check the result. If it is not finite, it is thrown
+ * away, and Bullet's function solves the group from the start.
  *
- * Bullet also solves groups with anything that is not implemented here: rows of rigid
- * bodies, constraints of rigid bodies, rows between a body and the world, and data that
- * Bullet's setup never leaves.
+ * Bullet also solves every group with something that is not implemented here: rows or
+ * constraints of rigid bodies, rows between a body and the world, and numbers that
+ * Bullet itself would not have written.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #define _GNU_SOURCE /* sincos, posix_memalign */
@@ -93,14 +93,14 @@ struct group {
     int num_bodies;
     double *velocities;
     int num_velocities;
-    int num_terms, num_units; /* upper bounds, to allocate */
-    /* Where the packing is. */
+    int num_terms, num_units; /* upper bounds, for the allocation */
+    /* The next free places while rows are packed: */
     struct term *term;
     double *unit;
 };
 
 static inline double max_residual(double a, double b) {
-    return a > b ? a : b; /* btMax, also for undefined numbers */
+    return a > b ? a : b; /* like btMax, also for NaN */
 }
 
 /* ---- one row ------------------------------------------------------------------- */
@@ -115,7 +115,8 @@ static inline void apply(const struct response *response, double impulse) {
     const __m128d factor = _mm_set1_pd(impulse);
     const double *unit = response->unit;
     double *velocity = response->velocity;
-    /* Always whole pairs: a load that spans two stores waits for both. */
+    /* Load and store whole pairs only: a load of a pair that was stored as two separate
+       numbers would stall the processor. */
     for (int i = 0; i < response->num_pairs; i++) {
         __m128d change = _mm_mul_pd(_mm_load_pd(unit + 2 * i), factor);
         _mm_store_pd(velocity + 2 * i,
@@ -123,11 +124,12 @@ static inline void apply(const struct response *response, double impulse) {
     }
 }
 
-/* The change of impulse that makes the row's velocity right, without limits. */
+/* The change of impulse that gives the row its target velocity, before limits. */
 static inline double wanted(const struct row *row) {
     double delta = row->rhs - row->impulse * row->cfm;
     delta -= dot(row->terms_a, row->terms_b) * row->jac_diag_inv;
-    /* Without terms, Bullet subtracts +0, because jac_diag_inv is not negative. */
+    /* If B has no terms, Bullet subtracts 0 * jac_diag_inv. This is +0 and changes
+       nothing, because jac_diag_inv is not negative. */
     if (row->terms_b != row->terms_end)
         delta -= dot(row->terms_b, row->terms_end) * row->jac_diag_inv;
     return delta;
@@ -196,7 +198,7 @@ static inline double resolve_cone(struct row *a, struct row *b) {
 
 /* ---- all rows ------------------------------------------------------------------ */
 
-/* Friction rows in pairs; those of rolling friction only where the contact presses. */
+/* Solves friction rows in pairs. With pressed_only, skips contacts that do not press. */
 static double iterate_cones(const struct group *group, const struct rows *rows,
                             int pressed_only, double residual) {
     for (int i = 0; i < rows->size; i += 2) {
@@ -212,7 +214,7 @@ static double iterate_cones(const struct group *group, const struct rows *rows,
     return residual;
 }
 
-/* Friction rows one by one, where the contact presses. */
+/* Solves friction rows one by one. Skips contacts that do not press. */
 static double iterate_friction(const struct group *group, const struct rows *rows,
                                double residual) {
     for (int i = 0; i < rows->size; i++) {
@@ -254,7 +256,7 @@ static double iterate(const struct group *group, const struct solver_info *info,
 /* ---- packing ------------------------------------------------------------------- */
 
 static inline int is_moderate(double number) {
-    return fabs(number) < 1e300; /* false for undefined numbers */
+    return fabs(number) < 1e300; /* false for NaN */
 }
 
 /* Registers a row's body; returns 0 if Bullet has to solve the group. */
@@ -360,7 +362,8 @@ static void pack_rows(struct group *group, const struct solver *solver,
 
 /* ---- memory of a group --------------------------------------------------------- */
 
-/* The rest of the caller's stack block, and the blocks that did not fit into it. */
+/* The unused rest of a block on the caller's stack, and the blocks on the heap for
+   everything that did not fit into it. */
 struct memory {
     char *rest;
     size_t size;
@@ -469,7 +472,8 @@ int solve_group(struct solver *solver, struct collision_object **bodies, int num
     struct memory memory = {stack, sizeof(stack), {NULL, NULL}, 0};
     const int size = solver->data.delta_velocities.size;
     int solved = 0;
-    /* A body for each velocity is more than enough; then the body of each velocity. */
+    /* Two arrays: the bodies, of which there are fewer than velocities; and the index of
+       the body to which each velocity belongs. */
     group.bodies = allocate(&memory, size * (sizeof(struct body) + sizeof(int)));
     if (group.bodies == NULL) return 0;
     int *body_at = (int *)(group.bodies + size);

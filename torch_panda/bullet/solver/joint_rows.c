@@ -11,17 +11,21 @@
  *
  * Why the results are the same bits
  * ---------------------------------
- * A motor's row has its body twice, as A and as B. Bullet computes the response to the
- * unit impulse for A, and for B the response to no impulse, which is zero. Here, the
- * responses to unit impulses at all joints are computed once per group, because nothing
- * that they depend on changes while rows are created; see responses.c. A limit's row
- * has the negative impulse, and the response is the negative, because every operation
- * rounds a number and its negative alike. The other numbers of a row are computed as
- * Bullet computes them. The zeros of the Jacobian are left out of sums, which must be
- * finite for this.
+ * A row has two bodies, A and B. In the row of a joint, both are the body of the joint.
+ * For A, Bullet computes the response to a unit impulse at the joint. For B, it computes
+ * the response to no impulse, which is zero. Here, responses.c computes the responses to
+ * unit impulses at all joints once per group. This is the same, because nothing that the
+ * responses depend on changes while rows are created.
  *
- * Where an array has no room for another row, Bullet's function creates this row, and
- * makes room with it. So no memory of Bullet's is allocated or freed here.
+ * The row of an upper limit has a negative unit impulse, as B. Its response is the
+ * negative of the response to a positive one, because every operation rounds a number
+ * and its negative alike.
+ *
+ * The other numbers of a row are computed as Bullet computes them, except that sums
+ * leave out the zeros of the Jacobian. This changes no bit while all numbers are finite.
+ *
+ * If an array has no room for another row, Bullet's function creates the row and makes
+ * room. Code here never allocates or frees Bullet's memory.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"
@@ -29,7 +33,8 @@
 
 #include <math.h>
 
-/* Whether a constraint is one of a joint with one degree of freedom, as assumed. */
+/* Whether a constraint belongs to a joint with one degree of freedom, and has the sizes
+   that this file assumes. */
 static int is_simple_joint(const struct constraint *constraint, int num_rows) {
     const struct multi_body *body = constraint->body_a;
     if (body == NULL || body != constraint->body_b ||
@@ -55,9 +60,9 @@ static int has_room_for(const struct array *rows, const struct jacobian_data *da
 }
 
 /*
- * Appends a row whose Jacobian has one entry, sign, at the joint of a link.
+ * Appends a row whose Jacobian has a single nonzero entry, `sign`, at a joint.
  *
- * The entry is in the part of A if it is positive, and in that of B if it is negative.
+ * The entry is in the part of body A if it is positive, and in that of B otherwise.
  * Returns the joint's velocity in the direction of the row.
  */
 static double fill_row(struct constraint_row *row, struct jacobian_data *data,

@@ -1,4 +1,4 @@
-"""The C library of the replacement, as the installation compiled it."""
+"""The compiled C library of the packed solver: loading and structs."""
 
 import ctypes
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from typing import NamedTuple
 # sources of this version.
 VERSION = 4
 
-# ``enum mode``
+# ``enum mode`` in hook.c
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
 
 # ``enum btMultibodyLink::eFeatherstoneJointType``
@@ -24,7 +24,7 @@ class Replacement(NamedTuple):
     """One of Bullet's functions that is replaced.
 
     Attributes:
-        table: Address of the table of virtual functions, as objects point to it.
+        table: Address in the vtable to which objects of the class point.
         slot: Address of the function's slot in the table.
         function: Address of Bullet's function.
     """
@@ -73,7 +73,7 @@ class Counts(Structure):
 
 
 class SolverLibrary:
-    """The C library of the replacement.
+    """The functions of the library.
 
     Args:
         path: Path of the compiled file.
@@ -83,7 +83,7 @@ class SolverLibrary:
     """
 
     def __init__(self, path: str) -> None:
-        functions = ctypes.PyDLL(path)  # cheap calls
+        functions = ctypes.PyDLL(path)  # the calls are cheap, so keep the GIL
         version = (
             functions.solver_version() if hasattr(functions, "solver_version") else 0
         )
@@ -110,7 +110,7 @@ class SolverLibrary:
         """Replace Bullet's functions in their slots.
 
         Raises:
-            GateError: The system does not make a table writable.
+            GateError: The system does not let a vtable be written.
         """
         addresses = c_void_p * len(replacements)
         slots = addresses(*(replacement.slot for replacement in replacements))
@@ -123,11 +123,11 @@ class SolverLibrary:
         self._uninstall()
 
     def enable(self, on: bool) -> None:
-        """Choose the solver of all threads that have no mode of their own."""
+        """Choose whether threads in the mode FOLLOW use the replacement."""
         self._enable(on)
 
     def set_mode(self, mode: int, expectation: Expectation | None = None) -> None:
-        """Set the mode of the calling thread, and start its counts."""
+        """Set the mode of the calling thread, and reset its counts to zero."""
         self._set_mode(mode, expectation)
 
     def counts(self) -> Counts:

@@ -1,9 +1,9 @@
 /*
- * The layout probe: are Bullet's structs laid out as bullet_types.h says?
+ * The layout probe: do Bullet's structs have the layout that bullet_types.h declares?
  *
- * It looks at a scene whose numbers are known, while Bullet itself solves it. It
- * checks the numbers of the settings first, the sizes of arrays next, and follows
- * pointers last, because a check relies on the checks before it.
+ * It reads the structs of a scene whose numbers are known, while Bullet itself steps the
+ * scene. Settings come first, then the sizes of arrays, and pointers last. Every check
+ * relies on the checks before it, so the probe never follows a pointer that is wrong.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "solver.h"

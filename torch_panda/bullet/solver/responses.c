@@ -1,5 +1,5 @@
 /*
- * What impulses at joints do to all joints of a body.
+ * Responses of a body with joints: changes of joint velocities by impulses at joints.
  *
  * Functions here, and their counterparts in Bullet
  * ------------------------------------------------
@@ -7,18 +7,20 @@
  *
  * Why the results are the same bits
  * ---------------------------------
- * The operations are Bullet's, in Bullet's order, for two rows side by side in the
- * lanes of a register. Left out is what only adds zeros:
+ * Bullet's function goes through all links twice: from the tips to the base, adding up
+ * impulses, and back from the base to the tips, computing the changes of velocity.
+ * solve_pair does the same operations in the same order, for two rows at once in the two
+ * lanes of a register. It skips three parts, because they only add zeros:
  *
- * 1. On the way to the base, links that carry no impulse: neither an impulse at their
- *    joint nor a link that passes one on.
- * 2. On the way back, links that carry no joint and no link with a joint.
+ * 1. On the way to the base, a link if there is no impulse at its own joint and none at
+ *    the joint of a descendant.
+ * 2. On the way back, a link if neither it nor a descendant has a joint.
  * 3. The base, which is fixed.
  *
- * Such zeros may differ from Bullet's in their sign. This reaches no other bit: a zero
- * added to another number returns this number, and zeros in a response change no
- * velocity, as iterations.c explains. All numbers must be finite for this. If one is
- * not, or if the body is not as simple as assumed, Bullet creates the rows.
+ * The sign of a zero may therefore differ from Bullet's. No other bit differs: adding a
+ * zero of either sign to another number does not change the number, and zeros in a
+ * response change no velocity, as iterations.c explains. This holds for finite numbers.
+ * If a number is not finite, or if is_simple refuses the body, Bullet creates the rows.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"

@@ -1,4 +1,4 @@
-/* Appending rows to Bullet's arrays, where they have room. */
+/* Append rows to Bullet's arrays, without allocating memory. */
 #ifndef TORCH_PANDA_ROWS_H
 #define TORCH_PANDA_ROWS_H
 
@@ -12,7 +12,7 @@ static inline int has_room(const struct array *array, int count) {
     return array->capacity - array->size >= count;
 }
 
-/* Appends zeros to an array of doubles. */
+/* Appends zeros to an array of doubles that has room for them. */
 static inline double *append(struct array *array, int count) {
     double *end = (double *)array->data + array->size;
     memset(end, 0, count * sizeof(double));
@@ -20,11 +20,13 @@ static inline double *append(struct array *array, int count) {
     return end;
 }
 
+/* Appends a row, which the caller has to fill, to an array that has room for it. */
 static inline struct constraint_row *expand(struct array *rows) {
     return (struct constraint_row *)rows->data + rows->size++;
 }
 
-/* Where the body's velocities are in the group's array; appends them at first. */
+/* Index of the body's velocities in the group's array. If the body is not in the array
+   yet, it is appended. */
 static inline int velocity_index(struct multi_body *body, struct jacobian_data *data) {
     if (body->companion_id < 0) {
         body->companion_id = data->delta_velocities.size;
@@ -33,7 +35,7 @@ static inline int velocity_index(struct multi_body *body, struct jacobian_data *
     return body->companion_id;
 }
 
-/* Adds up zeros, or an undefined number if one of the numbers is not finite. */
+/* Returns 0 if all numbers are finite, else NaN: infinity times 0 is NaN. */
 static inline double finite_zero(const double *numbers, int count) {
     double even = 0.0, odd = 0.0;
     int i = 0;

@@ -1,8 +1,9 @@
-"""The self-test: a scene with contacts, limits and motors, with and without the solver.
+"""The self-test, which compares Bullet's solver with the replacement in one scene.
 
-An arm of four joints swings into its limits and into a stack of two boxes. Bullet
-steps the scene first, and the layout of its objects is probed. Then the replacement
-steps it. All state must be the same, bit for bit, after every step.
+An arm of four joints swings into its joint limits and into a stack of two boxes. Bullet
+steps the scene first, while ``probe.c`` checks the layout of Bullet's objects. Then the
+replacement steps the same scene in a new client. After every step, both states must be
+equal bit for bit.
 """
 
 from ctypes import c_double, c_int
@@ -39,7 +40,7 @@ _KP = 0.3
 _KD = 1.0
 _JOINT_TYPES = (REVOLUTE, REVOLUTE, FIXED, PRISMATIC, PRISMATIC)  # of the arm's links
 _NUM_JOINTS = 4
-_JOINT_RANGE = 0.8  # beyond the limits of all joints
+_JOINT_TARGET = 0.8  # lies beyond the limits of all joints
 
 
 def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) -> None:
@@ -51,7 +52,7 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         limit_table: Address of the joint limits' table of virtual functions.
 
     Raises:
-        GateError: The layout differs, or a bit of the results.
+        GateError: The layout of Bullet's objects, or any bit of a state, differs.
     """
     expectation = Expectation(
         motor_table,
@@ -87,7 +88,8 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         solver.set_mode(FOLLOW)
     if counts.bullet_groups or not counts.groups:
         raise GateError("the packed solver did not solve all groups of the self-test")
-    # Bullet creates the first rows of a joint, and those for which it makes room.
+    # Some rows are Bullet's even with the replacement: the first rows of a joint, and
+    # those for which Bullet has to enlarge an array.
     if counts.joints <= counts.bullet_joints or not counts.manifolds:
         raise GateError("the packed solver did not create the rows of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
@@ -96,7 +98,7 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
 
 
 def _simulate() -> list[bytes]:
-    """Step the scene in a new client; return the bytes of its state per step."""
+    """Step the scene in a new client; return the bytes of the state after each step."""
     try:
         connection = connect()
         try:
@@ -164,8 +166,8 @@ def _box(
 
 
 def _drive(connection: Connection, arm: int, step: int) -> None:
-    """Send the joints to one end of their ranges, later to the other."""
-    target = _JOINT_RANGE if step < _NUM_STEPS // 2 else -_JOINT_RANGE
+    """Drive the joints to their upper limits, and in the second half to the lower."""
+    target = _JOINT_TARGET if step < _NUM_STEPS // 2 else -_JOINT_TARGET
     command = capi.motor_init(
         connection.handle, arm, capi.CONTROL_MODE_POSITION_VELOCITY_PD
     )
@@ -181,7 +183,7 @@ def _drive(connection: Connection, arm: int, step: int) -> None:
 
 
 def _state(connection: Connection, body: int) -> bytes:
-    """Positions, velocities and forces of motors of a body."""
+    """Bytes of a body's positions, velocities and motor forces."""
     handle = connection.handle
     state = BodyState(
         connection.submit(

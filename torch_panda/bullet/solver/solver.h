@@ -1,4 +1,12 @@
-/* Functions that the files of the solver share. */
+/*
+ * Functions that the files of the solver share.
+ *
+ * Bullet solves the contacts and joints of a group of touching bodies together. A
+ * manifold holds the contacts of two bodies. A row is one scalar constraint, for example
+ * one direction of a contact. The Jacobian of a row maps the velocities of its two
+ * bodies to the velocity along the row. The unit response of a row is the change of
+ * these velocities by a unit impulse along the row.
+ */
 #ifndef TORCH_PANDA_SOLVER_H
 #define TORCH_PANDA_SOLVER_H
 
@@ -15,13 +23,15 @@ int solve_group(struct solver *solver, struct collision_object **bodies, int num
 
 enum { MAX_LINKS = 64 }; /* of a body whose responses are computed here */
 
-/* A body with joints: what unit impulses at its joints do. A list of a group's bodies. */
+/* The responses of a body to unit impulses at its joints. The bodies of a group form a
+   linked list. */
 struct responses {
     struct responses *next;
     const struct multi_body *body;
-    int is_known;               /* 0: Bullet creates the rows of this body */
-    char is_needed[MAX_LINKS];  /* links that have a joint, or move one that has */
-    double columns[];           /* (num_dofs, num_dofs), a row for each impulse */
+    int is_known;              /* 0 if Bullet has to create the rows of this body */
+    char is_needed[MAX_LINKS]; /* whether the link or a descendant has a joint */
+    double columns[]; /* (num_dofs, num_dofs): changes of all joint velocities by a unit
+                         impulse at each joint */
 };
 
 /* The responses of a body, or NULL if Bullet has to create its rows. */
@@ -30,15 +40,17 @@ const struct responses *get_responses(struct responses **list,
 void free_responses(struct responses *list);
 
 /*
- * What two sets of impulses at the joints, (num_dofs,) each, do to the joints.
+ * The changes of all joint velocities by two sets of impulses at the joints.
+ *
+ * Each impulse and each result is an array (num_dofs,).
  */
 void solve_pair(const struct responses *responses, const double *const impulses[2],
                 double *const results[2]);
 
 /*
- * The rows of a joint's motor, and of its limits.
+ * Append the rows of a joint's motor, or of a joint's limits.
  *
- * Returns 1 if the rows are there. Returns 0, with nothing changed, if Bullet's own
+ * Return 1 if all rows were created. Return 0, with nothing changed, if Bullet's own
  * function has to create them.
  */
 int create_motor_rows(struct responses **responses, struct motor *motor,
@@ -49,9 +61,9 @@ int create_limit_rows(struct responses **responses, struct limit *limit,
                       const struct solver_info *info);
 
 /*
- * The rows of all contacts of a manifold.
+ * Append the rows of all contacts of a manifold.
  *
- * Returns as the functions above do.
+ * Returns 1 or 0, as the two functions above do.
  */
 int convert_manifold(struct responses **responses, struct solver *solver,
                      struct manifold *manifold, const struct solver_info *info);
@@ -73,10 +85,11 @@ struct expectation {
 };
 
 /*
- * Compare fields with the scene, before Bullet converts a group, and before and after
- * it solves the group.
+ * Compare the fields of Bullet's structs with the known numbers of the scene.
  *
- * Each returns NULL, or the name of the first field that is not as expected.
+ * probe_manifolds does this before Bullet creates the rows of a group, probe_rows before
+ * it solves the group, and probe_result after it. Each function returns NULL, or the
+ * name of the first field that does not have the expected number.
  */
 const char *probe_manifolds(const struct solver *solver,
                             struct manifold *const *manifolds, int num_manifolds,
