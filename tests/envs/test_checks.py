@@ -330,7 +330,7 @@ def test_nan_of_an_observation_is_named():
 
     with (
         make(Observing(), num_envs=2) as env,
-        pytest.raises(ValueError, match=r"Observing\.observation must return numbers"),
+        pytest.raises(ValueError, match=r"Observing\.observation must return finite"),
     ):
         env.reset()
     infinite = task_with(

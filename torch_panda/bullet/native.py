@@ -30,20 +30,21 @@ from torch_panda.bullet import capi
 # compiled from sources of this version.
 VERSION = 1
 
+# "native": threads of C. "ctypes": threads of Python that call Bullet through ctypes.
 LoopName = Literal["native", "ctypes"]
 
-# Environment variable that chooses the loop of every simulation that is created.
+# Environment variable that chooses the loop, read whenever a simulation is created.
 LOOP_VARIABLE = "TORCH_PANDA_LOOP"
 
 # ``enum arm_mode``
 ARM_MODES = {"position": 0, "velocity": 1, "torque": 2}
 
-# Values of a `Failure` beside Bullet's status codes.
-NO_ANSWER = -1  # of its answer
-CLIENT_CLOSED = -2  # of its expected status
-DIVERGED = -3  # of its expected status
+# Values of a `Failure` that are not status codes of Bullet.
+NO_ANSWER = -1  # as `answer`: Bullet gave no answer
+CLIENT_CLOSED = -2  # as `expected`: the client was closed before the command
+DIVERGED = -3  # as `expected`: no command failed, but the state is not finite
 
-# In the order of ``struct functions``.
+# Bullet's functions that the library calls, in the order of ``struct functions``.
 _BULLET = (
     capi.submit,
     capi.status_type,
@@ -193,7 +194,7 @@ class Library:
         except AttributeError:
             self.version = 0  # the library is older than the version numbers
         if self.version != VERSION:
-            return  # `loop_name` refuses it, and its functions may be others
+            return  # do not bind the functions: `loop_name` refuses this library
         self.create = library.loop_create
         self.create.restype = c_void_p
         self.create.argtypes = (POINTER(Batch), c_int)
@@ -218,8 +219,8 @@ class Library:
 
 
 def load() -> Library | str:
-    """The library, or the reason why there is none."""
-    # The file has the name of an extension module, but does not use Python.
+    """Load the library; return a text with the reason if this is not possible."""
+    # The file has the name of an extension module, because setuptools builds it.
     spec = importlib.util.find_spec("torch_panda.bullet._loop")
     if spec is None or spec.origin is None:
         compiler = shlex.split(sysconfig.get_config_var("CC") or "cc")[0]
@@ -238,12 +239,14 @@ _reason_missing = _loaded if isinstance(_loaded, str) else None
 
 
 def loop_name() -> LoopName:
-    """The loop of simulations that are created now. Warns once if it is the slow one.
+    """Name of the loop of a new simulation.
+
+    Without the library, this warns once per process that the Python loop is slower.
 
     Raises:
-        ImportError: the library was compiled from other sources than these.
-        ValueError: the environment variable names a loop that does not exist, or the
-            native one without a library.
+        ImportError: the library was compiled from sources of another version.
+        ValueError: the environment variable names an unknown loop, or names "native"
+            although there is no library.
     """
     name = os.environ.get(LOOP_VARIABLE) or None
     if name not in (None, *get_args(LoopName)):
@@ -264,7 +267,7 @@ def loop_name() -> LoopName:
 
 
 def loop_problem() -> str | None:
-    """Why the native loop cannot run, and the cure; None if it can."""
+    """Why the native loop cannot run, and how to fix this; None if it can run."""
     if LIBRARY is None:
         return (
             f"torch_panda has no compiled loop: {_reason_missing}. With a C compiler "

@@ -114,12 +114,12 @@ class NativeLoop:
             self._loop, self._control, setpoint.ctypes.data, queue, len(queue)
         ):
             return []
-        self._check(chosen)
+        self._raise_first_error(chosen)
         failures = self._failures
         return [e for e in chosen if failures[e].expected == native.DIVERGED]
 
     def reset(self, envs: Sequence[int]) -> None:
-        """Start episodes from the state tensors; see `VectorSimulation.reset`.
+        """Move bodies to the start of an episode; see `VectorSimulation.reset`.
 
         Raises:
             WorkerError: Bullet failed in at least one client. All others were reset.
@@ -127,7 +127,7 @@ class NativeLoop:
         self._start()
         queue = (c_int * len(envs))(*envs)
         if self._library.reset(self._loop, queue, len(queue)):
-            self._check(envs)
+            self._raise_first_error(envs)
 
     def reset_one(self, env: int) -> None:
         """Reset one client in the calling thread; see `reset`.
@@ -147,6 +147,7 @@ class NativeLoop:
         self._loop = None
 
     def _start(self) -> None:
+        """Start the threads, unless this process has started them already."""
         if self._loop is not None and self._process == os.getpid():
             return
         self._process = os.getpid()
@@ -169,14 +170,14 @@ class NativeLoop:
             doubles([self._physics.ik_damping] * len(control.forces)),
         )
 
-    def _check(self, envs: Sequence[int]) -> None:
-        """Raise the error of the first client that failed."""
+    def _raise_first_error(self, envs: Sequence[int]) -> None:
+        """Raise the error of the first client that failed; divergence is no error."""
         for env in sorted(envs):
             if error := self._error(env):
                 raise WorkerError(env, error) from error
 
     def _error(self, env: int) -> BulletError | None:
-        """The error of a client in the present step or reset, if it failed."""
+        """The error of a client in the last step or reset; None if it did not fail."""
         failure = self._failures[env]
         if failure.expected == native.CLIENT_CLOSED:
             return client_closed()

@@ -24,8 +24,8 @@ class VectorSimulation:
     """Steps ``num_envs`` clients of one scene in parallel threads.
 
     Args:
-        build: Builds the scene in a client. It is called once per client, one after
-            another, and must build the same scene every time.
+        build: Function that builds the scene in a client. It is called for one client
+            after another and must build the same scene every time.
         num_envs: Number of clients.
         num_threads: Number of threads; None means one per core, at most ``num_envs``.
         physics: Parameters of the integration.
@@ -58,7 +58,7 @@ class VectorSimulation:
         self.n_substeps = physics.n_substeps
         self.ctrl_dt = physics.ctrl_dt
         self._physics = physics
-        self._build = build
+        self._scene_builder = build
         self._clients: list[PhysicsClient] = []
         self._broad_phases: list[BroadPhase] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
@@ -66,13 +66,13 @@ class VectorSimulation:
         try:
             client = PhysicsClient(physics=physics)
             self._clients.append(client)
-            self.scene = _build(build, client)
+            self.scene = _build_scene(build, client)
             self._check_joints()
             self._blueprint = client.blueprint
             self._broad_phases.append(BroadPhase(client))
             for _ in range(1, num_envs):
                 self._clients.append(PhysicsClient(physics=physics))
-                self._broad_phases.append(self._build_again(self._clients[-1]))
+                self._broad_phases.append(self._build_same_scene(self._clients[-1]))
             self.state = SimulationState(self.scene, num_envs)
             if is_native:
                 self._native = NativeLoop(
@@ -180,8 +180,8 @@ class VectorSimulation:
     ) -> list[int]:
         """Set the motors, advance time and read the state.
 
-        The native loop does this if it is compiled and ``control`` is data. Otherwise
-        Python threads do it and compute the same numbers.
+        If the native loop is compiled and ``control`` is a `MotorControl`, threads of C
+        do this. Otherwise Python threads do it. They compute the same numbers.
 
         Args:
             control: Control of the robots.
@@ -192,15 +192,15 @@ class VectorSimulation:
             Indices of the clients whose state is not finite.
 
         Raises:
-            WorkerError: Bullet failed in at least one client. The error names it, and
-                all others took the step.
+            WorkerError: Bullet failed in at least one client, which the error names.
+                All other clients took the step.
             ValueError: ``control`` does not fit the setpoints or the robot.
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                self._pool.wait()  # its threads may still work after a second Ctrl-C
+                self._pool.wait()  # Python threads may still work, after Ctrl-C twice
                 return self._native.step(control, setpoint, envs)
 
         def step_one(env: int) -> None:
@@ -227,20 +227,23 @@ class VectorSimulation:
         self._pool.run(work, envs)
 
     def reset(self, envs: Sequence[int], vary: Work | None = None) -> None:
-        """Start episodes from the state tensors.
+        """Move the bodies of clients to the start of an episode.
 
-        Bullet's state is more than poses and velocities. `BroadPhase` restores the
-        rest, so that an episode depends on its start state and its actions only. The
-        native loop does this if it is compiled, otherwise Python threads do.
+        The caller writes the start into the tensors of `state` first. A reset moves the
+        bodies to the poses, velocities and joint positions in these tensors.
+
+        Bullet's own state also has a broad phase, which depends on earlier steps.
+        `BroadPhase` restores it, so that an episode depends on its start and its
+        actions only.
 
         Args:
             envs: Indices of the clients to reset.
-            vary: Function that changes the physics of an environment. It is called
-                first, in the thread that resets the environment.
+            vary: Function of the index of an environment that changes the physics of
+                its client. It is called before the reset, in the same thread.
 
         Raises:
-            WorkerError: Bullet or ``vary`` failed in at least one client. The error
-                names it, and all others were reset.
+            WorkerError: Bullet or ``vary`` failed in at least one client, which the
+                error names. All other clients were reset.
         """
         if self._native is not None and vary is None:
             self._pool.wait()
@@ -265,10 +268,10 @@ class VectorSimulation:
         return self.state.diverged()
 
     def rebuild(self, env: int) -> None:
-        """Replace a client by a new one, because no reset removes NaN from Bullet."""
+        """Replace a diverged client by a new one: no reset removes NaN from Bullet."""
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
-        self._broad_phases[env] = self._build_again(client)
+        self._broad_phases[env] = self._build_same_scene(client)
         if self._native is not None:
             self._native.replace(env, client)
 
@@ -280,24 +283,26 @@ class VectorSimulation:
         for client in self._clients:
             client.close()
 
-    def _build_again(self, client: PhysicsClient) -> BroadPhase:
-        """Build the scene in another client.
+    def _build_same_scene(self, client: PhysicsClient) -> BroadPhase:
+        """Build the scene in a further client.
 
         Raises:
-            BulletError: it is not the same scene.
+            BulletError: The scene differs from that of the first client.
         """
-        scene = _build(self._build, client)
+        scene = _build_scene(self._scene_builder, client)
         first, other = (self.scene, *self._blueprint), (scene, *client.blueprint)
         for expected, actual in zip(first, other, strict=False):
             if actual != expected:
                 raise BulletError(
-                    f"the scene must be the same in every client, got {actual} after "
-                    f"{expected}: draw random numbers in resets, not in build"
+                    f"the scene must be the same in every client: the first client has "
+                    f"{expected}, and a later client has {actual}; draw random numbers "
+                    f"in resets, not in build"
                 )
         if len(other) != len(first):
             raise BulletError(
-                f"the scene must be the same in every client, got {len(other) - 1} "
-                f"commands that build it after {len(first) - 1}"
+                f"the scene must be the same in every client: {len(first) - 1} "
+                f"commands built it in the first client, and {len(other) - 1} in a "
+                f"later one"
             )
         return BroadPhase(client)
 
@@ -312,7 +317,9 @@ class VectorSimulation:
             )
 
 
-def _build(build: Callable[[PhysicsClient], Scene], client: PhysicsClient) -> Scene:
+def _build_scene(
+    build: Callable[[PhysicsClient], Scene], client: PhysicsClient
+) -> Scene:
     """Build a scene in a new client."""
     scene = build(client)
     if not isinstance(scene, Scene):

@@ -30,14 +30,14 @@ class SimulationState:
         object_state: (num_envs, n_objects, 12), position [m], Euler angles [rad] and
             velocity.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
-        object_euler: (num_envs, n_objects, 3), roll, pitch and yaw [rad]. Steps and
-            resets compute them from the quaternion; a reset does not read them.
-        object_joint_position: (num_envs, n_object_joints) [rad] or [m], all joints of
-            the first object, then all joints of the next.
+        object_euler: (num_envs, n_objects, 3), roll, pitch and yaw [rad]. Every step
+            and every reset computes them from the quaternions.
+        object_joint_position: (num_envs, n_object_joints) [rad] or [m], the joints of
+            all objects, in the order of the objects.
         object_joint_velocity: (num_envs, n_object_joints) [rad/s] or [m/s].
-        marker_pose: (num_envs, n_markers, 7), to which a reset moves the markers.
-        rows: (num_envs, k), contiguous. All tensors but ``marker_pose`` are views of
-            it, in the order of ``client_row`` in ``client.c``.
+        marker_pose: (num_envs, n_markers, 7), poses to which a reset moves the markers.
+        rows: (num_envs, k), contiguous. All tensors except ``marker_pose`` are views of
+            ``rows``. Their order is that of ``client_row`` in ``client.c``.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
@@ -80,7 +80,8 @@ class SimulationState:
         self.marker_pose = torch.zeros(
             num_envs, len(scene.markers), 7, dtype=torch.float64, device="cpu"
         )
-        # The same memory as numpy arrays for `read`: indexing tensors takes longer.
+        # Views of the same memory as numpy arrays, for `read`, because indexing arrays
+        # is faster than indexing tensors.
         ends = np.cumsum(sizes)[:-1]
         self._parts = [np.split(row, ends) for row in self.rows.numpy()]
 
@@ -91,7 +92,7 @@ class SimulationState:
         return (~self.rows.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
     def place(self, env: int, client: PhysicsClient) -> None:
-        """Move robot, markers and objects of a client to the state in the tensors."""
+        """Move the bodies of a client to the state in the tensors."""
         scene = self._scene
         positions = self.joint_position[env].tolist()
         velocities = self.joint_velocity[env].tolist()

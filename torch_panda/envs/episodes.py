@@ -64,7 +64,8 @@ class Episodes:
         goal_dim: Number of entries of ``achieved_goal`` and ``desired_goal``.
     """
 
-    # Tensors that are made in inference mode could be changed in that mode only.
+    # Leave inference mode, because tensors made in this mode cannot be changed outside
+    # it.
     @torch.inference_mode(False)
     def __init__(
         self,
@@ -175,12 +176,12 @@ class Episodes:
 
         Args:
             envs: Environments that start an episode; None means all. Environments that
-                still need a reset start one too.
+                were never reset, or whose last reset failed, are always included.
             state: The state to start from, as `get_state` returns it, or some of its
                 entries: tensors of shape (*batch_shape, ...).
 
         Returns:
-            What all environments observe.
+            The observed entries of all environments.
 
         Raises:
             ValueError: The state is wrong.
@@ -193,7 +194,7 @@ class Episodes:
             start_state = None if state is None else self._read_state(state, envs)
             # If anything below raises, these environments need another reset.
             self._needs_reset.update(envs)
-            # If the last step raised, clients may have diverged without being rebuilt.
+            # If the last step raised, a diverged client may not have been rebuilt yet.
             for env in set(envs).intersection(self.simulation.diverged()):
                 self.simulation.rebuild(env)
             for env in envs:
@@ -208,22 +209,23 @@ class Episodes:
             self._needs_reset.difference_update(envs)
             observed = self._observe()
             if start_state is not None:
-                # A start is never an end, even if the given state was the last of its
-                # episode.
+                # An episode that has just started is not done, even if the given state
+                # was the last of an episode.
                 for key in ("terminated", "truncated", "done"):
                     observed[key][envs] = False
             return observed
 
-    def step(self, action: Tensor | None, stepped: Tensor | None = None) -> Observed:
+    def step(self, action: Tensor | None, step_mask: Tensor | None = None) -> Observed:
         """Act for one step.
 
         Args:
             action: (*batch_shape, action_dim), floating point. It is clipped to
                 [-1, 1].
-            stepped: Environments that take the step, (n, 1) bool; None means all.
+            step_mask: Mask of the environments that take the step, (n, 1) bool; None
+                means all.
 
         Returns:
-            What all environments observe, and ``reward``, (n, 1) float32.
+            The observed entries of all environments, and ``reward``, (n, 1) float32.
 
         Raises:
             BulletError: The environment is closed, needs a reset, or has diverged; or
@@ -236,16 +238,18 @@ class Episodes:
             action = check_action(action, (*self.batch_shape, self.robot.action_dim))
             # Clip before the conversion: a large float64 is infinite in float32.
             action = action.clamp(-1.0, 1.0).float()
-            envs = None if stepped is None else indices(stepped)
-            self._starts.step_count += 1 if stepped is None else stepped
-            self._history.record(action, stepped)
+            envs = None if step_mask is None else indices(step_mask)
+            self._starts.step_count += 1 if step_mask is None else step_mask
+            self._history.record(action, step_mask)
             if diverged := self._advance(action, envs):
                 self._recover(diverged)
             self._observer.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe(action)
-            if stepped is not None:
-                observed["reward"] = observed["reward"] * stepped
-            if diverged:  # these environments observe the start of their next episode
+            if step_mask is not None:
+                observed["reward"] = observed["reward"] * step_mask
+            if diverged:
+                # `observed` shows the start of these environments' next episodes. A
+                # success there is not a success of this step.
                 observed["success"][diverged] = observed["terminated"][diverged] = False
             return observed
 
@@ -263,14 +267,14 @@ class Episodes:
             for key, value in self._starts.state().items()
         }
 
-    def watch(self) -> Observed:
+    def progress(self) -> Observed:
         """Goals, success and number of steps, (n, ...), for a viewer.
 
         Raises:
             BulletError: The environment is closed or needs a reset.
         """
         self._check_was_reset()
-        return self._observer.watch(self._starts.goal, self._starts.step_count)
+        return self._observer.progress(self._starts.goal, self._starts.step_count)
 
     @contextmanager
     def exclusive(self) -> Iterator[None]:
@@ -293,8 +297,8 @@ class Episodes:
         exists = check_integer("an index", env) in range(self.num_envs)
         if not exists or env in self._needs_reset:
             raise ValueError(
-                f"there is no environment {env} that was reset: an index must be from "
-                f"0 to {self.num_envs - 1}, and the environment must have been reset"
+                f"environment {env} does not exist or was not reset: an index must be "
+                f"from 0 to {self.num_envs - 1}; call reset first"
             )
 
     def close(self) -> None:
@@ -308,7 +312,7 @@ class Episodes:
     # ---- parts of a step and of a reset --------------------------------------------
 
     def _place(self, envs: list[int]) -> None:
-        """Start episodes from the state tensors."""
+        """Move the bodies to the starts of episodes that the state tensors hold."""
         self._starts.place_markers(envs)
         self._history.begin(envs, self._starts.state())
         if self._goal_observer is not None:
@@ -330,7 +334,7 @@ class Episodes:
         return self.simulation.step(self._control, setpoint, envs)
 
     def _read_state(self, state: Mapping[str, Any], envs: list[int]) -> StartState:
-        """Check a state to start from before anything is changed."""
+        """Check a state to start from, without changing the environments."""
         start_state = read_state(
             state,
             batch_shape=self.batch_shape,
@@ -347,9 +351,9 @@ class Episodes:
     def _repeat_actions(self, envs: list[int], start_state: StartState) -> None:
         """Repeat the actions of an exact state and check that they lead to it."""
         for action, acting, last in start_state.steps(envs, self.num_envs):
-            stepped = torch.zeros(self.num_envs, 1, dtype=torch.bool, device="cpu")
-            stepped[acting] = True
-            self._history.record(action, stepped)
+            step_mask = torch.zeros(self.num_envs, 1, dtype=torch.bool, device="cpu")
+            step_mask[acting] = True
+            self._history.record(action, step_mask)
             self._advance(action, acting)
             self._observer.after_step(last)
         self._starts.step_count[envs] = start_state.values["step_count"]
@@ -366,7 +370,7 @@ class Episodes:
                 f"the physics of environments {envs} diverged: their state was not "
                 f"finite; they are at the start of their next episode"
             )
-        self._starts.step_count[envs] = self.max_episode_steps
+        self._starts.step_count[envs] = self.max_episode_steps  # truncates the step
 
     # ---- checks ------------------------------------------------------------------
 

@@ -63,7 +63,7 @@ class EpisodeObserver:
         self._terminate_on_success = terminate_on_success
         self._goal_indices = None if goal_indices is None else list(goal_indices)
         self._num_to_check = _NUM_CHECKED
-        # Hooks that the task leaves out are never called.
+        # A hook that the task does not override is never called.
         self._has_reward = type(task).reward is not Task.reward
         self._has_failure = type(task).failure is not Task.failure
         self._check_functions()
@@ -133,7 +133,7 @@ class EpisodeObserver:
             self._num_to_check -= 1
         return observed
 
-    def watch(self, goal: Tensor, step_count: Tensor) -> Observed:
+    def progress(self, goal: Tensor, step_count: Tensor) -> Observed:
         """Goals, success and number of steps, (n, ...), for a viewer."""
         achieved_goal = self._task.achieved_goal(self._simulation).float()
         desired_goal = goal.float()
@@ -184,10 +184,11 @@ class EpisodeObserver:
             name = "reward" if self._has_reward else "compute_reward"
             functions[f"{task}.{name}"] = observed["reward"]
         for function, values in functions.items():
-            self._check_valid(function, values, values.isfinite())
-        for key in self._extra_keys:  # infinity may mean that nothing is seen
-            function = f"{task}.extra_observation[{key!r}]"
-            self._check_valid(function, observed[key], ~observed[key].isnan())
+            self._check_valid(function, values, values.isfinite(), "finite numbers")
+        # Extra entries may be infinite, for example a distance to something unseen.
+        for key in self._extra_keys:
+            function, values = f"{task}.extra_observation[{key!r}]", observed[key]
+            self._check_valid(function, values, ~values.isnan(), "no NaN")
         if self._goal_indices is not None:
             entries = observation[:, self._goal_indices]
             achieved_goal = observed["achieved_goal"]
@@ -198,17 +199,19 @@ class EpisodeObserver:
                     f"{entries.tolist()} and {achieved_goal.tolist()}"
                 )
 
-    def _check_valid(self, function: str, values: Tensor, is_valid: Tensor) -> None:
+    def _check_valid(
+        self, function: str, values: Tensor, is_valid: Tensor, requirement: str
+    ) -> None:
         """Check the numbers, (n, ...), that a function of robot or task returned."""
         if is_valid.all():
             return
         invalid = (~is_valid).flatten(1).any(dim=1).nonzero().flatten().tolist()
-        # Where Bullet itself diverged, the functions are not to blame.
-        blamed = set(invalid).difference(self._simulation.diverged())
-        if blamed:
-            env = min(blamed)
+        # In environments in which Bullet diverged, the function is not the cause.
+        faulty = set(invalid).difference(self._simulation.diverged())
+        if faulty:
+            env = min(faulty)
             raise ValueError(
-                f"{function} must return numbers that are finite, but returned "
+                f"{function} must return {requirement}, but returned "
                 f"{values[env].tolist()} for environment {env}: look for a division by "
                 f"0 or a root of a negative number"
             )
@@ -263,7 +266,7 @@ class ExtraObserver:
         TypeError: The task does not return a dict of tensors.
 
     Attributes:
-        entries: The entries, by key; none if the task leaves the hook out.
+        entries: The entries, by key; empty if the task does not override the hook.
     """
 
     def __init__(self, task: Task, simulation: VectorSimulation) -> None:

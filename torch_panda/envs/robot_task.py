@@ -49,18 +49,20 @@ class RobotTaskEnv(EnvBase):
     ``reward`` (*batch, 1) float32, and ``success``, ``terminated``, ``truncated`` and
     ``done`` (*batch, 1) bool.
 
-    If a step or reset fails in one environment, `WorkerError` names it. The other
-    environments have finished the step. After a reset that failed, its environments
-    need another reset.
+    If a step fails in one environment, `WorkerError` names it, and all others finish
+    the step. If a reset fails in one environment, all environments of this reset need
+    another reset.
 
     An environment belongs to one thread at a time: a call while another thread is
     inside raises `BulletError`.
 
-    It pickles as its class and its arguments, because the state of Bullet cannot be
-    copied. A copy builds its own clients and continues with the last seed of all
-    environments. ``state_dict`` holds the seeds and the episode numbers: a run that
-    loads it continues with the episodes that would have followed, from the next reset
-    on. It does not hold the state of the running episodes.
+    A pickle holds the class, the arguments and the last seed of all environments,
+    because the state of Bullet cannot be copied. An unpickled environment builds its
+    own clients and starts with the first episode of this seed.
+
+    ``state_dict`` holds the seeds and the episode numbers, but not the state of the
+    running episodes. After `load_state_dict`, the next reset starts the episode that
+    would have followed the running one.
 
     Args:
         robot: The robot.
@@ -76,18 +78,19 @@ class RobotTaskEnv(EnvBase):
             the CPU.
         max_episode_steps: Number of steps after which an episode is ``truncated``;
             None means the task's number.
-        terminate_on_success: Whether success ends an episode, as in panda-gym 3. The
-            paper's episodes go on.
+        terminate_on_success: Whether success ends an episode, as in panda-gym 3. In the
+            paper, episodes continue after success.
         physics: How Bullet integrates: "exact" as in panda-gym, "fast", or parameters.
-        sensors: What to observe beside the state, each under its own keys: sensors, or
-            the names of force sensors.
+        sensors: Sensors, or names of force sensors, whose readings are observed beside
+            ``observation``, each under its own keys.
         observe_state: Whether to observe ``observation``. The goals are always
             observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: What happens when a step leaves an environment in a state that
             is not finite. The environment always starts its next episode. "raise" then
-            raises `BulletError`. "reset" ends the step ``truncated`` and without
-            success, with the reward of the new start.
+            raises `BulletError`. "reset" returns the start of that episode as the
+            result of the step: with its observation and reward, without success, and
+            ``truncated``.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
@@ -114,7 +117,7 @@ class RobotTaskEnv(EnvBase):
         env._arguments = (args, kwargs)
         return env
 
-    # Specs that are made in inference mode could be used in that mode only.
+    # Leave inference mode, because specs made in this mode cannot be used outside it.
     @torch.inference_mode(False)
     def __init__(
         self,
@@ -187,7 +190,7 @@ class RobotTaskEnv(EnvBase):
 
         It maps (..., goal_dim) to (..., 1); see `Task.compute_reward`.
         """
-        return self._of_goals(self.task.compute_reward)
+        return self._as_function_of_observed_goals(self.task.compute_reward)
 
     @property
     def is_success(self) -> RewardFunction:
@@ -195,10 +198,12 @@ class RobotTaskEnv(EnvBase):
 
         It maps (..., goal_dim) to (..., 1); see `Task.is_success`.
         """
-        return self._of_goals(self.task.is_success)
+        return self._as_function_of_observed_goals(self.task.is_success)
 
-    def _of_goals(self, function: RewardFunction) -> RewardFunction:
-        """A function of the task's goals as one of the observed goals."""
+    def _as_function_of_observed_goals(
+        self, function: RewardFunction
+    ) -> RewardFunction:
+        """Convert a function of the task's goals to one of the observed goals."""
         episodes = self.episodes
         if self.goal == "task" or episodes.goal_indices is None:
             return function
@@ -207,7 +212,7 @@ class RobotTaskEnv(EnvBase):
         )
 
     def __repr__(self) -> str:
-        """The class with the arguments that differ from their defaults; the solver."""
+        """The class, the arguments that are not the defaults, and Bullet's solver."""
         args, kwargs = self._arguments
         defaults = {
             name: parameter.default
@@ -236,17 +241,17 @@ class RobotTaskEnv(EnvBase):
         """Start new episodes, as in torchrl.
 
         Args:
-            tensordict: The environments to reset, under ``_reset``, and a state to
-                start from, as `get_state` returns it, or some of its entries. It is not
-                changed.
-            set_state: Whether to start from this state. Joints that it leaves out are
-                neutral, velocities zero, objects and goals sampled. None starts from
-                the state if the tensordict holds one.
+            tensordict: May hold ``_reset``, a mask of the environments to reset, and a
+                state to start from: the result of `get_state`, or some of its entries.
+                It is not changed.
+            set_state: Whether to start from this state. Joints that the state leaves
+                out are neutral, velocities are zero, and objects and goals are sampled.
+                None starts from the state if the tensordict holds one.
             **kwargs: Other options of torchrl.
 
         Returns:
-            What the environments observe, and the given state without the entries that
-            only an exact state has.
+            The observed entries of all environments. After a start from a state, also
+            the entries of this state, except those that only an exact state has.
 
         Raises:
             ValueError: The state is missing or wrong; or ``set_state`` is None and the
@@ -267,8 +272,9 @@ class RobotTaskEnv(EnvBase):
         """Act for one step, as in torchrl.
 
         Args:
-            tensordict: Holds ``action``. It may hold the environments that take the
-                step, under ``_step``, and entries that are kept under ``next``.
+            tensordict: Holds ``action``. It may also hold ``_step``, a mask of the
+                environments that take the step, and entries under ``next``, which are
+                kept.
 
         Returns:
             The same tensordict, with ``next``.
@@ -450,7 +456,8 @@ class RobotTaskEnv(EnvBase):
         Args:
             camera: The camera with which the view starts; None means `Camera`'s
                 defaults.
-            host: Address at which it serves; "0.0.0.0" lets other machines in.
+            host: Address at which the server listens; "0.0.0.0" lets other machines
+                connect.
             port: First port to try; the viewer takes the next free one, see ``url``.
             allowed_hosts: Names of this machine under which browsers may open the page,
                 beside ``host`` and the loopback names. Other requests, and requests of
@@ -470,7 +477,7 @@ class RobotTaskEnv(EnvBase):
         with episodes.exclusive():
             return WebViewer(
                 episodes.simulation,
-                episodes.watch,
+                episodes.progress,
                 max_episode_steps=episodes.max_episode_steps,
                 title=type(episodes.task).__name__,
                 camera=camera or Camera(),
@@ -500,8 +507,8 @@ class RobotTaskEnv(EnvBase):
             raise ValueError(
                 f"the action must be on device {self.device}, got {action.device}"
             )
-        stepped = self._read_mask(tensordict, "_step")
-        return self._emit(self.episodes.step(action, stepped))
+        step_mask = self._read_mask(tensordict, "_step")
+        return self._emit(self.episodes.step(action, step_mask))
 
     def _reset(
         self,
@@ -564,8 +571,8 @@ class RobotTaskEnv(EnvBase):
             values = {key: value.squeeze(0) for key, value in values.items()}
         if self.device.type != "cpu":
             values = {key: value.to(self.device) for key, value in values.items()}
-        # As torchrl makes its own tensordicts: the checks of the public constructor
-        # take ten times as long.
+        # torchrl also makes its tensordicts by this private function. The public
+        # constructor would take ten times as long, because of its checks.
         return TensorDict._new_unsafe(values, self.batch_size, self.device)
 
 
