@@ -51,17 +51,6 @@ def test_transforms():
     torch.testing.assert_close(rollout["next", "episode_reward"][:, 49], total)
 
 
-def test_transformed_environments_do_not_lose_a_state_silently():
-    with make_env(seed=0) as env:
-        env.rollout(5)
-        state = env.get_state()
-        transformed = TransformedEnv(env, StepCounter())
-        with pytest.raises(ValueError, match="do not pass states on"):
-            transformed.reset(state, set_state=True)
-        start = transformed.base_env.reset(state, set_state=True)
-        assert (start.select(*state.keys()) == state).exclude("desired_goal").all()
-
-
 def make_counted():
     return TransformedEnv(make_env(seed=0), StepCounter())
 
@@ -86,8 +75,6 @@ def test_a_reset_with_entries_of_transforms_is_a_new_episode(make_worker):
     if make_worker is make_counted:
         only_count = TensorDict({"step_count": first["step_count"]}, [2, 2])
         assert not env.reset(only_count)["step_count"].any()
-    with pytest.raises(NotImplementedError, match="does not support determin"):
-        env.reset(first, set_state=True)
     env.close()
 
 
@@ -105,8 +92,53 @@ def test_a_state_transform_passes_states_on():
     with pytest.warns(FutureWarning, match="without specifying `set_state`"):
         again = env.reset(now.select("state"))
     assert (again["state"] == now["state"]).all()
-    with pytest.raises(ValueError, match="StateTransform and give the state under"):
-        env.reset(env.get_state(), set_state=True)
+    env.close()
+
+
+WRAPPERS_THAT_DROP_STATES = {
+    "transformed": make_counted,
+    "transformed, with another state": make_with_state,
+    "serial workers": lambda: SerialEnv(2, make_counted),
+    "different serial workers": lambda: SerialEnv(2, [make_counted, make_primed]),
+    "transformed serial": lambda: TransformedEnv(SerialEnv(2, make_env), RewardSum()),
+    "parallel": lambda: ParallelEnv(2, make_env),
+    "parallel workers": lambda: ParallelEnv(2, make_counted),
+    "parallel workers, with another state": lambda: ParallelEnv(2, make_with_state),
+}
+
+
+@pytest.mark.parametrize("name", WRAPPERS_THAT_DROP_STATES)
+def test_a_state_that_would_not_arrive_is_refused(name):
+    """Among a state's entries, `ParallelEnv` passes on the goal alone."""
+    with make_env(seed=0) as env:
+        env.rollout(5)
+        state = env.get_state()
+    wrapped = WRAPPERS_THAT_DROP_STATES[name]()
+    if wrapped.ndim == 2:
+        state = torch.stack([state, state])
+    message = "would not reach the environment.*StateTransform.*under the key 'state'"
+    for set_state in (True, None):
+        with pytest.raises(ValueError, match=message):
+            wrapped.reset(state.clone(), set_state=set_state)
+    with pytest.raises(ValueError, match=message):
+        wrapped.reset(set_state=True)
+    if "another state" not in name:
+        with pytest.raises(ValueError, match=message):
+            wrapped.reset(TensorDict({"state": state}, state.shape))
+    wrapped.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("set_state", [True, None])
+def test_serial_workers_start_from_a_state(set_state):
+    env = SerialEnv(2, make_env)
+    env.rollout(5)
+    state = torch.stack([worker.get_state() for worker in env._envs])
+    env.reset()
+    start = env.reset(state.clone(), set_state=set_state)
+    assert torch.equal(start["desired_goal"], state["desired_goal"].float())
+    assert not torch.equal(
+        env.reset(state.clone(), set_state=False)["desired_goal"], start["desired_goal"]
+    )
     env.close()
 
 
@@ -114,7 +146,8 @@ def test_a_state_transform_passes_states_on():
 def test_a_state_transform_passes_states_to_workers(batched_env):
     env = batched_env(2, make_with_state)
     last = env.rollout(4)[..., -1]
-    env.reset()
+    with pytest.raises(ValueError, match="would not reach the environment"):
+        env.reset(last["state"], set_state=True)
     start = env.reset(last.select("state"), set_state=True)
     for key in ("object_pose", "joint_position", "desired_goal", "step_count"):
         assert torch.equal(start["state", key], last["state", key])

@@ -2,7 +2,6 @@
 
 import functools
 import inspect
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, EnvMetaData
+from torchrl.envs import EnvBase
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
@@ -22,7 +21,8 @@ from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, NESTED_STATE, is_state, unpack_state
+from torch_panda.envs.state import EXACT_KEYS, is_state, unpack_state
+from torch_panda.envs.state_support import StateSupport
 from torch_panda.rendering import Camera, RendererName, Window, segmentation_ids
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -32,9 +32,6 @@ from torch_panda.tasks.base import RewardFunction
 
 if TYPE_CHECKING:  # needs an extra
     from torch_panda.rendering.web_viewer import WebViewer
-
-# The function with which SerialEnv and ParallelEnv ask for the properties of a worker.
-_METADATA_CODE = EnvMetaData.metadata_from_env.__code__
 
 
 class RobotTaskEnv(EnvBase):
@@ -255,8 +252,8 @@ class RobotTaskEnv(EnvBase):
 
         Raises:
             ValueError: The state is missing or wrong; or ``set_state`` is None and the
-                tensordict holds observations and a state. torchrl's `TransformedEnv`
-                and `ParallelEnv` do not pass states on.
+                tensordict holds observations and a state; or torchrl's `TransformedEnv`
+                or `ParallelEnv` would not pass the state on (see `StateTransform`).
         """
         # In a rollout torchrl passes the last observations and `select_reset_only`,
         # which is no state.
@@ -523,22 +520,9 @@ class RobotTaskEnv(EnvBase):
         return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     @property
-    def _supports_set_state(self) -> bool:  # type: ignore[override]  # a constant there
-        """Whether a reset of this environment may start from a state.
-
-        `SerialEnv` and `ParallelEnv` ask this once for each worker. The answer is no
-        for a worker in which a `TransformedEnv` without `StateTransform` wraps this
-        environment, because no state would arrive. Otherwise torchrl would take the
-        ``step_count`` of a `StepCounter` in an ordinary reset for a state. torchrl does
-        not say who asks, so the calling functions are looked at.
-        """
-        wrapper, frame = None, sys._getframe(1)
-        while frame.f_code.co_name == "_supports_set_state" and frame.f_back:
-            wrapper = wrapper or frame.f_locals.get("self")
-            frame = frame.f_back
-        if wrapper is None or frame.f_code is not _METADATA_CODE:
-            return True
-        return NESTED_STATE in set(wrapper.state_spec.keys())
+    def _supports_set_state(self) -> StateSupport:  # type: ignore[override]  # a bool
+        """Whether a reset may start from a state; torchrl's wrappers ask, too."""
+        return StateSupport(frozenset(self.episodes.entries))
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         """Whether a tensordict has a state under "state"; `TransformedEnv` asks."""

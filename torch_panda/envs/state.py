@@ -173,10 +173,9 @@ def read_state(
     """
     if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
         raise ValueError(
-            f"set_state=True needs a state with some of {', '.join(present)}, but the "
-            "environment got none. torchrl's TransformedEnv and ParallelEnv do not "
-            "pass states on: reset env.base_env, or add "
-            "torch_panda.envs.StateTransform and give the state under the key "
+            f"set_state=True needs a state with some of {', '.join(present)}, got "
+            "none; if a wrapper dropped it, put torch_panda.envs.StateTransform into "
+            "the innermost TransformedEnv, and give the state under the key "
             f"{NESTED_STATE!r}"
         )
 
