@@ -12,11 +12,11 @@ from torch_panda.info import stepping
 ROOT = Path(__file__).parents[1]
 
 
-def test_it_names_the_loop(loop):
+def test_the_text_names_the_loop(loop):
     assert stepping().startswith(f"{loop}: ")
 
 
-def test_it_prints_versions_and_the_sizes_of_every_environment(capsys):
+def test_the_text_has_versions_and_the_sizes_of_every_environment(capsys):
     main(["info"])
     output = capsys.readouterr().out
     assert re.search(r"pybullet 3\.\d", output)
@@ -32,7 +32,7 @@ def test_it_prints_versions_and_the_sizes_of_every_environment(capsys):
     assert sorted(ids) == sorted(torch_panda.ENV_IDS)
 
 
-def test_it_says_how_to_install_what_is_missing(monkeypatch):
+def test_the_text_says_how_to_install_missing_extras(monkeypatch):
     monkeypatch.setattr(info, "find_spec", lambda name: None)
     monkeypatch.setattr(info, "loop_problem", lambda: "there is no C compiler")
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -45,7 +45,7 @@ def test_it_says_how_to_install_what_is_missing(monkeypatch):
     assert "egl" in missing
 
 
-def test_it_lists_every_extra():
+def test_the_text_lists_every_extra():
     """`test` and `docs` are for developers, so `info` leaves them out."""
     text = (ROOT / "pyproject.toml").read_text()
     section = text.split("[project.optional-dependencies]")[1].split(

@@ -177,7 +177,7 @@ def test_every_task_can_be_randomized(env_id):
         {"observe": True},
     ],
 )
-def test_bad_ranges(options):
+def test_bad_ranges_are_refused(options):
     with pytest.raises(ValueError, match=r"must be|needs a range"):
         Randomization(**options)
 

@@ -51,7 +51,7 @@ def test_bodies_return_to_where_they_were_built(client):
     assert poses(client) == built
 
 
-def test_contacts_disappear(client):
+def test_restore_removes_contacts(client):
     broad_phase = BroadPhase(client)
     client.step()
     assert client.contact_points()
@@ -59,7 +59,7 @@ def test_contacts_disappear(client):
     assert not client.contact_points()
 
 
-def test_links_touch_the_same_links_as_before(client):
+def test_links_touch_the_same_links_after_a_restore(client):
     broad_phase = BroadPhase(client)
     client.step()
 
@@ -74,7 +74,7 @@ def test_links_touch_the_same_links_as_before(client):
     assert touching() == built != set()
 
 
-def test_the_future_does_not_depend_on_the_past(client):
+def test_steps_after_a_restore_do_not_depend_on_earlier_steps(client):
     broad_phase = BroadPhase(client)
     ends = []
     for num_steps in (0, 7, 40, 300):
@@ -88,7 +88,7 @@ def test_the_future_does_not_depend_on_the_past(client):
     assert all(end == ends[0] for end in ends)
 
 
-def test_the_future_equals_that_of_a_new_client():
+def test_steps_after_a_restore_equal_those_of_a_new_client():
     def build(client):
         client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
         client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
@@ -139,7 +139,7 @@ def test_cubes_that_fly_apart_repeat_their_flight(seed):
     assert all(end == ends[0] for end in ends)
 
 
-def test_a_collision_filter_of_the_scene_is_kept():
+def test_restore_keeps_the_collision_filters_of_the_scene():
     with PhysicsClient() as client:
         client.create_box((1.0, 1.0, 0.1), mass=0.0, position=(0.0, 0.0, -0.1))
         cubes = [

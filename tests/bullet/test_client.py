@@ -50,7 +50,7 @@ def create(reference, client, shape, mass, position):
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder", "sphere"])
-def test_falling_bodies(reference, shape):
+def test_falling_bodies_equal_those_of_pybullet(reference, shape):
     with PhysicsClient() as client:
         ground = create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
         body = create(reference, client, shape, 1.0, (0.01, 0.02, 0.2))
@@ -77,7 +77,7 @@ def test_falling_bodies(reference, shape):
         assert [c.distance for c in ours] == [c[8] for c in theirs]
 
 
-def test_arm_with_kinematics_and_motors(reference):
+def test_an_arm_with_kinematics_and_motors_equals_that_of_pybullet(reference):
     rng = np.random.default_rng(0)
     with PhysicsClient() as client:
         urdf, base = "franka_panda/panda.urdf", (-0.6, 0.0, 0.0)
@@ -159,7 +159,7 @@ def test_other_status_codes_are_refused(monkeypatch):
         PhysicsClient()
 
 
-def test_mass(reference):
+def test_masses_equal_those_of_pybullet(reference):
     with PhysicsClient() as client:
         panda = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
         reference.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
@@ -180,7 +180,7 @@ def test_mass(reference):
         (0, 0, True),
     ],
 )
-def test_collision_filter(reference, group, mask, falls):
+def test_collision_filters_act_as_in_pybullet(reference, group, mask, falls):
     with PhysicsClient() as client:
         create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
         cube = create(reference, client, "box", 0.3, (0.0, 0.0, 0.05))
@@ -237,7 +237,7 @@ def test_contact_forces_carry_a_box():
     np.testing.assert_allclose(on_ground, -on_box)
 
 
-def test_joint_forces(reference):
+def test_joint_forces_equal_those_of_pybullet(reference):
     urdf = "franka_panda/panda.urdf"
     with PhysicsClient() as client:
         arm = reference.loadURDF(urdf, useFixedBase=True)

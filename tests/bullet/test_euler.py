@@ -32,11 +32,11 @@ def assert_equals_pybullet(roll, pitch, yaw):
 
 
 @given(angle, angle, angle)
-def test_equals_pybullet(roll, pitch, yaw):
+def test_angles_equal_those_of_pybullet(roll, pitch, yaw):
     assert_equals_pybullet(roll, pitch, yaw)
 
 
 @pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
 @given(roll=angle, yaw=angle)
-def test_equals_pybullet_when_vertical(pitch, roll, yaw):
+def test_angles_equal_those_of_pybullet_at_a_vertical_pitch(pitch, roll, yaw):
     assert_equals_pybullet(roll, pitch, yaw)

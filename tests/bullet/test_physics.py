@@ -24,7 +24,7 @@ def rollout(physics, env_id="PandaPush-v1", steps=20):
         return env.rollout(steps, towards_cube)["next", "observation"]
 
 
-def test_exact_is_the_default():
+def test_exact_physics_are_the_default():
     assert PhysicsParams() == EXACT
     assert PhysicsParams(1 / 500, 20, 50, 1e-7, 0.1, -9.81) == EXACT
     with torch_panda.make("PandaReach-v1") as env:
@@ -33,7 +33,7 @@ def test_exact_is_the_default():
     assert torch.equal(rollout("exact"), explicit)
 
 
-def test_fast_moves_the_arm_as_exact_does():
+def test_fast_physics_move_the_arm_like_exact_physics():
     assert pytest.approx(EXACT.ctrl_dt) == FAST.ctrl_dt
     exact, fast = rollout("exact", "PandaReach-v1"), rollout("fast", "PandaReach-v1")
     assert not torch.equal(exact, fast)

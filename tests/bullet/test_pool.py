@@ -21,7 +21,7 @@ def pool():
     assert not own_threads()
 
 
-def test_every_index_is_worked_on_once_by_several_threads(pool):
+def test_several_threads_process_every_index_once(pool):
     done, names = [], set()
 
     def work(index):
@@ -48,7 +48,7 @@ def test_a_slow_index_does_not_delay_the_others(pool):
     assert len(finished) == 30
 
 
-def test_an_error_names_its_index_and_all_others_are_done(pool):
+def test_an_error_names_its_index_and_the_other_calls_complete(pool):
     done = []
 
     def work(index):

@@ -27,7 +27,7 @@ def trajectory(num_envs, num_threads, steps):
         return torch.stack(observations)
 
 
-def test_many_threads_give_the_numbers_of_one():
+def test_many_threads_compute_the_same_numbers_as_one():
     assert torch.equal(trajectory(40, 40, 12), trajectory(40, 1, 12))
 
 

@@ -121,7 +121,7 @@ def test_a_broken_robot_is_refused_by_file_and_element(load, fault):
         ("", r"robot\.urdf is not a URDF"),
     ],
 )
-def test_a_file_that_is_no_urdf_is_refused(load, text, message):
+def test_a_file_that_is_not_a_urdf_is_refused(load, text, message):
     with pytest.raises(ValueError, match=message):
         load(text)
 
@@ -154,7 +154,7 @@ def test_files_that_bullet_reads_pass(name):
     check_urdf(find_urdf(name))
 
 
-def test_another_reason_is_printed_by_bullet(load):
+def test_bullet_prints_why_it_refuses_a_file(load):
     broken = "<axis xyz='0 1'/><limit lower='0' upper='1' effort='1' velocity='1'/>"
     hinge = joint("j", "a", "b", "revolute", broken)
     with pytest.raises(BulletError, match=r"load .*robot\.urdf \(it prints the reason"):

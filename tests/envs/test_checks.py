@@ -26,12 +26,12 @@ def make(task, robot=None, **options):
         (Panda(), None, "task must be an instance of Task, got None"),
     ],
 )
-def test_robot_and_task_have_the_right_type(robot, task, message):
+def test_a_robot_or_task_of_a_wrong_type_is_refused(robot, task, message):
     with pytest.raises(TypeError, match=message):
         RobotTaskEnv(robot=robot, task=task)
 
 
-def test_sensors_are_sensors():
+def test_objects_that_are_not_sensors_are_refused():
     with pytest.raises(TypeError, match="must be a Sensor or a name, got 3"):
         make(Reach(), sensors=(3,))
     twice = (torch_panda.CameraSensor(), torch_panda.CameraSensor(depth=True))
@@ -52,7 +52,7 @@ class ForgetfulRobot(Panda):
         super().build(client)
 
 
-def test_builders_that_return_nothing():
+def test_builders_that_return_nothing_are_refused():
     with pytest.raises(TypeError, match=r"Forgetful.build must return Bodies, got Non"):
         make(Forgetful())
     with pytest.raises(TypeError, match=r"ForgetfulRobot.build must return the robot"):
@@ -83,7 +83,7 @@ class Changing(Push):
 
 
 @pytest.mark.parametrize("change", ["size", "place", "friction", "number"])
-def test_scenes_that_differ_between_clients(change):
+def test_scenes_that_differ_between_clients_are_refused(change):
     with pytest.raises(BulletError, match="the same in every client"):
         make(Changing(change), num_envs=2)
 
@@ -121,7 +121,7 @@ class FlatGoal(Markers):
         return simulation.ee_position[:, :2]
 
 
-def test_markers_and_goals_that_do_not_fit_together():
+def test_markers_that_do_not_fit_the_goals_are_refused():
     message = r"Markers.marker_pose must return shape \(3, 2, 7\), got \(3, 1, 7\)"
     with pytest.raises(ValueError, match=message):
         make(Markers(), num_envs=3)
@@ -158,7 +158,7 @@ def task_with(name, function):
         ),
     ],
 )
-def test_a_function_of_a_task_returns_a_wrong_tensor(name, function, error, message):
+def test_wrong_tensors_of_a_task_are_refused(name, function, error, message):
     with pytest.raises(error, match=message):
         make(task_with(name, function), num_envs=2)
 
@@ -173,7 +173,7 @@ def test_reserved_names_are_refused(key):
         make(task)
 
 
-def test_keys_of_observations_are_strings():
+def test_observation_keys_that_are_not_strings_are_refused():
     task = task_with("extra_observation", lambda s, sim: {("a", "b"): sim.ee_position})
     with pytest.raises(ValueError, match=r"must be text, got \('a', 'b'\)"):
         make(task)
@@ -182,7 +182,7 @@ def test_keys_of_observations_are_strings():
 # ---- rotations ---------------------------------------------------------------
 
 
-def test_quaternions_without_length():
+def test_quaternions_of_length_zero_are_refused():
     kuka = {
         "urdf": "kuka_iiwa/model.urdf",
         "neutral_joint_position": (0.0,) * 7,

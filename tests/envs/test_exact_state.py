@@ -38,7 +38,7 @@ def follow(env, td, actions):
     "env_id",
     ["PandaPush-v1", "PandaSlideJoints-v3", "PandaPickAndPlace-v1", "PandaStack-v3"],
 )
-def test_goes_on_bit_for_bit(env_id):
+def test_an_episode_continues_bit_for_bit(env_id):
     """With hard contacts, and different numbers of steps per environment."""
     rngs = [np.random.default_rng(k) for k in range(NUM_ENVS)]
     with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=2, seed=1) as env:
@@ -98,7 +98,7 @@ def test_a_partial_reset_restores_only_its_own():
         assert torch.equal(pose, expected["achieved_goal"][1])
 
 
-def test_gymnasium_passes_it_on():
+def test_gymnasium_passes_exact_states_on():
     env = GoalEnv("PandaPush-v1")
     env.reset(seed=0)
     for _ in range(8):

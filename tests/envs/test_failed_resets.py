@@ -34,7 +34,7 @@ def make(task, **options):
     return RobotTaskEnv(robot=robot, task=task, num_threads=1, seed=0, **options)
 
 
-def test_a_start_that_cannot_be_drawn():
+def test_environments_recover_from_a_start_that_cannot_be_drawn():
     with make(FailsOnce()) as env:
         with pytest.raises(RuntimeError, match="no goal yet"):
             env.reset()
@@ -43,7 +43,7 @@ def test_a_start_that_cannot_be_drawn():
         assert env.rollout(3).shape == (3,)
 
 
-def test_physics_that_cannot_be_varied():
+def test_environments_recover_from_physics_that_cannot_be_varied():
     with make(FailsInTheThirdEpisode(), num_envs=2) as env:
         env.rollout(5)
         mask = torch.tensor([[True], [False]])
@@ -104,7 +104,7 @@ def test_divergence_beside_another_failure():
         assert torch.equal(*actual)
 
 
-def test_a_diverged_step_is_no_success_of_the_next_episode():
+def test_a_diverged_step_does_not_count_as_success():
     options = {"seed": 0, "on_divergence": "reset"}
     solved = 0
     with torch_panda.make("PandaPush-v3", **options) as env:

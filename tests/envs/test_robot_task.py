@@ -44,7 +44,7 @@ def env():
 # ---- reproducibility ---------------------------------------------------------
 
 
-def test_environments_do_not_depend_on_their_number():
+def test_episodes_do_not_depend_on_the_number_of_environments():
     few = torch_panda.make("PandaSlide-v1", num_envs=3, seed=4)
     many = torch_panda.make("PandaSlide-v1", num_envs=8, seed=4)
     with few, many:
@@ -59,7 +59,7 @@ def test_environments_do_not_depend_on_their_number():
 
 
 @pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaSlide-v1"])
-def test_history_changes_nothing(env_id):
+def test_earlier_episodes_do_not_change_later_ones(env_id):
     with torch_panda.make(env_id, num_envs=4, seed=0) as env:
         start = env.reset()
         state = env.get_state()
@@ -207,7 +207,7 @@ def test_partial_step_leaves_the_others_alone(env):
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])
-def test_a_step_is_torchrls_step(num_envs):
+def test_a_step_equals_torchrls_own_step(num_envs):
     """Also where it skips torchrl's checks of the result of `_step`."""
     steps = []
     for step in (torch_panda.RobotTaskEnv.step, EnvBase.step):
@@ -227,7 +227,7 @@ def test_a_step_is_torchrls_step(num_envs):
             assert torch.equal(actual[key], value)
 
 
-def test_a_rollout_is_torchrls_rollout(env):
+def test_a_rollout_equals_torchrls_own_rollout(env):
     def roll(method, **options):
         env.set_seed(3)
         torch.manual_seed(0)
@@ -271,7 +271,7 @@ def test_partial_state_leaves_the_rest_neutral_or_sampled(env):
     assert len(td["desired_goal"].unique(dim=0)) == 3
 
 
-def test_state_serves_again(env):
+def test_a_state_can_be_used_again(env):
     run(env, 20)
     state = env.get_state()
     before = state.clone()
@@ -284,7 +284,7 @@ def test_state_serves_again(env):
 
 
 @pytest.mark.parametrize("state", [None, TensorDict({}, [3])])
-def test_start_from_no_state(env, state):
+def test_starting_from_a_missing_state_is_refused(env, state):
     with pytest.raises(ValueError, match="needs a state with some of joint_position"):
         env.reset(state, set_state=True)
 
@@ -311,7 +311,7 @@ def test_bad_state_changes_nothing(env, key, change, message):
 @pytest.mark.parametrize(
     ("env_id", "end"), [("PandaReach-v1", "truncated"), ("PandaReach-v3", "terminated")]
 )
-def test_last_state_of_an_episode(env_id, end):
+def test_an_episode_can_start_from_the_last_state_of_another(env_id, end):
     with torch_panda.make(env_id, num_envs=2, seed=0) as env:
         td = env.reset()
         td["action"] = torch.zeros(2, 3)
@@ -378,37 +378,37 @@ def test_large_actions_are_clipped(env):
         ({"camera": torch_panda.Camera()}, ValueError),
     ],
 )
-def test_bad_arguments(arguments, error):
+def test_bad_arguments_are_refused(arguments, error):
     (name,) = arguments
     with pytest.raises(error, match=name):
         torch_panda.make("PandaReach-v1", **arguments)
 
 
 @pytest.mark.parametrize("size", [0, "a", (64, 64, 3)])
-def test_bad_render_size(size):
+def test_a_bad_render_size_is_refused(size):
     with pytest.raises(ValueError, match=r"size|width"):
         torch_panda.make("PandaReach-v1", from_pixels=True, render_size=size)
 
 
 @pytest.mark.parametrize("env_id", [None, 3, ["PandaPush-v1"]])
-def test_ids_are_text(env_id):
+def test_ids_that_are_not_strings_are_refused(env_id):
     with pytest.raises(ValueError, match="unknown environment id"):
         torch_panda.make(env_id)
 
 
-def test_unknown_id_suggests():
+def test_an_unknown_id_suggests_a_similar_one():
     with pytest.raises(ValueError, match=r"did you mean PandaPush-v1.*Panda{Reach,"):
         torch_panda.make("PandaPsh-v1")
 
 
-def test_unknown_options():
+def test_unknown_options_are_refused():
     with pytest.raises(ValueError, match="control_type must be one of"):
         torch_panda.Panda(control_type="torque")
     with pytest.raises(ValueError, match="reward_type must be one of"):
         torch_panda.Reach(reward_type="shaped")
 
 
-def test_goals_of_wrong_shape(env):
+def test_goals_of_a_wrong_shape_are_refused(env):
     with pytest.raises(ValueError, match=r"\(\.\.\., 3\), got \(5, 4\)"):
         env.compute_reward(torch.zeros(5, 4), torch.zeros(5, 4))
 
@@ -420,7 +420,7 @@ def test_reward_functions_pickle_without_the_simulator(env):
     assert success(*goals).all()
 
 
-def test_use_after_close():
+def test_use_after_close_is_refused():
     env = torch_panda.make("PandaReach-v1", num_envs=2)
     td = env.reset()
     env.close()

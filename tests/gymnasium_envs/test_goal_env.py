@@ -27,7 +27,7 @@ def env():
 
 
 @pytest.mark.parametrize("env_id", torch_panda.ENV_IDS)
-def test_registered(env_id):
+def test_all_ids_are_registered(env_id):
     spec = gymnasium.spec(f"torch_panda/{env_id}")
     assert spec.max_episode_steps == torch_panda.max_episode_steps(env_id)
     assert spec.vector_entry_point is not None
@@ -104,7 +104,7 @@ def test_same_episodes_as_the_torch_environment(env):
                 assert info["is_success"] == after["success"].item()
 
 
-def test_start_from_a_state(env):
+def test_an_episode_starts_from_a_given_state(env):
     env.reset(seed=1)
     before = env.step(np.ones(3))[0]
     state = env.unwrapped.torch_env.get_state()
@@ -154,7 +154,7 @@ def test_pixels_and_sensors_are_observed():
 
 
 @pytest.mark.parametrize("limit", [3, 60])
-def test_time_limit_is_gymnasiums_or_ones_own(limit):
+def test_episodes_are_truncated_at_a_given_time_limit(limit):
     env_id = "PandaReach-v1"
     for env in (
         gymnasium.make(f"torch_panda/{env_id}", max_episode_steps=limit),
@@ -198,7 +198,7 @@ def test_step_agrees_with_the_goal_functions(env):
         assert terminated == env.unwrapped.compute_terminated(*goals, info)
 
 
-def test_own_task():
+def test_an_environment_of_an_own_task_is_accepted():
     task = torch_panda.Reach(distance_threshold=0.2)
     torch_env = torch_panda.RobotTaskEnv(
         robot=torch_panda.Panda(block_gripper=True), task=task, max_episode_steps=4
@@ -235,7 +235,7 @@ def test_render(monkeypatch):
         assert frame is None if mode is None else np.array_equal(frame, image)
 
 
-def test_bad_actions(env):
+def test_bad_actions_are_refused(env):
     env.reset(seed=0)
     for action in (np.full(3, np.nan), np.zeros(4), "up"):
         with pytest.raises(ValueError, match=r"not finite|shape \(3,\)|convert"):

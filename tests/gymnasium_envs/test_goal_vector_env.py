@@ -46,7 +46,7 @@ def act(observation, rng):
 
 @pytest.mark.parametrize("mode", AutoresetMode)
 @pytest.mark.parametrize(("env_id", "limit"), CASES)
-def test_same_as_sync_vector_env(env_id, limit, mode):
+def test_values_equal_those_of_sync_vector_env(env_id, limit, mode):
     ours, theirs = make_pair(env_id, mode, limit)
     assert isinstance(ours, GoalVectorEnv)
     assert ours.metadata["autoreset_mode"] is ours.autoreset_mode is mode
@@ -155,7 +155,7 @@ def test_the_default_device_changes_nothing(mode):
         ({"options": {"reset_mask": np.ones(2, bool)}}, ValueError, r"shape \(3,\)"),
     ],
 )
-def test_bad_resets(arguments, error, message):
+def test_bad_resets_are_refused(arguments, error, message):
     env = GoalVectorEnv("PandaReach-v1", num_envs=3)
     with pytest.raises(ResetNeeded, match=r"reset environments \[0, 1, 2\]"):
         env.step(np.zeros((3, 3)))
@@ -167,7 +167,7 @@ def test_bad_resets(arguments, error, message):
 
 
 @pytest.mark.filterwarnings("error")
-def test_bad_arguments():
+def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match="Sometimes"):
         GoalVectorEnv("PandaReach-v1", autoreset_mode="Sometimes")
     with (

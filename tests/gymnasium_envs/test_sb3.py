@@ -57,7 +57,7 @@ def test_hindsight_trains(make_env):
     env.close()
 
 
-def test_same_as_dummy_vec_env():
+def test_values_equal_those_of_dummy_vec_env():
     env_id = "PandaReach-v3"
     ours = SB3VecEnv(env_id, num_envs=3)
     theirs = DummyVecEnv([lambda: gymnasium.make(f"torch_panda/{env_id}")] * 3)
@@ -80,7 +80,7 @@ def test_same_as_dummy_vec_env():
     assert number_of_ends.min() >= 2
 
 
-def test_truncation_is_told_from_termination():
+def test_truncation_is_distinguished_from_termination():
     env = SB3VecEnv("PandaReach-v1", num_envs=2, max_episode_steps=3)
     env.reset()
     flags = []

@@ -85,10 +85,10 @@ class BroadPhase:
     def restore(self) -> None:
         """Move all bodies to where they were built and restore the broad phase.
 
-        Move all bodies far away. Then insert one link after another at the pose at
-        which it was built, in the order in which the links were built. An inserted link
-        has lost its overlaps and contacts. The links that are still far away do not
-        affect where a link is inserted, so the new tree depends on this order only.
+        All bodies first wait far away. Then one link after another is inserted at the
+        pose at which it was built, in the order in which the links were built. Its old
+        overlaps and contacts are lost. The links that still wait do not affect where a
+        link is inserted, so the new tree depends on this order only.
         """
         client = self._client
         client.load(self._away)
@@ -112,6 +112,7 @@ class BroadPhase:
         client.load(self._built)
 
     def _describe(self) -> native.BroadPhase:
+        """The struct with which ``reset.c`` does the same as `restore`."""
         links = [native.Link(b, k, *filters, s) for b, k, filters, s in self._links]
         return native.BroadPhase(
             self._num_detections,
@@ -135,7 +136,7 @@ class BroadPhase:
         The importer also inserts a link in another orientation if the link's inertial
         frame is rotated. This method does not imitate that, because no shipped robot
         has such a link. For a robot that has one, all resets lead to the same broad
-        phase, but it differs from the broad phase of a newly built client.
+        phase, but not to that of a newly built client.
         """
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):

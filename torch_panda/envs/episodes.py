@@ -42,7 +42,7 @@ from torch_panda.tasks import Task
 
 OnDivergence = Literal["raise", "reset"]
 
-# Measured with the Panda and a cube.
+# Memory of an environment, measured with the Panda and a cube.
 _BYTES_PER_ENV = 44e6
 
 
@@ -228,8 +228,8 @@ class Episodes:
             The observed entries of all environments, and ``reward``, (n, 1) float32.
 
         Raises:
-            BulletError: The environment is closed, needs a reset, or has diverged; or
-                another thread is inside.
+            BulletError: The environment is closed or needs a reset; another thread is
+                inside; or the step diverges and ``on_divergence`` is "raise".
             ValueError: The action has a wrong shape or is not finite.
             TypeError: The action has an integer dtype.
         """

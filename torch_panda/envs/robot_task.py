@@ -103,7 +103,7 @@ class RobotTaskEnv(EnvBase):
         RuntimeError: torch does not know the device, or EGL does not work.
 
     Attributes:
-        episodes: Runs the environments, without torchrl.
+        episodes: The same environments as plain torch, without torchrl's interface.
     """
 
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
