@@ -60,7 +60,11 @@ struct link { /* _Link of broad_phase.py */
     int body, link, group, mask, snapshot;
 };
 
-struct broad_phase { /* BroadPhase of broad_phase.py */
+/* BroadPhase of broad_phase.py. `num_detections` is the client's number after its scene
+   was built, and `cycle` the number modulo which it is restored. `away` and `built` are
+   snapshots with the bodies far away and as built. `pair` has the first bodies, whose
+   overlap brings the cursor back to the start. */
+struct broad_phase {
     int64_t num_detections;
     int cycle, away, built, num_links, pair_size, pair[2];
     const struct link *links;
@@ -85,7 +89,7 @@ struct scene { /* the same in every client */
 
 enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
 struct control { /* MotorControl of control.py */
-    int ik_link; /* link whose target setpoints contain; -1: they contain joints */
+    int ik_link; /* link whose target setpoints contain; -1 for joints */
     int num_arm_joints, setpoint_size;
     int turns;    /* whether setpoints contain the orientation of ik_link */
     int arm_mode; /* enum arm_mode */
@@ -137,7 +141,8 @@ handle client_submit(struct batch *batch, int env, handle command, int expected,
 /* Copy the state of a client into its row. */
 int client_read_state(struct batch *batch, int env);
 
-/* Restore a client's broad phase, place its bodies, and copy its state into its row. */
+/* Restore a client's broad phase, move its bodies to the state in its row, and copy the
+   resulting state into the row. */
 int client_reset(struct batch *batch, int env);
 
 /* Take up to `piece` substeps of a step. Return 1 if substeps remain, else 0. */
