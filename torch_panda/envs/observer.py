@@ -31,7 +31,7 @@ class EpisodeObserver:
         simulation: The environments.
         renderer: Draws the pictures of camera sensors.
         sensors: The sensors.
-        randomizer: Varies the physics, which may be observed.
+        randomizer: Draws the physics, whose parameters may be observed.
         goal_indices: Entries of the observation that are the achieved goal, or None.
         max_episode_steps: Number of steps after which an episode is ``truncated``.
         terminate_on_success: Whether success ends an episode.
@@ -73,6 +73,8 @@ class EpisodeObserver:
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._readings, extra]
+        # Keys of a state, which would be taken for a state if they were observed. The
+        # sensor "joint_state" may use two of them; see `is_state`.
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
@@ -107,7 +109,8 @@ class EpisodeObserver:
 
         Raises:
             ValueError: One of the first observations or rewards is NaN or infinite, or
-                does not hold the achieved goal where the task says.
+                the observation does not hold the achieved goal at the entries that
+                `Task.goal_entries` declares.
         """
         task, simulation = self._task, self._simulation
         observation = torch.cat(

@@ -102,13 +102,12 @@ def is_state(
 ) -> bool:
     """Whether a reset without ``set_state`` should start from its argument.
 
-    torchrl may pass the last observations to any reset, so a state has to be told from
-    observations by its keys. The argument is a state in two cases:
+    torchrl may pass the last observations to any reset, so the keys have to show
+    whether the argument is a state or observations. It is a state in two cases:
 
     * It has entries of `BODY_KEYS`, or a nested state under ``state``, where
       `StateTransform` puts it.
-    * It has a ``desired_goal`` without an ``achieved_goal``. With an ``achieved_goal``
-      the two are observations.
+    * It has a ``desired_goal`` and no ``achieved_goal``. Observations have both.
 
     A ``step_count`` alone is not a state: torchrl's `StepCounter` writes it too.
 
@@ -166,10 +165,10 @@ def read_state(
         Entries of shape (len(envs), ...), in the dtypes of ``present``.
 
     Raises:
-        ValueError: An entry has a wrong shape, is not finite, is above 1e6, or should
-            be a rotation and is not; or there is no entry of a state, except perhaps
-            ``step_count``, which may be that of torchrl's `StepCounter`; or an exact
-            state lacks entries.
+        ValueError: An entry has a wrong shape, is not finite, is above 1e6, or has a
+            quaternion that is not a unit quaternion. Or an exact state lacks entries.
+            Or there are no entries of a state. ``step_count`` alone does not count,
+            because torchrl's `StepCounter` writes it too.
     """
     if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
         raise ValueError(

@@ -7,32 +7,34 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
 from torch_panda.envs.state import BODY_KEYS, NESTED_STATE, unpack_state
 
-# The function in which torchrl asks whether a reset may start from a state.
+# torchrl's function that decides whether a reset starts from a state.
 _RESOLVE_CODE = EnvBase._resolve_set_state.__code__
 
 
 @dataclass(frozen=True)
 class StateSupport:
-    """The answer to whether resets may start from a state: true, or an error.
+    """What ``_supports_set_state`` of an environment returns: true, or an error.
 
-    `TransformedEnv`, `SerialEnv` and `ParallelEnv` take over this answer from the
-    environment that they wrap, also from a worker in another process. torchrl tests its
-    truth in every reset of a wrapper, before it sends the state off. The truth
-    therefore depends on the reset: a state that would not arrive raises an error here.
-    torchrl does not pass the arguments of the reset, so they are read from the calling
-    function.
+    torchrl asks an environment whether its resets may start from a state. The wrappers
+    `TransformedEnv`, `SerialEnv` and `ParallelEnv` give the answer of the environment
+    that they wrap, also if it runs in another process.
+
+    torchrl evaluates the answer as a boolean in every reset of a wrapper, before the
+    wrapper passes the state on. `__bool__` uses this moment to raise an error if the
+    state of this reset would not reach the environment. torchrl does not pass the
+    arguments of the reset, so `__bool__` reads them from the calling function.
 
     Attributes:
-        observed: Entries that the environment observes under keys of a state.
+        observed: Keys of `BODY_KEYS` under which the environment has observations.
     """
 
     observed: frozenset[str]
 
     def __bool__(self) -> bool:
-        """Whether torchrl should treat this reset as one that may have a state.
+        """Whether torchrl should look for a state in this reset.
 
         Raises:
-            ValueError: The reset has a state that would not arrive.
+            ValueError: The reset has a state that would not reach the environment.
         """
         frame = sys._getframe(1)
         while frame.f_code.co_name == "_supports_set_state" and frame.f_back:
@@ -48,7 +50,7 @@ class StateSupport:
         has_nested = entries is not None and unpack_state(entries) is not entries
         arrives = has_nested and NESTED_STATE in set(env.state_spec.keys())
         if isinstance(env, SerialEnv):
-            # It passes all entries on, and the environments of its workers check them.
+            # A SerialEnv passes all entries on, so its environments check them.
             return bool(set_state or arrives)
         keys = set() if entries is None else set(entries.keys())
         has_state = has_nested or keys & set(BODY_KEYS) - self.observed
@@ -62,5 +64,6 @@ class StateSupport:
                 f"reset(TensorDict({{{NESTED_STATE!r}: state}}, env.batch_size), "
                 "set_state=True)"
             )
-        # Without a state of ours, torchrl would take a `StepCounter`'s count for one.
+        # Without a state, answer no: torchrl would take the ``step_count`` of a
+        # `StepCounter` for a state.
         return arrives
