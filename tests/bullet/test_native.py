@@ -13,9 +13,9 @@ import torch_panda
 from torch_panda.bullet import native
 
 FOLDER = Path(native.__file__).parent
-SOURCES = ("client.h", "client.c", "loop.c", "reset.c")
+SOURCES = ("client.h", "client.c", "environment.c", "loop.c", "reset.c")
 # Hash of the C sources without comments and white space, by version.
-HASHES = {1: "0369eca1f4deac42"}
+HASHES = {2: "6c4a1ceb2163b398"}
 
 
 def hash_of_sources():

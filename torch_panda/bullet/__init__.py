@@ -14,6 +14,7 @@ from torch_panda.bullet.physics import (
 )
 from torch_panda.bullet.pool import WorkerError, WorkerPool
 from torch_panda.bullet.scene import Scene
+from torch_panda.bullet.selection import selects_state
 from torch_panda.bullet.shapes import Box, Cylinder, Sphere, Visual
 from torch_panda.bullet.simulation import VectorSimulation
 from torch_panda.bullet.state import SimulationState
@@ -39,4 +40,5 @@ __all__ = [
     "WorkerError",
     "WorkerPool",
     "read_physics",
+    "selects_state",
 ]

@@ -54,11 +54,11 @@ class NativeLoop:
             len(object_joints),
             len(scene.markers),
             physics.n_substeps,
-            _ints(scene.joints),
-            _ints(scene.objects),
-            _ints(map(len, scene.object_joints)),
-            _ints(object_joints),
-            _ints(scene.markers),
+            ints(scene.joints),
+            ints(scene.objects),
+            ints(map(len, scene.object_joints)),
+            ints(object_joints),
+            ints(scene.markers),
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
@@ -187,6 +187,7 @@ class NativeLoop:
         return refusal(failure.action.decode(), code, failure.expected)
 
 
-def _ints(values: Iterable[int]) -> "Array[c_int]":
+def ints(values: Iterable[int]) -> "Array[c_int]":
+    """A C array of integers."""
     values = tuple(values)
     return (c_int * len(values))(*values)

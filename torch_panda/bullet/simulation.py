@@ -97,6 +97,11 @@ class VectorSimulation:
         return self._pool.num_threads
 
     @property
+    def is_native(self) -> bool:
+        """Whether the compiled loop steps the clients."""
+        return self._native is not None
+
+    @property
     def clients(self) -> Sequence[PhysicsClient]:
         """The clients, by index of the environment."""
         return self._clients

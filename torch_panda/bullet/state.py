@@ -36,6 +36,7 @@ class SimulationState:
             all objects, in the order of the objects.
         object_joint_velocity: (num_envs, n_object_joints) [rad/s] or [m/s].
         marker_pose: (num_envs, n_markers, 7), poses to which a reset moves the markers.
+        ee_column: Column of ``rows`` at which ``ee_state`` begins.
         rows: (num_envs, k), contiguous. All tensors except ``marker_pose`` are views of
             ``rows``. Their order is that of ``client_row`` in ``client.c``.
     """
@@ -72,7 +73,8 @@ class SimulationState:
             self.object_joint_velocity,
             object_state,
         ) = self.rows.split(sizes, dim=1)
-        self.ee_state = self.rows[:, 2 * n_joints : 2 * n_joints + 6]
+        self.ee_column = 2 * n_joints
+        self.ee_state = self.rows[:, self.ee_column : self.ee_column + 6]
         self.object_pose = object_pose.unflatten(1, (n_objects, 7))
         self.object_state = object_state.unflatten(1, (n_objects, 12))
         self.object_euler = self.object_state[..., 3:6]

@@ -13,6 +13,7 @@ from torch_panda.bullet import (
     PhysicsParams,
     ThreadGuard,
     VectorSimulation,
+    native,
     read_physics,
 )
 from torch_panda.checks import (
@@ -37,6 +38,7 @@ from torch_panda.envs.start import EpisodeStarts
 from torch_panda.envs.state import StartState, read_state
 from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
+from torch_panda.robots.compiled_setpoints import CompiledSetpoints
 from torch_panda.sensors import Entry, Sensor, read_sensors
 from torch_panda.tasks import Task
 
@@ -108,6 +110,10 @@ class Episodes:
         self.robot, self.task = robot, task
         self._control = robot.controller
         self.batch_shape = () if num_envs is None else (n,)
+        self._action_shape = torch.Size((*self.batch_shape, robot.action_dim))
+        self._template_action = torch.zeros(
+            n, robot.action_dim, dtype=torch.float32, device="cpu"
+        )
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
@@ -123,6 +129,9 @@ class Episodes:
             build_scene, n, num_threads=num_threads, physics=self.physics
         )
         try:
+            self._compiled_setpoints = None
+            if CompiledSetpoints.applies(robot, self.simulation):
+                self._compiled_setpoints = CompiledSetpoints(robot, self.simulation)
             self.renderer = VectorRenderer(self.simulation, renderer=renderer)
             randomizer = DomainRandomizer(
                 randomize, robot, task, self.simulation, self.physics
@@ -235,9 +244,7 @@ class Episodes:
         """
         with self._guard:
             self._check_was_reset()
-            action = check_action(action, (*self.batch_shape, self.robot.action_dim))
-            # Clip before the conversion: a large float64 is infinite in float32.
-            action = action.clamp(-1.0, 1.0).float()
+            action = self._read_action(action)
             envs = None if step_mask is None else indices(step_mask)
             self._starts.step_count += 1 if step_mask is None else step_mask
             self._history.record(action, step_mask)
@@ -328,9 +335,33 @@ class Episodes:
             observed["desired_goal"] = self._goal_observer.desired.clone()
         return observed
 
+    def _read_action(self, action: Tensor | None) -> Tensor:
+        """Check and clip an action; return it as (n, action_dim) float32."""
+        shape = self._action_shape
+        if (
+            native.LIBRARY is not None
+            and self.simulation.is_native
+            and isinstance(action, Tensor)
+            and action.shape == shape
+            and action.dtype == torch.float32
+            and action.is_cpu
+            and action.is_contiguous()
+        ):
+            clipped = torch.empty_like(self._template_action)
+            if native.LIBRARY.environment_clip(
+                action.data_ptr(), clipped.data_ptr(), clipped.numel()
+            ):
+                return clipped
+        action = check_action(action, tuple(shape))
+        # Clip before the conversion: a large float64 is infinite in float32.
+        return action.clamp(-1.0, 1.0).float()
+
     def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
         """Advance the physics by one step; return the environments that diverged."""
-        setpoint = self.robot.setpoint(action, self.simulation).numpy()
+        if self._compiled_setpoints is None:
+            setpoint = self.robot.setpoint(action, self.simulation).numpy()
+        else:
+            setpoint = self._compiled_setpoints(action)
         return self.simulation.step(self._control, setpoint, envs)
 
     def _read_state(self, state: Mapping[str, Any], envs: list[int]) -> StartState:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.checks import check_output
+from torch_panda.envs.compiled_observer import CompiledObserver, Observed
 from torch_panda.envs.randomization import PHYSICS_KEYS, DomainRandomizer
 from torch_panda.envs.state import BODY_KEYS, EXACT_KEYS
 from torch_panda.rendering import VectorRenderer
@@ -17,9 +18,6 @@ from torch_panda.tasks import Task
 # Number of the first observations that are checked for NaN and infinity. The check is
 # too expensive for every step.
 _NUM_CHECKED = 20
-
-Observed = dict[str, Tensor]
-"""Observed entries of all environments, (n, ...) by key, in new tensors."""
 
 
 class EpisodeObserver:
@@ -67,6 +65,13 @@ class EpisodeObserver:
         self._has_reward = type(task).reward is not Task.reward
         self._has_failure = type(task).failure is not Task.failure
         self._check_functions()
+        self._compiled = CompiledObserver.make(
+            robot,
+            task,
+            simulation,
+            max_episode_steps=max_episode_steps,
+            terminate_on_success=terminate_on_success,
+        )
         self._readings = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]
@@ -112,29 +117,44 @@ class EpisodeObserver:
                 the observation does not hold the achieved goal at the entries that
                 `Task.goal_entries` declares.
         """
-        task, simulation = self._task, self._simulation
-        observation = torch.cat(
-            (self._robot.observation(simulation), task.observation(simulation)), dim=1
-        )
-        # A copy, because a task may return a tensor that the next step overwrites.
-        achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
-        desired_goal = goal.float()
-        success = task.is_success(achieved_goal, desired_goal)
-        observed = {
-            "observation": observation.float(),
-            "achieved_goal": achieved_goal,
-            "desired_goal": desired_goal,
-            "success": success,
-            **self._ends(success, step_count),
-        }
-        if action is not None:
-            observed["reward"] = self._reward(action, achieved_goal, desired_goal)
+        if self._compiled is None:
+            observed, is_complete = self._observe_goals(goal), False
+        else:
+            observed, is_complete = self._compiled.observe(goal, step_count)
+        if not is_complete or self._has_reward or self._has_failure:
+            self._add_outcome(observed, step_count, action)
+        if action is None:
+            observed.pop("reward", None)
         for observer in self._observers:
             observed |= observer.observe()
         if self._num_to_check:
             self._check_numbers(observed)
             self._num_to_check -= 1
         return observed
+
+    def _observe_goals(self, goal: Tensor) -> Observed:
+        """Observation and goals, for desired goals (n, goal_dim)."""
+        task, simulation = self._task, self._simulation
+        observation = torch.cat(
+            (self._robot.observation(simulation), task.observation(simulation)), dim=1
+        )
+        # A copy, because a task may return a tensor that the next step overwrites.
+        achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
+        return {
+            "observation": observation.float(),
+            "achieved_goal": achieved_goal,
+            "desired_goal": goal.float(),
+        }
+
+    def _add_outcome(
+        self, observed: Observed, step_count: Tensor, action: Tensor | None
+    ) -> None:
+        """Add success, ends and after a step the reward; see `observe`."""
+        goals = observed["achieved_goal"], observed["desired_goal"]
+        observed["success"] = self._task.is_success(*goals)
+        observed |= self._ends(observed["success"], step_count)
+        if action is not None:
+            observed["reward"] = self._reward(action, *goals)
 
     def progress(self, goal: Tensor, step_count: Tensor) -> Observed:
         """Goals, success and number of steps, (n, ...), for a viewer."""

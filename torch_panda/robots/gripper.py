@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torch_panda.bullet import native
+
 
 @dataclass(frozen=True)
 class Gripper:
@@ -69,6 +71,21 @@ class Gripper:
     def fingers_width(self, joints: Tensor) -> Tensor:
         """Distance between the fingers [m], (n, 1), for joints (n, num_joints)."""
         return (joints * self._weights).sum(dim=1, keepdim=True) + self._offset
+
+    def describe(self, column: int) -> native.Gripper:
+        """This gripper, which must have two joints, for C.
+
+        Args:
+            column: Column of the first joint's position in the rows of the state.
+        """
+        return native.Gripper(
+            column,
+            self.scale,
+            tuple(self._weights.tolist()),
+            self._offset,
+            tuple(self._closed.tolist()),
+            tuple(self._per_width.tolist()),
+        )
 
     def setpoint(self, action: Tensor, joints: Tensor) -> Tensor:
         """Setpoints of the joints for actions.

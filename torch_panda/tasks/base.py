@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.arguments import Configured
-from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.bullet import PhysicsClient, VectorSimulation, selects_state
 from torch_panda.checks import check_choice, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.table import create_table
@@ -275,10 +275,13 @@ class Task(Configured, ABC):
         rotation = goal.new_tensor(NO_ROTATION).expand(*positions.shape[:-1], 4)
         return torch.cat((positions, rotation), dim=-1)
 
+    @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation, (num_envs, observation_dim) float64.
 
-        The robot's part precedes it in ``observation``.
+        The robot's part precedes it in ``observation``. If a task declares this method
+        and `achieved_goal` with `bullet.selects_state`, C code observes instead of
+        them, which saves about 50 microseconds per step.
         """
         return simulation.ee_position[:, :0]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
+from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation, selects_state
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import (
     OBJECT_LAYOUT,
@@ -93,10 +93,12 @@ class Slide(Task):
         position = sample_on_table(rng, self.obj_xy_range, height=PUCK_START_HEIGHT)
         return ((*position, *NO_ROTATION),)
 
+    @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, Euler angles and velocities of the puck, (num_envs, 12)."""
         return object_observation(simulation, 0)
 
+    @selects_state
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Position of the puck, (num_envs, 3)."""
         return simulation.object_pose[:, 0, :3]

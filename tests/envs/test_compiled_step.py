@@ -1,0 +1,223 @@
+"""Setpoints, observations, success and reward from C equal those from torch."""
+
+import math
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda import Panda, Push, RobotTaskEnv, Task
+from torch_panda.bullet import native, selects_state
+from torch_panda.bullet.selection import selected_columns
+from torch_panda.envs.compiled_observer import CompiledObserver
+from torch_panda.robots.compiled_setpoints import CompiledSetpoints
+
+pytestmark = pytest.mark.skipif(
+    native.LIBRARY is None, reason="installed where there was no C compiler"
+)
+
+N = 3
+IDS = (
+    "PandaReach-v1",
+    "PandaReachJointsDense-v3",
+    "PandaPush-v3",
+    "PandaPushDense-v1",
+    "PandaSlideJoints-v3",
+    "PandaPickAndPlace-v1",
+    "PandaPickAndPlaceJoints-v3",
+    "PandaStack-v1",
+    "PandaStackDense-v3",
+    "PandaFlip-v3",
+    "PandaFlipDense-v1",
+)
+
+
+def without_c(monkeypatch):
+    monkeypatch.setattr(CompiledObserver, "make", lambda *_, **__: None)
+    monkeypatch.setattr(CompiledSetpoints, "applies", lambda *_: False)
+
+
+def act(env, steps):
+    """Observations of steps with actions in and out of range, and of partial resets."""
+    generator, observed = torch.Generator().manual_seed(0), [env.reset()]
+    for _ in range(steps):
+        td = observed[-1].exclude("action", "next")
+        td["action"] = torch.rand(env.action_spec.shape, generator=generator) * 3 - 1.5
+        _, td = env.step_and_maybe_reset(td)
+        observed.append(td)
+    return observed
+
+
+def assert_same_bits(ours, theirs):
+    assert ours.keys() == theirs.keys()
+    for key, value in ours.items():
+        other = theirs[key]
+        assert value.dtype == other.dtype
+        assert value.shape == other.shape
+        assert value.is_contiguous()
+        if value.dtype == torch.float32:  # also the signs of zeros
+            value, other = value.view(torch.int32), other.view(torch.int32)
+        assert value.equal(other), key
+
+
+@pytest.mark.parametrize("num_envs", [N, None])
+@pytest.mark.parametrize("env_id", IDS)
+def test_steps_from_c_have_the_bits_of_steps_from_torch(monkeypatch, env_id, num_envs):
+    options = {"num_envs": num_envs, "seed": 1, "max_episode_steps": 7}
+    with torch_panda.make(env_id, **options) as env:
+        assert env.episodes._compiled_setpoints is not None
+        assert env.episodes._observer._compiled is not None
+        ours = act(env, 16)
+    without_c(monkeypatch)
+    with torch_panda.make(env_id, **options) as env:
+        assert env.episodes._compiled_setpoints is None
+        assert env.episodes._observer._compiled is None
+        theirs = act(env, 16)
+    for one, other in zip(ours, theirs, strict=True):
+        assert_same_bits(one, other)
+
+
+def test_distances_near_the_threshold_are_left_to_torch():
+    """The goal is moved by the threshold and by a few float32 more or less."""
+    generator = torch.Generator().manual_seed(0)
+    with torch_panda.make("PandaPush-v3", num_envs=64, seed=0) as env:
+        env.reset()
+        observer, goal = env.episodes._observer, env.episodes._starts.goal
+        steps = torch.ones(64, 1, dtype=torch.int64)
+        achieved = env.task.achieved_goal(env.episodes.simulation)
+        rest, successes = 0, 0
+        for _ in range(200):
+            direction = torch.randn(64, 3, generator=generator).double()
+            direction /= direction.norm(dim=1, keepdim=True)
+            factor = 1 + 1e-6 * torch.randn(64, 1, generator=generator).double()
+            goal[:] = achieved + env.task.distance_threshold * factor * direction
+            _, is_complete = observer._compiled.observe(goal, steps)
+            rest += not is_complete
+            observed = observer.observe(goal, steps, torch.zeros(64, 3))
+            goals = observed["achieved_goal"], observed["desired_goal"]
+            assert observed["success"].equal(env.is_success(*goals))
+            assert observed["reward"].equal(env.compute_reward(*goals))
+            assert observed["done"].equal(observed["success"])
+            successes += int(observed["success"].sum())
+        assert rest == 200
+        assert 0.3 < successes / (200 * 64) < 0.7
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1e-30, 0.04, 1.0, 1e30, math.inf])
+def test_thresholds_of_any_size_that_change_later(threshold):
+    with torch_panda.make("PandaPush-v3", num_envs=N, seed=0) as env:
+        env.task.distance_threshold = threshold
+        for td in act(env, 3)[1:]:
+            goals = td["achieved_goal"], td["desired_goal"]
+            assert td["success"].equal(env.is_success(*goals))
+        env.episodes._starts.goal[:] = env.get_state()["object_pose"][:, 0, :3]
+        td = env.step(td.set("action", torch.zeros(N, 3)))["next"]
+        goals = td["achieved_goal"], td["desired_goal"]
+        assert td["success"].equal(env.is_success(*goals))
+        assert td["reward"].equal(env.compute_reward(*goals))
+
+
+class FarPush(Push):
+    """Its own achieved goal and success, which C must not replace."""
+
+    goal_entries = None
+
+    def achieved_goal(self, simulation):
+        return super().achieved_goal(simulation) + 1.0
+
+    def success_distance(self, achieved_goal, desired_goal):
+        return self.distance(achieved_goal, desired_goal + 1.0)
+
+
+class OwnSuccess(Push):
+    def is_success(self, achieved_goal, desired_goal):
+        return ~super().is_success(achieved_goal, desired_goal)
+
+
+class OwnRobot(Panda):
+    def arm_setpoint(self, action, simulation):
+        return super().arm_setpoint(-action, simulation)
+
+    def observation(self, simulation):
+        return -super().observation(simulation)
+
+
+def make(task=None, robot=None):
+    robot, task = robot or Panda(block_gripper=True), task or Push()
+    return RobotTaskEnv(robot=robot, task=task, num_envs=N, seed=0)
+
+
+def test_functions_of_the_user_are_called():
+    action = torch.ones(N, 3)
+    with make() as env, make(FarPush()) as far, make(OwnSuccess()) as own:
+        td, td_far, td_own = (e.reset().set("action", action) for e in (env, far, own))
+        step, step_far, step_own = (
+            e.step(start)["next"]
+            for e, start in ((env, td), (far, td_far), (own, td_own))
+        )
+        moved = step["achieved_goal"].double() + 1.0
+        assert step_far["achieved_goal"].allclose(moved.float())
+        assert step_far["success"].equal(step["success"])
+        assert step_own["success"].equal(~step["success"])
+
+
+def test_setpoints_and_observations_of_a_users_robot():
+    action = torch.ones(N, 3)
+    with make() as env, make(robot=OwnRobot(block_gripper=True)) as own:
+        step = env.step(env.reset().set("action", action))["next"]
+        other = own.step(own.reset().set("action", -action))["next"]
+        expected = step["observation"].clone()
+        expected[:, :6] *= -1
+        assert other["observation"].equal(expected)
+
+
+def test_a_wrong_declaration_is_refused():
+    class Doubled(Push):
+        @selects_state
+        def observation(self, simulation):
+            return 2 * super().observation(simulation)
+
+    with make() as env:
+        simulation = env.episodes.simulation
+        rows = simulation.state.rows.clone()
+        assert selected_columns(Task.distance.__get__(env.task), simulation) is None
+        with pytest.raises(ValueError, match="declared by selects_state, so it must"):
+            selected_columns(Doubled().observation, simulation)
+        assert simulation.state.rows.equal(rows)
+
+
+def test_outputs_are_not_reused_and_do_not_show_the_present():
+    with make() as env:
+        td = env.reset()
+        steps = []
+        for _ in range(3):
+            td = env.step(td.copy().set("action", torch.ones(N, 3)))["next"]
+            steps.append((td, td.clone()))
+        pointers = {value.data_ptr() for step, _ in steps for value in step.values()}
+        assert len(pointers) == sum(len(step.keys()) for step, _ in steps)
+        for step, copy in steps:
+            assert (step == copy).all()
+
+
+def test_the_callers_action_is_kept_and_not_changed():
+    with make() as env:
+        start = env.reset()
+        action = torch.full((N, 3), 2.0)
+        env.step(start.set("action", action))
+        assert (action == 2.0).all()
+        action.zero_()
+        state = env.get_state(exact=True)
+        assert (state["actions"] == 1.0).all()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_bad_action_changes_nothing(bad):
+    with make() as env:
+        start = env.reset()
+        action = torch.zeros(N, 3)
+        action[1, 2] = bad
+        with pytest.raises(ValueError, match="environment 1 is not finite"):
+            env.step(start.set("action", action))
+        state = env.get_state(exact=True)
+        assert (state["num_actions"] == 0).all()
+        assert (state["step_count"] == 0).all()

@@ -1,0 +1,102 @@
+/* From actions to setpoints, and from states to observations, goals, success, reward and
+   ends.
+
+   The robot and the task compute the same numbers with torch, see Robot.setpoint and
+   EpisodeObserver. Between two steps of physics, an operation of torch takes 2 to 5
+   microseconds, and a step needs about 40 of them. */
+
+#include "client.h"
+
+#include <math.h>
+#include <stdint.h>
+
+/* Clip actions to [-1, 1]. Return 0 if one is not finite. */
+int environment_clip(const float *action, float *clipped, int count) {
+    for (int k = 0; k < count; k++) {
+        if (!isfinite(action[k])) return 0;
+        clipped[k] = action[k] < -1 ? -1 : action[k] > 1 ? 1 : action[k];
+    }
+    return 1;
+}
+
+static double fingers_width(const struct gripper *gripper, doubles row) {
+    doubles joints = row + gripper->column;
+    double width = joints[0] * gripper->weights[0] + joints[1] * gripper->weights[1];
+    return width + gripper->offset;
+}
+
+/* Setpoints of all robots for clipped actions; see Robot.setpoint. */
+void environment_setpoints(const struct actuation *actuation, doubles state,
+                           int num_envs, const float *action, double *setpoint) {
+    const struct gripper *gripper = &actuation->gripper;
+    for (int env = 0; env < num_envs; env++, state += actuation->row_size) {
+        doubles present = state + actuation->column;
+        for (int k = 0; k < actuation->num_displaced; k++) {
+            float displacement = *action++ * actuation->scale;
+            double target = present[k] + displacement;
+            if (actuation->has_limits) {
+                double lowest = actuation->lowest[k], highest = actuation->highest[k];
+                target = target < lowest ? lowest : target > highest ? highest : target;
+            }
+            *setpoint++ = target;
+        }
+        for (int k = 0; k < actuation->num_resting; k++)
+            *setpoint++ = actuation->resting[k];
+        if (!actuation->has_gripper) continue;
+        /* The sum is float32, as in panda-gym under NumPy 2. */
+        float change = *action++ * gripper->scale;
+        float width = (float)fingers_width(gripper, state) + change;
+        for (int k = 0; k < 2; k++)
+            *setpoint++ = gripper->closed[k] + width * gripper->per_width[k];
+    }
+}
+
+enum { REACHED, MISSED, UNKNOWN };
+/* Compare the distance of two goals with the threshold. torch rounds distances in its
+   own ways, which depend on the processor. The answer is UNKNOWN where its rounding
+   could decide. */
+static int compare(const struct observation *observed, const float *achieved_goal,
+                   const float *desired_goal) {
+    double sum = 0, threshold = observed->distance_threshold;
+    for (int k = 0; k < observed->goal_size; k++) {
+        float offset = achieved_goal[k] - desired_goal[k];
+        sum += (double)offset * offset;
+    }
+    double distance = sqrt(sum), margin = 1e-5 * threshold + 1e-15;
+    if (distance < threshold - margin) return REACHED;
+    return distance > threshold + margin && distance < 1e15 ? MISSED : UNKNOWN;
+}
+
+/* Observe all environments. Return 1 if success, ends and the sparse reward were
+   computed too, else 0: then none of them are valid. The reward may be NULL. */
+int environment_observe(const struct observation *observed, doubles state, int num_envs,
+                        doubles goal, const int64_t *step_count, float *observation,
+                        float *achieved_goal, float *desired_goal, float *reward,
+                        uint8_t *success, uint8_t *terminated, uint8_t *truncated,
+                        uint8_t *done) {
+    int goal_size = observed->goal_size, is_complete = observed->compares_distance;
+    for (int env = 0; env < num_envs; env++, state += observed->row_size) {
+        for (int k = 0; k < observed->size; k++) {
+            int column = observed->columns[k];
+            *observation++ = column == WIDTH ? fingers_width(&observed->gripper, state)
+                                             : state[column];
+        }
+        for (int k = 0; k < goal_size; k++) {
+            achieved_goal[k] = state[observed->goal_columns[k]];
+            desired_goal[k] = *goal++;
+        }
+        if (is_complete) {
+            int answer = compare(observed, achieved_goal, desired_goal);
+            int has_begun = step_count[env] > 0; /* a start does not end an episode */
+            is_complete = answer != UNKNOWN;
+            success[env] = answer == REACHED;
+            if (reward) reward[env] = answer == REACHED ? -0.0f : -1;
+            terminated[env] =
+                observed->terminate_on_success && success[env] && has_begun;
+            truncated[env] = step_count[env] >= observed->max_episode_steps;
+            done[env] = terminated[env] || truncated[env];
+        }
+        achieved_goal += goal_size, desired_goal += goal_size;
+    }
+    return is_complete;
+}

@@ -1,0 +1,57 @@
+"""Functions that select entries of the state, which C code then copies."""
+
+from collections.abc import Callable
+from typing import TypeVar
+from weakref import WeakSet
+
+import torch
+from torch import Tensor
+
+from torch_panda.bullet.simulation import VectorSimulation
+
+_Function = TypeVar("_Function", bound=Callable[..., Tensor])
+
+_selectors: WeakSet[Callable[..., Tensor]] = WeakSet()
+
+
+def selects_state(function: _Function) -> _Function:
+    """Declare that a method of a task or robot only selects entries of the state.
+
+    Each entry of its result must always be the same entry of ``simulation.state``,
+    in every environment. The compiled library then copies the entries, which takes less
+    time than the method. A method that overrides this one is called as usual, unless it
+    is declared too.
+    """
+    _selectors.add(function)
+    return function
+
+
+def selected_columns(
+    method: Callable[[VectorSimulation], Tensor], simulation: VectorSimulation
+) -> tuple[int, ...] | None:
+    """Columns of ``simulation.state.rows`` that a method selects.
+
+    Returns:
+        None if the method is not declared by `selects_state`.
+
+    Raises:
+        ValueError: The method is declared, but does not select entries of the state.
+    """
+    if getattr(method, "__func__", method) not in _selectors:
+        return None
+    rows = simulation.state.rows
+    saved = rows.clone()
+    numbers = torch.arange(rows.numel(), dtype=rows.dtype, device="cpu").view_as(rows)
+    try:
+        rows.copy_(numbers)
+        selected = method(simulation).clone()
+    finally:
+        rows.copy_(saved)
+    columns = selected[0].tolist()
+    is_valid = set(columns) <= set(numbers[0].tolist())
+    if not is_valid or not numbers[:, list(map(int, columns))].equal(selected):
+        raise ValueError(
+            f"{method} is declared by selects_state, so it must return entries of the "
+            f"state, the same for all environments: remove the declaration"
+        )
+    return tuple(map(int, columns))
