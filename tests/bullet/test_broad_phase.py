@@ -1,4 +1,4 @@
-"""Restoring the broad phase: bodies return, and the past has no effect."""
+"""Restoring the broad phase: bodies return, and earlier steps have no effect."""
 
 import random
 
@@ -151,5 +151,5 @@ def test_restore_keeps_the_collision_filters_of_the_scene():
         broad_phase.restore()
         client.step(200)
         heights = [client.state(cube).base_pose[2] for cube in cubes]
-    assert heights[0] < -0.1  # it touches nothing
+    assert heights[0] < -0.1  # the first cube touches nothing and falls
     assert heights[1] == pytest.approx(0.02, abs=1e-3)

@@ -1,4 +1,4 @@
-"""PhysicsClient equals the pybullet module: the same commands give the same numbers."""
+"""PhysicsClient and the pybullet module compute the same numbers."""
 
 import numpy as np
 import pybullet
@@ -166,7 +166,7 @@ def test_masses_equal_those_of_pybullet(reference):
         cube = create(reference, client, "box", 0.3, (0.0, 0.0, 1.0))
         for body, link in ((panda, -1), (panda, 4), (cube, -1)):
             assert client.mass(body, link) == reference.getDynamicsInfo(body, link)[0]
-        assert client.mass(panda) == 0.0  # a fixed base, which has a mass in its URDF
+        assert client.mass(panda) == 0.0  # the base is fixed; in the URDF it has a mass
         assert client.mass(cube) == 0.3
 
 

@@ -26,7 +26,7 @@ def hash_of_sources():
 
 @pytest.fixture
 def unset(monkeypatch):
-    """No environment variable, and no warning so far."""
+    """Unset the environment variable, and forget that a warning was given."""
     monkeypatch.delenv(native.LOOP_VARIABLE, raising=False)
     native._warn_of_slow_loop.cache_clear()
     yield

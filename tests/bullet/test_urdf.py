@@ -1,4 +1,4 @@
-"""Broken URDFs are refused before Bullet reads them and crashes, or gives no reason."""
+"""Broken URDFs are refused with a reason, before Bullet reads them and crashes."""
 
 import pytest
 

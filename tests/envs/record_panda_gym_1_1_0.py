@@ -18,7 +18,7 @@ FILE = Path(__file__).with_name("panda_gym_1_1_0.npz")
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack")
 EPISODES = 6
 STEPS = 60
-LIFTED = 0.06  # [m], height of a cube's centre that only a grasp explains
+LIFTED = 0.06  # [m]; a cube's centre is only this high if the fingers hold the cube
 
 
 class _Box:
@@ -45,7 +45,7 @@ def stub_gym():
 
 
 def choose_action(task, observation, item, rng):
-    """Towards the object number `item`, down to it, and, with a gripper, away with it.
+    """Move to object number `item`, go down, and with a gripper carry it away.
 
     Noisy, and often out of range.
     """
@@ -59,7 +59,9 @@ def choose_action(task, observation, item, rng):
     ee, width = observation[:3], observation[6]
     offset = observation[7 + 12 * item :][:3] - ee
     near = np.abs(offset).max() < 0.015
-    if near and width < 0.045:  # grasped: carry it around, and let go at times
+    if (
+        near and width < 0.045
+    ):  # the object is grasped: carry it around and sometimes let go
         grip = 1.0 if rng.random() < 0.05 else -1.0
         return np.append(noise[:3] * 0.5 + (0.0, 0.0, 0.5), grip)
     over = np.linalg.norm(offset[:2]) > 0.012

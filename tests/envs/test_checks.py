@@ -89,7 +89,7 @@ def test_scenes_that_differ_between_clients_are_refused(change):
 
 
 def test_pictures_show_the_scene_of_the_simulation():
-    """They are drawn from its blueprint: a later build cannot differ from it."""
+    """Renderers build from the blueprint, so a later, different build has no effect."""
     task = Changing("size")
     with make(task, seed=0) as env:
         env.reset()
@@ -254,7 +254,7 @@ def test_a_state_beside_observations_needs_set_state(env):
     with pytest.raises(ValueError, match="pass set_state=True"):
         env.reset(td)
     env.reset(td, set_state=False)
-    # Within a rollout torchrl resets as ever.
+    # The resets that torchrl does within a rollout start new episodes.
     last = env.get_state()
     last["step_count"][:] = 49
     td = env.reset(last, set_state=True)
@@ -347,7 +347,7 @@ def test_nan_of_an_observation_is_named():
 
 
 def test_later_steps_are_not_checked():
-    """The checks cost nothing after the first steps."""
+    """Checks of every step would take too long, so only the first steps are checked."""
     with make(Reach()) as env:
         env.rollout(30)
         env.episodes._observer._check_numbers = None

@@ -1,4 +1,4 @@
-"""Physics that diverges is noticed and named, and its environment starts anew."""
+"""Divergence is noticed and named, and the environment starts its next episode."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def env(request):
 
 
 def blow_up(env, index, body):
-    """Give a body a velocity whose square overflows, without the environment."""
+    """Give a body a velocity whose square overflows, behind the environment's back."""
     simulation = env.episodes.simulation
     client, scene = simulation.clients[index], simulation.scene
     if body == "object":
@@ -117,7 +117,9 @@ def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
             if step == diverges:
                 assert ours["done"][1] and not ours["success"][1]
                 ours = env.reset(ours.set("_reset", only_1)).exclude("_reset")
-                for _ in range(2):  # the divergence began an episode, too
+                for _ in range(
+                    2
+                ):  # the first of these episodes began after the divergence
                     theirs = other.reset(theirs.set("_reset", only_1))
                 theirs = theirs.exclude("_reset")
 

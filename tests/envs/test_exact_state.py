@@ -39,7 +39,7 @@ def follow(env, td, actions):
     ["PandaPush-v1", "PandaSlideJoints-v3", "PandaPickAndPlace-v1", "PandaStack-v3"],
 )
 def test_an_episode_continues_bit_for_bit(env_id):
-    """With hard contacts, and different numbers of steps per environment."""
+    """The environments have hard contacts and have taken different numbers of steps."""
     rngs = [np.random.default_rng(k) for k in range(NUM_ENVS)]
     with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=2, seed=1) as env:
         td = act(env, env.reset(), env_id, rngs, 12)
@@ -57,7 +57,7 @@ def test_an_episode_continues_bit_for_bit(env_id):
             assert torch.equal(again[key], td[key]), key
         assert (env.get_state(exact=True) == state).all()
         assert (follow(env, again, actions) == expected).all()
-    # And in another environment.
+    # Continue the episode in another environment, too.
     with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=1) as other:
         again = other.reset(state.clone(), set_state=True)
         assert (follow(other, again, actions) == expected).all()
@@ -74,7 +74,7 @@ def test_without_actions_and_unbatched():
         again = env.reset(state, set_state=True)
         actual = env.step(again.set("action", action))["next"]
         assert (actual == expected).all()
-        # Sensors say what they said, not that no time has passed.
+        # Sensors have the same readings as before, not those of a start.
         again = env.reset(later, set_state=True)
         assert torch.equal(again["joint_torque"], expected["joint_torque"])
 
@@ -85,7 +85,7 @@ def test_a_partial_reset_restores_only_its_own():
         td = env.rollout(5)[:, -1]["next"].exclude("reward")
         mask = torch.tensor([True, False])
         env.step(td.clone().set("action", torch.ones(2, 3)).set("_step", mask))
-        mask[:] = True  # which changes nothing of what has been
+        mask[:] = True  # the history must have its own copy of the mask
         state = env.get_state(exact=True)
         assert state["num_actions"].flatten().tolist() == [6, 5]
         action = torch.ones(2, 3)

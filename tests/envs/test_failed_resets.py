@@ -51,7 +51,7 @@ def test_environments_recover_from_physics_that_cannot_be_varied():
             env.reset(env.rand_action().set("_reset", mask))
         with pytest.raises(BulletError, match=r"environments \[0\] .*reset failed"):
             env.step(env.rand_action())
-        # That environment is reset, too, whatever else is.
+        # A reset of another environment also resets this one.
         env.reset(env.rand_action().set("_reset", ~mask))
         exact = env.get_state(exact=True)
         env.reset(exact, set_state=True)
@@ -119,4 +119,4 @@ def test_a_diverged_step_does_not_count_as_success():
             ends = [after[key].item() for key in ("success", "terminated", "truncated")]
             assert ends == [False, False, True]
             assert after["done"]
-    assert solved  # where it could be taken for one
+    assert solved  # some of these states would have counted as success

@@ -35,7 +35,7 @@ def test_goal_indices_are_the_achieved_goal_of_every_id(env_id):
 
 
 class Undeclared(Push):
-    """Overrides `observation` without declaring ``goal_entries`` anew."""
+    """Overrides `observation` without declaring ``goal_entries`` again."""
 
     def observation(self, simulation):
         return super().observation(simulation).flip(1)

@@ -14,7 +14,8 @@ from tests.envs.test_parity import choose_action
 
 pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
-# Of other episodes. Times 20 substeps they differ modulo any power of two above 4.
+# Lengths of the earlier episodes [steps]. Their numbers of substeps, 20 per step,
+# differ modulo every power of two above 4.
 HISTORY = (41, 50, 57)
 
 

@@ -22,7 +22,7 @@ def no_collection():
 
 
 def test_a_rebound_environment_is_gone_at_once(no_collection):
-    """Without the garbage collector, because no cycle of references exists."""
+    """No cycle of references exists, so the garbage collector is not needed."""
     env = torch_panda.make(
         "PandaPush-v1",
         num_envs=2,
@@ -61,7 +61,7 @@ def test_a_subclass_with_arguments_pickles():
             assert (copy.friction, copy.max_episode_steps) == (0.7, 9)
             assert copy.task.object_friction == 0.7
             assert (copy.reset() == env.reset()).all()
-            # And a copy's copy.
+            # A copy of a copy is the same, too.
             with pickle.loads(pickle.dumps(copy)) as second:
                 assert second.friction == 0.7
 

@@ -60,7 +60,7 @@ def make(env_id="PandaPush-v1", **options):
 
 
 def own_threads():
-    """Number of threads of this process, including threads of C."""
+    """Number of threads of this process, of Python and of C."""
     return len(os.listdir("/proc/self/task"))
 
 
@@ -132,7 +132,7 @@ def test_as_many_threads_as_environments_give_the_same_numbers():
 @needs_native
 @pytest.mark.parametrize(
     "n_substeps", [1, 7]
-)  # fewer than a piece has; not a multiple of it
+)  # fewer substeps than in a piece; a number that is not a multiple of a piece
 def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
     def rollout(num_threads):
         physics = PhysicsParams(n_substeps=n_substeps)
@@ -147,7 +147,7 @@ def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
 
 @needs_native
 def test_an_arm_alone(monkeypatch):
-    """The only body has no second one to make a pair of the broad phase."""
+    """With a single body, the broad phase has no pair that resets its cursor."""
 
     def build(client):
         arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
@@ -233,7 +233,7 @@ def test_a_reset_that_fails(env):
         assert caught.value.index == 2
         for _ in range(2):
             other.reset()
-        # The others were reset, but steps are refused until all are.
+        # The others were reset, but steps are refused until all environments are reset.
         for key in ("joint_position", "object_pose", "ee_position"):
             ours = getattr(env.episodes.simulation, key)[:2]
             theirs = getattr(other.episodes.simulation, key)[:2]
@@ -362,7 +362,7 @@ def test_denormal_numbers_are_not_flushed_to_zero(monkeypatch):
     finally:
         torch.set_flush_denormal(False)
     assert (velocity > 0).all()
-    assert (velocity < tiny).all()  # Bullet damps it
+    assert (velocity < tiny).all()  # Bullet damps the velocity
 
 
 # ---- which loop ----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Threads, seeds and deaths in worker processes."""
+"""Threads, seeds and killed workers in multi-process collectors."""
 
 import os
 import signal
@@ -39,7 +39,7 @@ def test_parallel_env():
         rollouts.append(e.rollout(STEPS, go_for_the_goal))
     serial.close()
     check_threads(rollouts[0])
-    # The workers draw what their seeds say, in every run and in any process.
+    # The draws of a worker depend on its seed only, in every run and in any process.
     for key in ("desired_goal", ("next", "observation")):
         assert torch.equal(rollouts[0][key], rollouts[1][key])
     assert len(goals(rollouts[0])) == 2 * NUM_ENVS
@@ -74,7 +74,7 @@ def test_collectors(collector_class):
         for data in collector:
             check_threads(data)
             seen.update(goals(data))
-            # Both workers have drawn what they draw in any run of this seed.
+            # Both workers drew the same goals as in any other run with this seed.
             if killed is None and expected <= seen:
                 killed = kill(workers[1])
     pid, start = killed
@@ -92,7 +92,7 @@ def first_goals(seed, num_workers):
             make_env, go_for_the_goal, frames_per_batch=NUM_ENVS, total_frames=NUM_ENVS
         )
         seed = collector.set_seed(seed)
-        collector.reset()  # as multi-process collectors do when they are seeded
+        collector.reset()  # multi-process collectors do this when they get a seed
         drawn |= goals(next(iter(collector)))
         collector.shutdown()
     return drawn

@@ -18,7 +18,7 @@ from tests.envs import record_panda_gym_1_1_0 as old
 from tests.ids import PHYSICS_IDS
 from tests.panda_gym_reference import make_reference, start
 
-# Those of ours that panda-gym, which the reference imports, has registered.
+# Our ids that panda-gym has registered; the reference imports panda-gym.
 V3_IDS = [env_id for env_id in PHYSICS_IDS if env_id in gymnasium.registry]
 pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
@@ -32,7 +32,7 @@ def choose_action(env_id, observation, rng, size):
         # Bend down onto the table.
         action[1] += 2.0
     elif len(observation) > 7 and rng.random() < 0.8:
-        first = size - 3 + 6  # the robot's part is one longer with a gripper
+        first = size - 3 + 6  # with a gripper, the robot's part has one more entry
         towards = observation[first : first + 3] - observation[:3]
         action[:3] = towards * 30 + rng.normal(size=3) * 0.3
     return action.astype(np.float32)
@@ -47,7 +47,7 @@ def had_contact(reference):
 
 
 def make_v1(task, **options):
-    """The -v1 environment; Slide with the goals of 1.1.0, which are not the paper's."""
+    """The -v1 environment, with 1.1.0's goals in Slide, which are not the paper's."""
     if task != "Slide":
         return torch_panda.make(f"Panda{task}-v1", **options)
     return torch_panda.RobotTaskEnv(
@@ -77,12 +77,12 @@ def test_v1_equals_panda_gym_1_1_0(task):
     episodes, steps, _ = recorded["action"].shape
     assert episodes >= 4
     touched, grasped = (recorded[key].sum(1) for key in ("touched", "grasped"))
-    if task != "Reach":  # its episodes press on the table at most
+    if task != "Reach":  # Reach has no object; the hand only presses on the table
         assert touched.min() >= 9
     if task in ("PickAndPlace", "Stack"):
         assert grasped.min() >= 4
     keys = ["observation", "achieved_goal"]
-    if task != "Stack":  # whose success is the paper's
+    if task != "Stack":  # -v1 has the paper's success for Stack, which 1.1.0 has not
         keys += ["reward", "success"]
     differing = set()
     with make_v1(task, num_envs=episodes, seed=3) as env:
@@ -160,8 +160,8 @@ def test_equals_panda_gym(env_id):
             assert torch.equal(ours["reward"], rewards.float())
             goals = ours["achieved_goal"], ours["desired_goal"]
             rewards = torch.tensor([[dense_reward(r)] for r in references])
-            # panda-gym measures to the float64 goal, we to the float32 goal that both
-            # emit: a dense reward may differ in its last bits.
+            # panda-gym computes the distance to the float64 goal, and we to the float32
+            # goal that both return: a dense reward may differ in its last bits.
             torch.testing.assert_close(
                 dense_task.compute_reward(*goals), rewards.float(), rtol=0.0, atol=1e-6
             )

@@ -174,7 +174,7 @@ def test_the_first_call_must_be_a_reset(env):
         other.reset()
         assert (env.get_state() == other.get_state()).all()
     env.set_seed(1)
-    env.step(action)  # a new seed is for the next episode
+    env.step(action)  # a new seed takes effect in the next episode
 
 
 def test_partial_reset_leaves_the_others_alone(env):
@@ -208,7 +208,7 @@ def test_partial_step_leaves_the_others_alone(env):
 
 @pytest.mark.parametrize("num_envs", [None, 3])
 def test_a_step_equals_torchrls_own_step(num_envs):
-    """Also where it skips torchrl's checks of the result of `_step`."""
+    """`step` skips torchrl's checks of the result, but returns the same result."""
     steps = []
     for step in (torch_panda.RobotTaskEnv.step, EnvBase.step):
         with torch_panda.make("PandaPush-v1", num_envs=num_envs, seed=0) as env:
@@ -374,7 +374,7 @@ def test_large_actions_are_clipped(env):
         ({"num_threads": 2.5}, TypeError),
         ({"seed": -1}, ValueError),
         ({"seed": 1.5}, TypeError),
-        ({"render_size": 64}, ValueError),  # of no picture
+        ({"render_size": 64}, ValueError),  # without pixels, nothing is rendered
         ({"camera": torch_panda.Camera()}, ValueError),
     ],
 )

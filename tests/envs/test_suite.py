@@ -1,4 +1,4 @@
-"""Tests that run over every id. They find a new task by its registration.
+"""Tests that run over every registered id, so they include every new task.
 
 The expected sizes are read from the task and the robot of an id. The sizes of the ids
 of the paper and of panda-gym are fixed in `test_sizes_of_the_contract`.
@@ -166,7 +166,7 @@ def test_starts_differ(env):
 
 
 def test_same_seed_same_trajectory(env, env_id):
-    """For any number of threads, and whatever the environment did before."""
+    """Neither the number of threads nor earlier episodes change a trajectory."""
     torch.manual_seed(0)
     expected = env.rollout(15, break_when_any_done=False)
     with torch_panda.make(env_id, num_envs=NUM_ENVS, num_threads=1, seed=0) as other:

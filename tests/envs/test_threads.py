@@ -118,7 +118,7 @@ def test_threads_may_build_environments_of_their_own_at_the_same_time():
 
 
 def test_threads_share_one_scratch_directory(monkeypatch):
-    """Even if making it takes long: no folder of a thread is deleted."""
+    """All threads use one directory, even if creating it takes long."""
 
     @functools.cache
     def make_slowly():

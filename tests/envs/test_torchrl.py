@@ -83,7 +83,7 @@ def test_a_state_transform_passes_states_on():
     check_env_specs(env)
     rollout = env.rollout(8)
     now = rollout[..., 5]
-    # StepCounter's count is beside the state's, and begins anew.
+    # The state has its own step count. That of StepCounter starts at zero again.
     assert torch.equal(now["state", "step_count"], now["step_count"])
     start = env.reset(now.select("state"), set_state=True)
     assert (start["state"] == now["state"]).all()

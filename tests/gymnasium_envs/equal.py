@@ -4,7 +4,7 @@ import numpy as np
 
 
 def assert_equal(ours, theirs, where=""):
-    """Same nesting, keys, types, dtypes, shapes and values."""
+    """Assert equal nesting, keys, types, dtypes, shapes and values."""
     assert type(ours) is type(theirs), where
     if isinstance(ours, dict):
         assert ours.keys() == theirs.keys(), where

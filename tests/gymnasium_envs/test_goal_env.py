@@ -15,7 +15,7 @@ from torch_panda.gymnasium_envs import GoalEnv
 
 # check_env advises against spaces without bounds; positions have none.
 NO_BOUNDS = "ignore:.*A Box observation space"
-# To Gymnasium -v3 is the successor of -v1; here they are different tasks.
+# Gymnasium takes -v3 for the successor of -v1; here they are different tasks.
 NOT_OLD = r"ignore:.*torch_panda/Panda\w+-v1 is out of date"
 
 
@@ -51,7 +51,7 @@ def test_goals_that_are_observations():
         env.close()
 
 
-# Each task, control, reward and version once; what an id means is tested elsewhere.
+# Each task, control type, reward and version once; other tests cover all ids.
 @pytest.mark.parametrize(
     "env_id",
     [

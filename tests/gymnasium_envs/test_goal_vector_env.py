@@ -17,7 +17,8 @@ from tests.gymnasium_envs.equal import assert_equal
 from torch_panda.gymnasium_envs import GoalVectorEnv
 
 NUM_ENVS = 3
-# Success ends episodes of Reach-v3 at different times, time ends them in the others.
+# In Reach-v3, success ends episodes at different times. In the others, the time limit
+# ends them.
 CASES = [("PandaReach-v3", None), ("PandaPushDense-v1", 7)]
 
 
@@ -65,7 +66,7 @@ def test_values_equal_those_of_sync_vector_env(env_id, limit, mode):
         if mode is AutoresetMode.DISABLED and ended.any():
             with pytest.raises(ResetNeeded, match=str(int(ended.nonzero()[0][0]))):
                 ours.step(actions)
-            # Some with a new seed, the others with their next episode.
+            # Some environments get a new seed, the others start their next episode.
             seeds = [7, None, step]
             result = ours.reset(seed=seeds, options={"reset_mask": ended})
             options = {"reset_mask": ended}

@@ -51,7 +51,7 @@ def test_hindsight_trains(make_env):
         "compute_reward", achieved_goal, desired_goal, [], indices=[0]
     )
     assert np.array_equal(batch.rewards.numpy()[:, 0], expected)
-    # Goals that were reached, and steps whose goal was not.
+    # There are rewards of steps that reached the goal, and of steps that did not.
     assert (expected == 0).any()
     assert (expected == -1).any()
     env.close()

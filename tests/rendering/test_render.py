@@ -37,7 +37,7 @@ def render_reference(reference):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_pictures_equal_those_of_panda_gym(task):
-    """Except for targets, which panda-gym draws opaque."""
+    """Only targets differ, because panda-gym draws them opaque."""
     reference = make_reference(
         f"Panda{task}-v3", render_width=WIDTH, render_height=HEIGHT
     )

@@ -1,4 +1,4 @@
-"""The viewer in the browser: it shows the environments, to its own page only."""
+"""The viewer in the browser shows environments, and serves its own page only."""
 
 import socket
 from http.client import HTTPConnection
@@ -93,7 +93,7 @@ def test_pause_goes_back_and_on(env):
         # viser does not send movements of a few micrometres.
         np.testing.assert_allclose(cube.position, shown[1][1], atol=1e-5)
         env.step(env.full_action_spec.rand())
-        viewer.update()  # recorded, not shown
+        viewer.update()  # records the state, but does not show it
         assert viewer._step.value == 2
         viewer._pause.value = False
         assert not viewer.paused

@@ -1,4 +1,4 @@
-"""Where the packed solver must run: the other tests are skipped without it."""
+"""The packed solver must run where pybullet has a wheel, or its tests are skipped."""
 
 import platform
 import sys

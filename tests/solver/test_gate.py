@@ -1,4 +1,4 @@
-"""The gate: where a condition does not hold, Bullet's own functions run."""
+"""If a condition of the gate does not hold, Bullet's own functions run."""
 
 import ctypes
 import os
@@ -18,7 +18,7 @@ pytestmark = needs_packed
 
 @pytest.fixture
 def closed(monkeypatch):
-    """A process in which nothing is replaced yet, and nothing may be enabled."""
+    """Pretend that nothing was replaced yet, and forbid to enable the replacement."""
     solver = gate.load_library()
     solver.uninstall()
     replacements = gate.find_replacements(library.library_path())
@@ -130,7 +130,8 @@ def test_function_that_is_not_in_the_table(closed, monkeypatch):
     ],
 )
 def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
-    # The scene contradicts the expectation, as it does where a field is elsewhere.
+    # Expect wrong numbers of the scene: the probe then reports a field, as it would if
+    # the field were at another offset.
     probe = native.SolverLibrary.set_mode
 
     def set_mode(self, mode, expectation=None):

@@ -227,7 +227,7 @@ def test_box_wedged_between_fingers():
 
 @pytest.mark.parametrize("last_force", [1e280, math.inf, math.nan])
 def test_diverging_simulation(last_force):
-    """Where numbers become infinite or undefined, Bullet's function takes over."""
+    """If numbers become infinite or NaN, Bullet's function takes over."""
 
     def fill(world):
         world.ground()

@@ -159,6 +159,6 @@ def test_soak():
 @pytest.mark.parametrize("env_id", PHYSICS_IDS)
 def test_many_seeds(env_id, seed, randomize, physics):
     options = {} if randomize is None else {"randomize": randomize}
-    # Groups are left where an object touches the base and another one the hand.
+    # Bullet solves groups in which one object touches the base and another the hand.
     build = environment(env_id, seed=seed, physics=physics, **options)
     assert_same(build, 120, leaves_groups=None)
