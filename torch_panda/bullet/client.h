@@ -148,13 +148,14 @@ int client_reset(struct batch *batch, int env);
 /* Take up to `piece` substeps of a step. Return 1 if substeps remain, else 0. */
 int client_take_piece(struct batch *batch, int env, int piece);
 
-struct gripper { /* Gripper of gripper.py, with two joints */
+struct gripper { /* Gripper of gripper.py, if it has two joints */
     int column; /* of the first joint's position in the row of a client */
     float scale;
     double weights[2], offset, closed[2], per_width[2];
 };
 
-struct actuation { /* Robot.setpoint; setpoints are targets, then other joints */
+/* What Robot.setpoint computes. A setpoint has the targets, then the other joints. */
+struct actuation {
     int row_size;
     int column, num_displaced; /* numbers in the row that an action displaces */
     int has_limits, num_resting, has_gripper;
@@ -165,7 +166,7 @@ struct actuation { /* Robot.setpoint; setpoints are targets, then other joints *
 };
 
 enum { WIDTH = -1 }; /* the column of the distance between the fingers */
-struct observation { /* EpisodeObserver of observer.py */
+struct observation { /* what EpisodeObserver of observer.py observes */
     int row_size, size, goal_size;
     const int *columns, *goal_columns; /* of entries in the row of a client */
     struct gripper gripper;

@@ -225,15 +225,16 @@ class Observation(Structure):
     )
 
 
-# The column of `Observation` that stands for the distance between the fingers.
+# Entry of `Observation.columns` for the distance between the fingers, which is not a
+# column of the state.
 WIDTH = -1
 
 
 class Library:
     """The functions of the library.
 
-    Calls release the GIL, except those whose names start with ``environment_``: they
-    take less time than giving the GIL away and getting it back.
+    Calls release the GIL, except those of functions whose names start with
+    ``environment_``. These are so short that releasing the GIL would take longer.
 
     Args:
         path: Path of the compiled file.

@@ -1,4 +1,4 @@
-"""Functions that select entries of the state, which C code then copies."""
+"""Methods that only select entries of the state, so that C code can do their work."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -17,10 +17,10 @@ _selectors: WeakSet[Callable[..., Tensor]] = WeakSet()
 def selects_state(function: _Function) -> _Function:
     """Declare that a method of a task or robot only selects entries of the state.
 
-    Each entry of its result must always be the same entry of ``simulation.state``,
-    in every environment. The compiled library then copies the entries, which takes less
-    time than the method. A method that overrides this one is called as usual, unless it
-    is declared too.
+    Each entry of its result must be an entry of ``simulation.state``, and the same one
+    in every call and every environment. The compiled library then copies these entries
+    instead of calling the method, which saves time. A method of a subclass that
+    overrides this one is called as usual, unless it is declared too.
     """
     _selectors.add(function)
     return function
@@ -41,6 +41,7 @@ def selected_columns(
         return None
     rows = simulation.state.rows
     saved = rows.clone()
+    # Replace each entry of the state by its index, and see which indices are returned.
     numbers = torch.arange(rows.numel(), dtype=rows.dtype, device="cpu").view_as(rows)
     try:
         rows.copy_(numbers)

@@ -1,4 +1,4 @@
-"""Observes states and goals in C."""
+"""Computes observations, goals, success, reward and the ends of episodes in C."""
 
 import torch
 from torch import Tensor
@@ -13,19 +13,20 @@ from torch_panda.tasks import Task
 Observed = dict[str, Tensor]
 """Observed entries of all environments, (n, ...) by key, in new tensors."""
 
-# The methods from which success and sparse reward are the distance of two positions.
+# If a task overrides none of these methods, its success and its sparse reward depend on
+# the distance of the two goals only, and C code can compute them.
 _DISTANCE_METHODS = ("distance", "success_distance", "is_success", "compute_reward")
 
 
 class CompiledObserver:
-    """Computes the same numbers as robot and task, in less time.
+    """Computes in C the numbers that functions of robot and task compute in torch.
 
     Args:
         robot: The robot.
         task: The task.
         simulation: The environments, which the native loop steps.
-        columns: Columns of the rows of the state that are the observation.
-        goal_columns: Columns that are the achieved goal.
+        columns: Columns of ``simulation.state.rows`` that make up the observation.
+        goal_columns: Columns that make up the achieved goal.
         max_episode_steps: Number of steps after which an episode is ``truncated``.
         terminate_on_success: Whether success ends an episode.
     """
@@ -112,9 +113,10 @@ class CompiledObserver:
             step_count: Number of steps of the present episodes, (n, 1) int64.
 
         Returns:
-            Observation, goals, reward, success and ends; and whether reward, success
-            and ends are valid. They are not if the task defines its own or is
-            rewarded densely, or if the rounding of torch decides.
+            The observed entries with the reward; and whether reward, success and ends
+            are valid. They are not valid if the task defines its own success or reward,
+            if the reward is dense, or if a goal is so close to the threshold that the
+            rounding of torch decides.
         """
         observed = {key: torch.empty_like(t) for key, t in self._templates.items()}
         description, task = self._description, self._task

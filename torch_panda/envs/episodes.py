@@ -338,6 +338,7 @@ class Episodes:
     def _read_action(self, action: Tensor | None) -> Tensor:
         """Check and clip an action; return it as (n, action_dim) float32."""
         shape = self._action_shape
+        # C code clips most actions faster than torch does.
         if (
             native.LIBRARY is not None
             and self.simulation.is_native

@@ -133,7 +133,11 @@ class EpisodeObserver:
         return observed
 
     def _observe_goals(self, goal: Tensor) -> Observed:
-        """Observation and goals, for desired goals (n, goal_dim)."""
+        """Compute observation and goals with torch.
+
+        Args:
+            goal: Desired goals, (n, goal_dim).
+        """
         task, simulation = self._task, self._simulation
         observation = torch.cat(
             (self._robot.observation(simulation), task.observation(simulation)), dim=1
@@ -149,7 +153,7 @@ class EpisodeObserver:
     def _add_outcome(
         self, observed: Observed, step_count: Tensor, action: Tensor | None
     ) -> None:
-        """Add success, ends and after a step the reward; see `observe`."""
+        """Compute success and ends with torch, after a step also the reward."""
         goals = observed["achieved_goal"], observed["desired_goal"]
         observed["success"] = self._task.is_success(*goals)
         observed |= self._ends(observed["success"], step_count)
