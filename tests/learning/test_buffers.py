@@ -6,7 +6,7 @@ import torch
 import torch_panda
 from tests.learning.episodes import play_randomly
 from torch_panda.learning import buffers
-from torch_panda.learning.buffers import find_motion, make_buffer, select_episodes
+from torch_panda.learning.buffers import has_moved, make_buffer, select_episodes
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_episodes_in_which_nothing_moved(stack):
     goal[:] = goal[:, :1]
     goal[1, 60:, 4] += 0.02
     goal[2, :3, 2] += 0.05  # before the objects have settled
-    assert find_motion(data).tolist() == [False, True, False, False]
+    assert has_moved(data).tolist() == [False, True, False, False]
     torch.manual_seed(0)
     kept = [len(select_episodes(data.clone(), 0.25)) for _ in range(200)]
     assert abs(sum(kept) / 200 - (1 + 3 / 4)) < 0.2
@@ -97,4 +97,4 @@ def test_short_episodes_in_which_something_moved(stack):
     goal = data["next", "achieved_goal"]
     goal[:] = goal[:, :1]
     goal[1, 2, 4] += 0.02
-    assert find_motion(data).tolist() == [False, True, False, False]
+    assert has_moved(data).tolist() == [False, True, False, False]

@@ -5,7 +5,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 import torch_panda
-from torch_panda.learning.starts import PHYSICAL, StartFrom, states_at_objects
+from torch_panda.learning.starts import PLACED_KEYS, StartFrom, states_at_objects
 
 NUM_ENVS = 8
 
@@ -119,7 +119,7 @@ def test_ratio_of_the_episodes(states):
         )
         td = env.rollout(3)
         assert td.batch_size == (NUM_ENVS, 3)
-        assert not set(PHYSICAL) & set(td.keys())
+        assert not set(PLACED_KEYS) & set(td.keys())
 
 
 def test_partial_reset_leaves_the_others_alone(states):

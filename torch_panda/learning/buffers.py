@@ -85,7 +85,7 @@ def make_buffer(
     return TensorDictReplayBuffer(storage=storage, transform=transform)
 
 
-def find_motion(data: TensorDictBase) -> Tensor:
+def has_moved(data: TensorDictBase) -> Tensor:
     """Find the episodes in which the achieved goal changed.
 
     In an episode without motion every hindsight goal is achieved already, so it teaches
@@ -119,5 +119,5 @@ def select_episodes(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase
     if keep_unmoved == 1:
         return data
     is_kept = torch.rand(len(data)) < keep_unmoved
-    rows = find_motion(data) | is_kept.to(data.device)
+    rows = has_moved(data) | is_kept.to(data.device)
     return data[rows]  # type: ignore[return-value]  # a TensorDict

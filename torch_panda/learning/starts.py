@@ -25,7 +25,7 @@ GAP = (0.055, 0.08)
 LIFTED = (0.12, 0.2)
 ROOM = 0.08  # smallest distance between the centres of two objects [m]
 OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # action of a hand that waits
-PHYSICAL = ["joint_position", "joint_velocity", "object_pose", "object_velocity"]
+PLACED_KEYS = ["joint_position", "joint_velocity", "object_pose", "object_velocity"]
 
 
 def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict:
@@ -87,7 +87,7 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 arrived = arrived | waits
                 action = torch.where(waits, torch.tensor(OPEN_HAND), action)
             td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
-        state = env.get_state().select(*PHYSICAL).set("placed", placed)
+        state = env.get_state().select(*PLACED_KEYS).set("placed", placed)
     speed = state["object_velocity"].abs().flatten(1).amax(1, keepdim=True)
     return state[(arrived & (speed < 0.1)).squeeze(1)]
 

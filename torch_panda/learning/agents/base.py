@@ -17,7 +17,7 @@ from torch_panda.learning.normalizer import Normalizer
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
-STATE_KEYS: list[NestedKey] = ["observation", "desired_goal"]
+POLICY_INPUTS: list[NestedKey] = ["observation", "desired_goal"]
 LEARNING_RATE = 1e-3  # of actor and critic, from the panda-gym paper
 TAU = 0.05  # fraction that target networks move towards their networks
 
@@ -70,7 +70,7 @@ class Agent(nn.Module, ABC):
             noise: Modules that change ``action`` for exploration.
             trained: Parameters that the optimizer changes.
         """
-        normalize = TensorDictModule(self.normalizer, STATE_KEYS, ["normalized"])
+        normalize = TensorDictModule(self.normalizer, POLICY_INPUTS, ["normalized"])
         last: list[TensorDictModuleBase] = []
         if self.hp.fine_fingers:
             last = [TensorDictModule(from_fine, ["action"], ["action"])]
@@ -151,7 +151,7 @@ class Agent(nn.Module, ABC):
             The loss, a scalar without gradients.
         """
         rows = self._prepare(Transitions.from_tensordict(demos))
-        states = dict(zip(STATE_KEYS, (rows.observation, rows.goal), strict=True))
+        states = dict(zip(POLICY_INPUTS, (rows.observation, rows.goal), strict=True))
         normalize, actor = self.policy.module[:2]  # type: ignore[index]  # a ModuleList
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = normalize(demos.empty().update(states))
