@@ -2,11 +2,21 @@
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
 
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+
+def dot(first: Tensor, second: Tensor) -> Tensor:
+    """Inner products of vectors (..., n), (..., 1).
+
+    Elementwise operations give the same bits on every processor. torch's reductions do
+    not, because their kernels fuse multiplications and additions on some processors.
+    """
+    return reduce(torch.add, (first * second).unbind(-1)).unsqueeze(-1)
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
@@ -36,7 +46,7 @@ def rotation_distance(first: Tensor, second: Tensor) -> Tensor:
     Returns:
         (..., 1). It is the squared sine of half the angle between the rotations.
     """
-    return 1 - (first * second).sum(-1, keepdim=True).square()
+    return 1 - dot(first, second).square()
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
@@ -45,11 +55,16 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     As a rotation, it is ``second`` followed by ``first``, both about the world's axes.
     Equally, it is ``first`` followed by ``second`` about the axes turned by ``first``.
     """
-    first, second = torch.broadcast_tensors(first, second)
-    a, w = first[..., :3], first[..., 3:]
-    b, v = second[..., :3], second[..., 3:]
-    vector = w * b + v * a + torch.linalg.cross(a, b)
-    return torch.cat((vector, w * v - (a * b).sum(-1, keepdim=True)), dim=-1)
+    # Elementwise, for the reason that `dot` gives.
+    x, y, z, w = first.unbind(-1)
+    a, b, c, v = second.unbind(-1)
+    product = (
+        w * a + v * x + (y * c - z * b),
+        w * b + v * y + (z * a - x * c),
+        w * c + v * z + (x * b - y * a),
+        w * v - (x * a + y * b + z * c),
+    )
+    return torch.stack(product, dim=-1)
 
 
 def rotate_vector(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:

@@ -19,13 +19,13 @@ def record(format, out, env_id, episodes, seed=0, **options):
 
 
 def imitate(env, demos):
-    """The success rate of an agent after 300 gradient steps of imitation."""
+    """The success rate of an agent after 600 gradient steps of imitation."""
     torch.manual_seed(0)
     agent = make_agent(env, Hyperparameters())
     agent.normalizer.update(demos["observation"], demos["desired_goal"])
     buffer = make_demo_buffer(demos)
     untrained = evaluate_in(env, agent.policy, 16).success_rate
     assert untrained < 0.5
-    for _ in range(300):
+    for _ in range(600):
         agent.imitate(buffer.sample(128))
     return evaluate_in(env, agent.policy, 16).success_rate

@@ -8,6 +8,7 @@ import dense_ppo
 import gallery
 import numpy as np
 import own_task
+import panda_gym_judge
 import parallel
 import pixels
 import pytest
@@ -157,3 +158,15 @@ def test_the_gallery_refuses_an_episode_that_fails(monkeypatch):
     monkeypatch.setitem(gallery.SCENES, "Slide", (4, None))
     with pytest.raises(ValueError, match="Slide fails with seed 4"):
         gallery.play("Slide")
+
+
+def test_panda_gym_judges_as_our_own_environments_do(capsys):
+    ours = torch_panda.evaluate(
+        torch_panda.load_policy("PandaReach-v1"), "PandaReach-v3", episodes=30
+    )
+    result = panda_gym_judge.main("PandaReach-v1", "PandaReach-v3", episodes=30)
+    assert "success at the end   100.0%  [88.6%, 100.0%]" in capsys.readouterr().out
+    assert result.success_rate == ours.success_rate == 1.0
+    # Each step without success costs 1, in both.
+    assert torch.equal(result.returns, 1.0 - result.lengths)
+    assert abs(result.mean_length - ours.mean_length) < 1

@@ -1,8 +1,12 @@
-"""Record demonstrations of the scripted experts, and say how often they succeed.
+"""Record demonstrations of the scripted experts, or data sets for offline learning.
 
 python -m torch_panda record --env-id PandaPush-v1 --episodes 200 --out demos.pt
 python -m torch_panda record --format minari --out panda/push-expert-v0
 python -m torch_panda record --format lerobot --out push_lerobot
+python -m torch_panda record --kind play --transitions 100000 --out push_play.pt
+
+Demonstrations come with the success rate of the expert. The other kinds are the data of
+`torch_panda.datasets.generate`, and come with their hash.
 """
 
 from collections.abc import Sequence
@@ -11,29 +15,43 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from tqdm import tqdm
 
 import torch_panda
 from torch_panda.datasets.formats import Writer, load_format
+from torch_panda.datasets.generation import (
+    Kind,
+    episode_seed,
+    fixed_options,
+    generate_parts,
+    sha256,
+    size,
+)
+from torch_panda.datasets.parts import Parts
 from torch_panda.datasets.recording import TensorWriter, disturb, play
 from torch_panda.experts import make_expert
 from torch_panda.learning.evaluation import wilson_interval
+from torch_panda.learning.files import prepare, save
 from torch_panda.learning.limits import Finite, Positive, Seed, Weight, check_limits
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+
+# Pictures, which are no part of the hash.
+PIXELS = ("pixels", ("next", "pixels"))
 
 
 @dataclass
 class Args:
-    """Record demonstrations of a scripted expert."""
+    """Record demonstrations of a scripted expert, or a data set."""
 
     env_id: str = "PandaPush-v1"
     """task of the expert, with end-effector control"""
-    episodes: Positive = 200
-    """number of episodes"""
+    episodes: Positive | None = None
+    """number of demonstrations (kind "expert"); None means 200"""
     seed: Seed = 0
-    """seed of the environments"""
+    """seed of the environments, or of the data set"""
     num_envs: Positive = 32
     """number of environments that are stepped in parallel"""
     num_threads: Positive | None = None
@@ -48,11 +66,20 @@ class Args:
     """a file with a nested dict of tensors (transitions, ...), or a data set"""
     out: Path | None = None
     """file to write; for minari the id of the data set, for lerobot its folder; None
-    measures success only"""
+    measures the expert's success only"""
     image_size: Positive = 128
     """height and width of the pictures of a LeRobot data set [pixels]"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
+    kind: Literal["expert", Kind] = "expert"
+    """demonstrations ("expert"); or the data of `torch_panda.datasets.generate`: the
+    expert with noise on its actions ("noisy"), the expert pursuing goal after goal
+    without reset ("play"), or random actions ("random")"""
+    transitions: Positive | None = None
+    """number of transitions of the other kinds, rounded up to whole episodes; None
+    means 100,000"""
+    resume: bool = False
+    """continue a data set of the other kinds that was interrupted"""
 
 
 def print_success(env_id: str, success: list[Tensor]) -> None:
@@ -73,73 +100,193 @@ def print_success(env_id: str, success: list[Tensor]) -> None:
         )
 
 
-def open_writer(args: Args, env: torch_panda.RobotTaskEnv) -> Writer | None:
-    """Open the writer of the episodes; None if they are only counted.
+def open_writer(args: Args, out: Path, env: torch_panda.RobotTaskEnv) -> Writer:
+    """Open the writer of the episodes.
 
     Raises:
         ValueError: The library of the format is not installed, or refuses the name.
         OSError: The data cannot be written.
     """
-    if args.out is None:
-        return None
     if args.format == "tensors":
-        return TensorWriter(args.out)
-    return load_format(args.format).open_writer(args.out, args.env_id, env)
+        return TensorWriter(out)
+    return load_format(args.format).open_writer(out, args.env_id, env, args.kind)
+
+
+def check(args: Args) -> None:
+    """Check options before recording starts.
+
+    Raises:
+        ValueError: An option is out of its limits, or two do not fit together.
+    """
+    check_limits(args)
+    is_data = args.kind != "expert"
+    if is_data and (args.episodes is not None or args.noise_eps):
+        raise ValueError(
+            f"episodes and noise_eps do not work with the kind {args.kind}; use "
+            "transitions, or the kind expert"
+        )
+    if is_data and args.out is None:
+        raise ValueError(f"the kind {args.kind} needs a file or name to write, --out")
+    if not is_data and (args.transitions is not None or args.resume):
+        raise ValueError(
+            "transitions and resume do not work with the kind expert; use episodes, or "
+            "another kind"
+        )
+    if args.noise_eps and args.format == "minari":
+        raise ValueError(
+            "noise_eps does not work with the format minari, whose episodes hold "
+            "the executed actions"
+        )
+    if args.task_options and args.format != "tensors":
+        raise ValueError(
+            f"task_options do not work with the format {args.format}, whose data "
+            "sets are recreated from an id; use the format tensors"
+        )
+
+
+def make_options(args: Args) -> dict[str, Any]:
+    """Arguments of `torch_panda.make` that the options determine."""
+    options: dict[str, Any] = {"task_options": args.task_options}
+    if args.format == "lerobot":
+        options |= {"from_pixels": True, "render_size": args.image_size}
+    return options
 
 
 def main(args: Args) -> None:
-    """Play the episodes, print the success rates and save the transitions."""
+    """Record, and print what was recorded."""
     try:
-        check_limits(args)
+        check(args)
         import_modules(read_modules(args.imports))
-        expert: TensorDictModuleBase = make_expert(args.env_id)
-        if args.noise_eps and args.format == "minari":
-            raise ValueError(
-                "noise_eps does not work with the format minari, whose episodes hold "
-                "the executed actions"
-            )
-        if args.task_options and args.format != "tensors":
-            raise ValueError(
-                f"task_options do not work with the format {args.format}, whose data "
-                "sets are recreated from an id; use the format tensors"
-            )
-        pictures: dict[str, Any] = {}
-        if args.format == "lerobot":
-            pictures = {"from_pixels": True, "render_size": args.image_size}
-        env = torch_panda.make(
-            args.env_id,
-            num_envs=min(args.num_envs, args.episodes),
-            num_threads=args.num_threads,
-            seed=args.seed,
-            task_options=args.task_options,
-            **pictures,
-        )
-        writer = open_writer(args, env)
+        if args.kind == "expert":
+            record_demonstrations(args)
+        else:
+            record_data(args, args.kind)
     except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None
+    except KeyboardInterrupt:
+        raise SystemExit("stopped") from None
+
+
+def record_demonstrations(args: Args) -> None:
+    """Play episodes of the expert, print its success and save the transitions.
+
+    Raises:
+        ValueError: There is no expert for the id, or the format refuses the name.
+        TypeError: The task does not have one of the ``task_options``.
+        OSError: The data cannot be written.
+    """
+    expert: TensorDictModuleBase = make_expert(args.env_id)
+    episodes = args.episodes or 200
+    env = torch_panda.make(
+        args.env_id,
+        num_envs=min(args.num_envs, episodes),
+        num_threads=args.num_threads,
+        seed=args.seed,
+        **make_options(args),
+    )
+    writer = None if args.out is None else open_writer(args, args.out, env)
     expert = disturb(expert, env, args.noise_eps)
     success: list[Tensor] = []
     steps = 0
+    with env, tqdm(total=episodes, unit="episode", desc=args.env_id) as bar:
+        while len(success) < episodes:
+            first = len(success)
+            if args.format != "tensors":  # every episode stores its seed
+                for index in range(env.batch_size[0]):
+                    env.set_env_seed(index, args.seed + first + index)
+            new = play(env, expert)[: episodes - first]
+            for index, episode in enumerate(new, first):
+                success.append(episode["next", "success"])
+                if writer is not None:
+                    episode["action"] = episode.pop("intended")
+                    writer.add(episode, args.seed + index)
+                    steps += len(episode)
+            bar.update(len(new))
+    print_success(args.env_id, success)
+    if writer is not None:
+        print(f"{steps} transitions in {writer.close()}")
+
+
+def record_data(args: Args, kind: Kind) -> None:
+    """Generate a data set, save it, and print its hash.
+
+    Raises:
+        ValueError: The kind does not fit the id, the format refuses the name, or there
+            is no data set to resume.
+        TypeError: The task does not have one of the ``task_options``.
+        OSError: The data cannot be written.
+    """
+    assert args.out is not None
+    out = args.out
+    folder = out
+    if args.format == "tensors":
+        prepare(out)
+    else:
+        folder = load_format(args.format).find_folder(out)
+    transitions = args.transitions or 100_000
+    options = make_options(args)
+    recipe = {
+        "env_id": args.env_id,
+        "kind": kind,
+        "transitions": transitions,
+        "seed": args.seed,
+        "format": args.format,
+        **options,
+    }
+    parts = Parts(
+        folder.with_name(folder.name + ".unfinished"), recipe, resume=args.resume
+    )
+    num_episodes, steps = size(args.env_id, kind, transitions, **options)
     try:
-        with env, tqdm(total=args.episodes, unit="episode", desc=args.env_id) as bar:
-            while len(success) < args.episodes:
-                first = len(success)
-                if args.format != "tensors":  # every episode stores its seed
-                    for index in range(env.batch_size[0]):
-                        env.set_env_seed(index, args.seed + first + index)
-                new = play(env, expert)[: args.episodes - first]
-                for index, episode in enumerate(new, first):
-                    success.append(episode["next", "success"])
-                    if writer is not None:
-                        episode["action"] = episode.pop("intended")
-                        writer.add(episode, args.seed + index)
-                        steps += len(episode)
-                bar.update(len(new))
-        print_success(args.env_id, success)
-        if writer is not None:
-            print(f"{steps} transitions in {writer.close()}")
+        with tqdm(
+            total=num_episodes * steps,
+            initial=parts.num_episodes * steps,
+            unit="transition",
+            desc=f"{args.env_id} {kind}",
+        ) as bar:
+            for part in generate_parts(
+                args.env_id,
+                kind=kind,
+                transitions=transitions,
+                seed=args.seed,
+                num_envs=args.num_envs,
+                num_threads=args.num_threads,
+                progress=bar.update,
+                first=parts.num_episodes,
+                **options,
+            ):
+                parts.add(part)
+        data = TensorDict.cat([part.exclude(*PIXELS) for part in parts])
+        if args.format == "tensors":
+            save(out, data.to_dict())
+            place = str(out)
+        else:
+            place = write_episodes(args, out, parts)
     except KeyboardInterrupt:
-        raise SystemExit("stopped") from None
+        if not parts.num_episodes:
+            raise
+        raise SystemExit("stopped: the same command with --resume continues") from None
+    print(f"{data.numel()} transitions in {place}")
+    print(f"sha256 {sha256(data)}")
+    parts.remove()
+
+
+def write_episodes(args: Args, out: Path, parts: Parts) -> str:
+    """Write the episodes of all parts as a data set.
+
+    Returns:
+        Where it is, and how to read it.
+    """
+    options = {**make_options(args), **fixed_options(args.kind)}
+    with torch_panda.make(args.env_id, **options) as env:
+        writer = open_writer(args, out, env)
+        for part in parts:
+            goals = part["achieved_goal"], part["desired_goal"]
+            part["success"] = env.is_success(*goals)
+            for episode in part:
+                number = int(episode["collector", "traj_ids"][0])
+                writer.add(episode, episode_seed(args.seed, number))
+    return writer.close()
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -42,11 +42,11 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     else:
         content = files.read(path, "demonstrations", STORED_KEYS, finite=STORED_KEYS)
         try:
-            demos = TensorDict(content, [len(content["action"])]).select(*STORED_KEYS)
-        except (
-            RuntimeError,
-            TypeError,
-        ) as error:  # lengths or types differ
+            # (n,), or [episodes, steps] of the kinds other than expert.
+            shape = content["action"].shape[:-1]
+            demos = TensorDict(content, shape).select(*STORED_KEYS).reshape(-1)
+        # Lengths or types differ.
+        except (AttributeError, RuntimeError, TypeError) as error:
             raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")

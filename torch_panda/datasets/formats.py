@@ -41,8 +41,24 @@ class Writer(Protocol):
 class FormatModule(Protocol):
     """Interface of the modules ``minari_format`` and ``lerobot_format``."""
 
-    def open_writer(self, out: Path, env_id: str, env: RobotTaskEnv) -> Writer:
-        """Start a data set of transitions of this environment."""
+    def open_writer(
+        self, out: Path, env_id: str, env: RobotTaskEnv, kind: str = "expert"
+    ) -> Writer:
+        """Start a data set of transitions of this environment.
+
+        Args:
+            out: Folder or id of the data set.
+            env_id: Id of the environment.
+            env: The environment.
+            kind: What acts: "expert", or a kind of `torch_panda.datasets.generate`.
+        """
+
+    def find_folder(self, out: Path) -> Path:
+        """The folder that a new data set will have.
+
+        Raises:
+            ValueError: The name is invalid, or there is such a data set.
+        """
 
     def read(self, path: Path) -> TensorDict:
         """Read the transitions (n,) of a data set's folder, under our keys."""

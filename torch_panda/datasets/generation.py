@@ -5,7 +5,7 @@ number of environments and threads, and `sha256` shows whether they are the same
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -26,7 +26,6 @@ Kind = Literal["noisy", "play", "random"]
 PLAY_STEPS = 1000  # length of an episode of "play"
 HOLD_STEPS = 10  # steps for which "play" stays at a goal that it reached
 MAX_NOISE = 0.5  # largest standard deviation of the noise of "noisy"
-OBSERVED = ("observation", "achieved_goal", "desired_goal")
 
 
 def generate(
@@ -71,19 +70,53 @@ def generate(
             task cannot be changed during an episode ("play"), or a number is out of
             range.
     """
+    parts = generate_parts(
+        env_id,
+        kind=kind,
+        transitions=transitions,
+        seed=seed,
+        num_envs=num_envs,
+        num_threads=num_threads,
+        progress=progress,
+        **make_options,
+    )
+    return TensorDict.cat(list(parts))
+
+
+def generate_parts(
+    env_id: str,
+    *,
+    kind: Kind,
+    transitions: int,
+    seed: int,
+    num_envs: int,
+    num_threads: int | None = None,
+    progress: Callable[[int], object] | None = None,
+    first: int = 0,
+    **make_options: Any,  # noqa: ANN401 (those of `torch_panda.make`)
+) -> Iterator[TensorDict]:
+    """Generate the data set of `generate` in parts of at most ``num_envs`` episodes.
+
+    ``first`` is the number of the first episode, for a data set whose earlier episodes
+    exist. The other arguments are those of `generate`.
+
+    Yields:
+        Transitions [episodes, steps].
+
+    Raises:
+        ValueError: As for `generate`.
+    """
     if kind not in get_args(Kind):
         names = ", ".join(get_args(Kind))
         raise ValueError(f"kind must be one of {names}, got {kind!r}")
     check_positive(transitions=transitions, num_envs=num_envs)
     seed = check_seed(seed)
     expert = None if kind == "random" else make_expert(env_id)
-    if kind == "play":
-        make_options["max_episode_steps"] = PLAY_STEPS
-    make_options["terminate_on_success"] = False
-    steps = make_options.get("max_episode_steps") or max_episode_steps(env_id)
-    num_episodes = -(-transitions // steps)
-    num_envs = min(num_envs, num_episodes)
-    parts = []
+    make_options = {**make_options, **fixed_options(kind)}
+    num_episodes, steps = size(env_id, kind, transitions, **make_options)
+    num_envs = min(num_envs, num_episodes - first)
+    if num_envs < 1:
+        return
     with torch_panda.make(
         env_id, num_envs=num_envs, num_threads=num_threads, **make_options
     ) as env:
@@ -92,9 +125,9 @@ def generate(
                 'kind "play" needs goals that do not depend on how an episode starts, '
                 f'unlike those of {env_id}; use "noisy" or "random"'
             )
-        for first in range(0, num_episodes, num_envs):
-            numbers = torch.arange(first, min(first + num_envs, num_episodes))
-            episodes = _Episodes(env, expert, kind, seed, first)
+        for start in range(first, num_episodes, num_envs):
+            numbers = torch.arange(start, min(start + num_envs, num_episodes))
+            episodes = _Episodes(env, expert, kind, seed, start)
             rows = []
             for _ in range(steps):
                 rows.append(episodes.step())
@@ -102,8 +135,44 @@ def generate(
                     progress(len(numbers))
             part = TensorDict.stack(rows, 1)[: len(numbers)]
             part["collector", "traj_ids"] = numbers[:, None].repeat(1, steps)
-            parts.append(part)
-    return TensorDict.cat(parts)
+            yield part
+
+
+def fixed_options(kind: str) -> dict[str, Any]:
+    """The arguments of `torch_panda.make` that a kind fixes."""
+    options: dict[str, Any] = {"terminate_on_success": False}
+    if kind == "play":
+        options["max_episode_steps"] = PLAY_STEPS
+    return options
+
+
+def size(
+    env_id: str,
+    kind: Kind,
+    transitions: int,
+    **make_options: Any,  # noqa: ANN401 (those of `torch_panda.make`)
+) -> tuple[int, int]:
+    """Number of episodes of a data set, and their number of steps."""
+    options = {**make_options, **fixed_options(kind)}
+    steps = options.get("max_episode_steps") or max_episode_steps(env_id)
+    return -(-transitions // steps), steps
+
+
+def episode_seed(seed: int, number: int) -> int:
+    """Seed of the environment for an episode of a data set.
+
+    ``env.set_env_seed(index, episode_seed(seed, number))`` and a reset start this
+    episode again.
+    """
+    return _spawn(seed, number)[0]
+
+
+def _spawn(seed: int, number: int) -> tuple[int, np.random.Generator]:
+    """Seed of an episode's environment, and the generator of everything else."""
+    env_seed, other_seed = np.random.SeedSequence((seed, number)).spawn(2)
+    # set_env_seed takes an int64.
+    value = int(env_seed.generate_state(1, np.uint64)[0] >> 1)
+    return value, np.random.default_rng(other_seed)
 
 
 class _Episodes:
@@ -121,13 +190,12 @@ class _Episodes:
         self._generators = []
         noise = []
         for index in range(env.batch_size[0]):
-            sequence = np.random.SeedSequence((seed, first + index))
-            env_seed, other_seed = sequence.spawn(2)
-            # set_env_seed takes an int64.
-            env.set_env_seed(index, int(env_seed.generate_state(1, np.uint64)[0] >> 1))
-            self._generators.append(np.random.default_rng(other_seed))
+            env_seed, generator = _spawn(seed, first + index)
+            env.set_env_seed(index, env_seed)
+            self._generators.append(generator)
             noise.append(self._generators[-1].uniform(0.0, MAX_NOISE))
         self._noise = torch.tensor(noise, dtype=torch.float32).unsqueeze(1)
+        self._observed = [key for key in env.observation_spec if key != "success"]
         self._state = env.reset()
         if kind == "play":
             self._goal = self._state["desired_goal"].clone()
@@ -143,13 +211,13 @@ class _Episodes:
             The transitions of all environments, (num_envs,).
         """
         env = self._env
-        row = self._state.select(*OBSERVED)
+        row = self._state.select(*self._observed)
         if self._kind == "play":
             row["desired_goal"] = self._goal.clone()
         row["action"] = self._act(row)
         row = env.step(row)
         after: TensorDictBase = row["next"]  # type: ignore[assignment]
-        self._state = after.select(*OBSERVED)
+        self._state = after.select(*self._observed)
         if self._kind == "play":
             self._pursue(row)
         return row

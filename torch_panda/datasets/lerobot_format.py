@@ -5,6 +5,7 @@ The format has no place for the observation after an episode's last action.
 """
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -35,8 +36,7 @@ class LeRobotWriter:
     """
 
     def __init__(self, folder: Path, env_id: str, env: RobotTaskEnv) -> None:
-        if folder.exists():
-            raise ValueError(f"the folder {folder} exists already: choose another one")
+        find_folder(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         task = type(env.task)
@@ -44,6 +44,7 @@ class LeRobotWriter:
         self.instruction = (task.__doc__ or task.__name__).partition("\n")[0]
         # An unfinished data set has another name, so Ctrl-C leaves no broken one.
         self.unfinished = folder.with_name(folder.name + ".new")
+        shutil.rmtree(self.unfinished, ignore_errors=True)
         self.dataset = LeRobotDataset.create(
             repo_id=f"torch_panda/{env_id}",
             fps=FPS,
@@ -101,9 +102,22 @@ def features(env: RobotTaskEnv) -> dict[str, dict[str, object]]:
     return result
 
 
-def open_writer(out: Path, env_id: str, env: RobotTaskEnv) -> LeRobotWriter:
-    """Start a data set; ``out`` is its folder."""
+def open_writer(
+    out: Path, env_id: str, env: RobotTaskEnv, kind: str = "expert"
+) -> LeRobotWriter:
+    """Start a data set; ``out`` is its folder, and its ``kind`` is not stored."""
     return LeRobotWriter(out, env_id, env)
+
+
+def find_folder(out: Path) -> Path:
+    """The folder of a new data set, which is ``out``.
+
+    Raises:
+        ValueError: The folder exists.
+    """
+    if out.exists():
+        raise ValueError(f"the folder {out} exists already: choose another one")
+    return out
 
 
 def read(path: Path) -> TensorDict:
@@ -138,6 +152,8 @@ def read(path: Path) -> TensorDict:
     }
     for key, values in observed.items():
         data[key], data["next", key] = values[:-1], values[1:]
+    # The goal of a step, also where the next step pursues another one.
+    data["next", "desired_goal"] = data["desired_goal"]
     transitions: TensorDict
     transitions = TensorDict(data, [len(kept)])[kept]  # type: ignore[assignment]
     numbers = transitions["collector", "traj_ids"]

@@ -1,9 +1,11 @@
 """Minari's format (https://minari.farama.org): one folder holds all data sets by id."""
 
 import warnings
+from copy import deepcopy
 from importlib.metadata import version
 from pathlib import Path
 
+import gymnasium
 import minari
 import numpy as np
 import torch
@@ -15,6 +17,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch_panda import RobotTaskEnv
 
 OBSERVED = ("observation", "achieved_goal", "desired_goal")
+# What acted, by the kind of the data.
+ALGORITHMS = {
+    "expert": "the scripted expert of torch_panda.experts",
+    "noisy": "the scripted expert of torch_panda.experts, with noise",
+    "play": "the scripted expert of torch_panda.experts, pursuing goal after goal",
+    "random": "uniformly random actions",
+}
 
 
 class MinariWriter:
@@ -23,34 +32,26 @@ class MinariWriter:
     Args:
         dataset_id: Id of the data set, such as "panda/push-expert-v0".
         env_id: Id of the environment that was recorded.
+        env: The environment, for the options that its id does not fix.
+        kind: "expert", or a kind of `torch_panda.datasets.generate`.
 
     Raises:
         ValueError: The id is invalid, or a data set with this id exists.
     """
 
-    def __init__(self, dataset_id: str, env_id: str) -> None:
-        try:
-            parse_dataset_id(dataset_id)
-        except (ValueError, TypeError):  # TypeError: without a version
-            raise ValueError(
-                f"{dataset_id!r} is no id of a Minari data set: it must end in a "
-                "version, and a namespace must have at least two characters, as in "
-                "panda/push-expert-v0"
-            ) from None
-        if self.folder(dataset_id).exists():
-            raise ValueError(
-                f"the data set {dataset_id} exists already: choose another id"
-            )
-        self.dataset_id, self.env_id = dataset_id, env_id
+    def __init__(
+        self, dataset_id: str, env_id: str, env: RobotTaskEnv, kind: str
+    ) -> None:
+        self.folder = find_folder(Path(dataset_id))
+        self.dataset_id, self.env_id, self.kind = dataset_id, env_id, kind
+        self.spec = deepcopy(gymnasium.spec(f"torch_panda/{env_id}"))
+        self.spec.max_episode_steps = env.max_episode_steps
+        self.spec.kwargs["terminate_on_success"] = env.terminate_on_success
         self.episodes: list[EpisodeBuffer] = []
-
-    @staticmethod
-    def folder(dataset_id: str) -> Path:
-        """The folder in which Minari keeps a data set."""
-        return Path(get_dataset_path(dataset_id))
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
         """Add an episode: observations and success have one more entry than actions."""
+        success = torch.cat((episode["success"][:1], episode["next", "success"]))
         self.episodes.append(
             EpisodeBuffer(
                 id=len(self.episodes),
@@ -60,7 +61,7 @@ class MinariWriter:
                 rewards=after(episode, "reward"),
                 terminations=after(episode, "terminated"),
                 truncations=after(episode, "truncated"),
-                infos={"is_success": states(episode, "success").squeeze(-1)},
+                infos={"is_success": success.squeeze(-1).numpy()},
             )
         )
 
@@ -74,23 +75,43 @@ class MinariWriter:
             minari.create_dataset_from_buffers(
                 self.dataset_id,
                 self.episodes,
-                env=f"torch_panda/{self.env_id}",
-                algorithm_name="the scripted expert of torch_panda.experts",
+                env=self.spec,
+                algorithm_name=ALGORITHMS[self.kind],
                 description=f"{self.env_id}: import torch_panda before "
                 "recover_environment(); reset(seed=...) with the seed of an episode "
                 "starts it again",
                 requirements=[f"torch_panda=={version('torch_panda')}"],
                 data_format="hdf5",
             )
-        return (
-            f"minari.load_dataset({self.dataset_id!r}), "
-            f"in {self.folder(self.dataset_id)}"
-        )
+        return f"minari.load_dataset({self.dataset_id!r}), in {self.folder}"
 
 
-def open_writer(out: Path, env_id: str, env: RobotTaskEnv) -> MinariWriter:
+def open_writer(
+    out: Path, env_id: str, env: RobotTaskEnv, kind: str = "expert"
+) -> MinariWriter:
     """Start a data set; ``out`` is its id."""
-    return MinariWriter(out.as_posix(), env_id)
+    return MinariWriter(out.as_posix(), env_id, env, kind)
+
+
+def find_folder(out: Path) -> Path:
+    """The folder of a new data set with the id ``out``.
+
+    Raises:
+        ValueError: The id is invalid, or a data set with this id exists.
+    """
+    dataset_id = out.as_posix()
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):  # TypeError: without a version
+        raise ValueError(
+            f"{dataset_id!r} is no id of a Minari data set: it must end in a "
+            "version, and a namespace must have at least two characters, as in "
+            "panda/push-expert-v0"
+        ) from None
+    folder = Path(get_dataset_path(dataset_id))
+    if folder.exists():
+        raise ValueError(f"the data set {dataset_id} exists already: choose another id")
+    return folder
 
 
 def read(path: Path) -> TensorDict:
@@ -111,13 +132,15 @@ def read(path: Path) -> TensorDict:
         for key in OBSERVED:
             values = torch.as_tensor(episode.observations[key])
             data[key], data["next", key] = values[:-1], values[1:]
+        # The goal of a step, also where the next step pursues another one.
+        data["next", "desired_goal"] = data["desired_goal"]
         episodes.append(TensorDict(data, [len(done)]))
     return TensorDict.cat(episodes)
 
 
 def states(episode: TensorDictBase, key: str) -> np.ndarray:
     """The values of an entry in all states of an episode, (steps + 1, ...)."""
-    return torch.cat((episode[key][:1], episode["next", key])).numpy()
+    return torch.cat((episode[key], episode["next", key][-1:])).numpy()
 
 
 def after(episode: TensorDictBase, key: str) -> np.ndarray:

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from torch_panda.rotations import dot
 from torch_panda.rotations import quaternion_product as compose
 
 
@@ -32,8 +33,9 @@ def same_half(quaternion: Tensor) -> Tensor:
 def turn(axis: int, angle: Tensor) -> Tensor:
     """Rotations about a world axis by angles [rad] (..., 1), (..., 4)."""
     parts = [torch.zeros_like(angle)] * 3
-    parts[axis] = (angle / 2).sin()
-    return torch.cat((*parts, (angle / 2).cos()), -1)
+    half = angle.double() / 2  # rounded later, so that libraries' last bits drop out
+    parts[axis] = half.sin().to(angle)
+    return torch.cat((*parts, half.cos().to(angle)), -1)
 
 
 def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,9 +45,8 @@ def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         The distance that it leaves, and its angle [rad], (..., 1) each.
     """
     half_turn = compose(start.new_tensor((0.0, 1.0, 0.0, 0.0)), start)
-    cosine = (goal * start).sum(-1, keepdim=True)
-    sine = (goal * half_turn).sum(-1, keepdim=True)
-    angle = 2 * torch.atan2(sine, cosine)
+    cosine, sine = dot(goal, start), dot(goal, half_turn)
+    angle = 2 * torch.atan2(sine.double(), cosine.double()).to(start)
     angle = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
     return 1 - cosine.square() - sine.square(), angle
 
@@ -63,4 +64,4 @@ STRAIGHT = _straight_orientations()
 def straighten(cube: Tensor) -> Tensor:
     """The nearest of the 24 straight orientations, (..., 4)."""
     straight = STRAIGHT.to(cube)
-    return straight[(cube[..., None, :] * straight).sum(-1).abs().argmax(-1)]
+    return straight[dot(cube[..., None, :], straight).squeeze(-1).abs().argmax(-1)]

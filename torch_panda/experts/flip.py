@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torch_panda.experts.cube_orientations import best_pitch, compose, straighten, turn
 from torch_panda.experts.moves import GAIN, norm, open_to
+from torch_panda.rotations import dot
 from torch_panda.rotations import rotation_distance as distance
 
 # Distances between the fingers [m]: around the cube, closing on it, holding it firmly,
@@ -42,7 +43,7 @@ QUARTERS = torch.cartesian_prod(*[torch.tensor((0.0, 1.0, -1.0, 2.0))] * 2)
 TURNS = compose(
     *(turn(axis, QUARTERS[:, k : k + 1] * math.pi / 2) for axis, k in ((2, 1), (1, 0)))
 )
-TURN_COSTS = QUARTERS.abs() @ torch.tensor(((PITCH_COST,), (YAW_COST,)))
+TURN_COSTS = dot(QUARTERS.abs(), torch.tensor((PITCH_COST, YAW_COST)))
 
 
 class Table(NamedTuple):
@@ -227,7 +228,7 @@ def act(
     # Fingers that close on the centre straighten the cube. A straight cube is grasped
     # aside from its centre. A spinning cube is caught when it is nearly straight.
     now = straighten(cube)
-    tilt = 2 * (cube * now).sum(-1, keepdim=True).abs().clamp(max=1.0).acos()
+    tilt = 2 * dot(cube, now).abs().clamp(max=1.0).double().acos().to(cube)
     slow, straight = spin_z.abs() < 1.5, tilt < TILT
     aside = LAG - ASIDE * pitch.sign()
     aside = torch.where(swings & straight & slow, aside, 0.0)

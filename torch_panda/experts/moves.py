@@ -1,11 +1,14 @@
 """Moves that the scripted experts combine.
 
 Positions and offsets are in the world frame [m]. An action of 1 displaces the
-end-effector by 5 cm.
+end-effector by 5 cm. All arithmetic is elementwise, so that every processor computes
+the same bits and data sets have the same hashes everywhere.
 """
 
 import torch
 from torch import Tensor
+
+from torch_panda.rotations import dot
 
 GAIN = 0.8 / 0.05  # actions per metre, to cover 0.8 of an offset in one step
 GRIPPER = 0.2  # distance by which an action of 1 opens the fingers [m]
@@ -18,7 +21,7 @@ ROUGH = 0.25 * 9.81
 
 def norm(vector: Tensor) -> Tensor:
     """Lengths of vectors (..., n), (..., 1)."""
-    return torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    return dot(vector, vector).sqrt()
 
 
 def unit(vector: Tensor) -> Tensor:
@@ -59,11 +62,11 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     """
     offset, beside, height = (goal - cube)[..., :2], (ee - cube)[..., :2], cube[..., 2:]
     distance, direction = norm(offset), unit(offset)
-    along = (beside * direction).sum(-1, keepdim=True)
+    along = dot(beside, direction)
     lateral = beside - along * direction
     behind = torch.cat((cube[..., :2] - 0.06 * direction, height), -1)
     pushing = (along < -0.02) & (norm(lateral) < 0.02) & (ee[..., 2:] < height + 0.02)
-    left = distance - velocity.square().sum(-1, keepdim=True) / (2 * ROUGH)
+    left = distance - dot(velocity, velocity) / (2 * ROUGH)
     step = (0.5 * left).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
     # Leave a cube within 3 cm alone, because another approach would disturb it.

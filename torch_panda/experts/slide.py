@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.experts.moves import go_over, norm, unit
+from torch_panda.rotations import dot
 
 # Reach of the closed fingers from the end-effector along x and y, and the puck [m].
 FINGERS_X, FINGERS_Y, PUCK_RADIUS = 0.008, 0.0217, 0.029
@@ -88,7 +89,7 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
 
     def evaluate(polynomial: dict[str, float], aim: Tensor) -> Tensor:
         terms = strike_terms(polynomial, puck, distance, aim, side)
-        return (terms * terms.new_tensor([*polynomial.values()])).sum(-1, keepdim=True)
+        return dot(terms, terms.new_tensor([*polynomial.values()]))
 
     aim = direction
     for _ in range(3):  # correct the aim until the puck goes to the goal

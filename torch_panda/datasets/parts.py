@@ -1,0 +1,89 @@
+"""Parts of a data set that is being generated, in a folder until all are there."""
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from tensordict import TensorDict, TensorDictBase
+
+from torch_panda.learning import files
+
+RECIPE = "recipe.json"  # file of the options that determine the data
+
+
+class Parts:
+    """The folder of the finished parts, each a file named by its first episode.
+
+    Args:
+        folder: The folder.
+        recipe: Options that determine the data, as JSON has them.
+        resume: Whether to continue with the parts that the folder holds.
+
+    Raises:
+        ValueError: The folder holds no parts to resume, parts of another recipe, or
+            parts although ``resume`` is false.
+    """
+
+    def __init__(
+        self, folder: Path, recipe: Mapping[str, object], *, resume: bool
+    ) -> None:
+        self.folder, self._recipe = folder, recipe
+        file = folder / RECIPE
+        if not resume and file.exists():
+            raise ValueError(
+                f"{folder} holds a part of a data set: continue with --resume, or "
+                "remove the folder"
+            )
+        if resume and not file.exists():
+            raise ValueError(
+                f"there is no data set to resume in {folder}: start without --resume"
+            )
+        if not resume:
+            return
+        saved = json.loads(file.read_text())
+        differing = [
+            f"{key} was {saved.get(key)!r}, is {value!r}"
+            for key, value in recipe.items()
+            if saved.get(key) != value
+        ]
+        if differing:
+            raise ValueError(
+                f"cannot resume {folder} with other options: {'; '.join(differing)}"
+            )
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of episodes in all parts."""
+        paths = self._paths()
+        if not paths:
+            return 0
+        return int(paths[-1].stem) + len(_read(paths[-1]))
+
+    def add(self, part: TensorDictBase) -> None:
+        """Save a part [episodes, steps]; the first one creates the folder.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        if not (self.folder / RECIPE).exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            files.save_text(self.folder / RECIPE, json.dumps(self._recipe, indent=2))
+        first = int(part["collector", "traj_ids"][0, 0])
+        files.save(self.folder / f"{first:08d}.pt", part.to_dict())
+
+    def __iter__(self) -> Iterator[TensorDict]:
+        """The parts [episodes, steps] in the order of their episodes."""
+        return map(_read, self._paths())
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder)
+
+    def _paths(self) -> list[Path]:
+        return sorted(self.folder.glob("*.pt"))
+
+
+def _read(path: Path) -> TensorDict:
+    content = files.read(path, "a part of a data set", ("action", "next"))
+    return TensorDict(content).auto_batch_size_(2)
