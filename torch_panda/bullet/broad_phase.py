@@ -26,14 +26,15 @@ from torch_panda.bullet.blueprint import Blueprint, SetCollisionFilter
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.rotations import rotate_vector
 
-# Where bodies wait until their links are inserted again [m]. Bullet inserts an AABB
-# near the closest AABBs of the tree. At this distance, the closest AABBs are always
-# those of the scene, and never those of the links that still wait.
+# Position to which `restore` moves all bodies before it inserts their links into the
+# tree of AABBs again, one by one [m]. Bullet inserts an AABB beside the closest AABBs
+# of the tree. From this position to the scene is so far that the closest AABBs always
+# are those of links already inserted, never of links that are still here.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
-# The number of detections is restored modulo this cycle, so its lowest 8 bits are
-# restored. A detection reads one bit per level of the tree, and trees of the shipped
-# tasks have up to 11 levels. In 120 episodes, though, only the lowest 6 bits had an
-# effect.
+# `restore` restores the lowest 8 bits of the number of detections. A detection reads
+# one bit of it per level of the tree, and the trees of the shipped tasks have up to 11
+# levels. Only the lowest 6 bits had an effect in 120 episodes, and every further bit
+# would double the detections of a reset, so 8 bits are enough.
 _DETECTION_CYCLE = 256
 
 _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
@@ -85,18 +86,18 @@ class BroadPhase:
     def restore(self) -> None:
         """Move all bodies to where they were built and restore the broad phase.
 
-        All bodies first wait far away. Then one link after another is inserted at the
-        pose at which it was built, in the order in which the links were built. Its old
-        overlaps and contacts are lost. The links that still wait do not affect where a
-        link is inserted, so the new tree depends on this order only.
+        All bodies are first moved far away. Then one link after another is inserted at
+        the pose at which it was built, in the order in which the links were built. Its
+        old overlaps and contacts are lost. The links that are still far away do not
+        affect where a link is inserted, so the new tree depends on this order only.
         """
         client = self._client
         client.load(self._away)
-        # All links overlap where they wait, so filter out all their pairs.
+        # All links overlap far away, so filter out all their pairs.
         for body, link, _, _ in self._links:
             client.set_collision_filter(body, link, *_NO_CONTACTS)
-        # Bring the cursor to the start of the list: a detection moves the cursor on,
-        # modulo the number of pairs, so let one detection find exactly one pair.
+        # Bring the cursor over the list of pairs to its start. A detection moves the
+        # cursor on, modulo the number of pairs. With exactly one pair the result is 0.
         for body in self._first_pair:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
@@ -130,13 +131,15 @@ class BroadPhase:
 
         While Bullet's URDF importer builds a body, it inserts the AABB of each link as
         if the link's centre of mass were at the origin of the link's frame. At the end,
-        it moves the links to their poses without updating their AABBs. To insert a link
-        where the importer did, its snapshot holds the body shifted by that offset.
+        it moves the links to their poses without updating their AABBs. A link's AABB is
+        therefore displaced by the distance from its centre of mass to the origin of its
+        frame. The snapshot of a link holds the whole body with this displacement.
 
         The importer also inserts a link in another orientation if the link's inertial
         frame is rotated. This method does not imitate that, because no shipped robot
-        has such a link. For a robot that has one, all resets lead to the same broad
-        phase, but not to that of a newly built client.
+        has such a link. For a robot that has one, all resets still lead to the same
+        broad phase. It differs from the broad phase that Bullet has after importing the
+        robot, so episodes may differ from those of plain pybullet.
         """
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):

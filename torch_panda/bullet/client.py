@@ -332,7 +332,9 @@ class PhysicsClient:
         lateral: float | None = None,
         spinning: float | None = None,
     ) -> None:
-        """Set friction coefficients of a link (-1 is the base); None keeps one.
+        """Set the friction coefficients of a link (-1 is the base).
+
+        A coefficient that is None stays as it is.
 
         Raises:
             ValueError: a coefficient is negative or not finite.
@@ -390,10 +392,10 @@ class PhysicsClient:
         self._record(SetPhysics("set_dynamics", (body, link, *numbers.values())))
 
     def set_joint_friction(self, body: int, joint: int, force: float) -> None:
-        """Set the friction of a joint that no motor drives [N m] or [N].
+        """Set the friction [N m] or [N] of a joint that nothing else controls.
 
-        Bullet's default is about 1 N. The friction is a motor with this maximum force,
-        which drives the velocity of the joint to zero.
+        Bullet imitates friction by a motor. The motor's target velocity is 0, and its
+        maximum force is ``force``. Without this call, it is about 1 N.
 
         Raises:
             ValueError: the force is negative or not finite.
@@ -415,7 +417,8 @@ class PhysicsClient:
         """Set the collision group and mask of a link (-1 is the base), two bit fields.
 
         Two links A and B can touch if ``group_A & mask_B`` or ``group_B & mask_A`` is
-        not 0. Resets restore the filter that was set while the scene was built.
+        not 0. (One of them suffices in pybullet; Bullet's own default needs both.)
+        Resets restore the filter that was set while the scene was built.
 
         Bullet removes the link from the broad phase and inserts it again as the last
         link. The link thereby loses its present overlaps and contacts.
@@ -501,7 +504,9 @@ class PhysicsClient:
         return int(capi.status_snapshot(status))
 
     def load(self, snapshot: int) -> None:
-        """Restore a snapshot, which must have been taken while there were no contacts.
+        """Restore a snapshot that was taken while there were no contacts.
+
+        Restoring contacts would run a collision detection.
 
         Unlike `set_base`, this does not update the bodies' AABBs in Bullet's broad
         phase. The next collision detection updates them.
@@ -521,8 +526,8 @@ class PhysicsClient:
     ) -> None:
         """Set the targets of the motors of all movable joints of a body.
 
-        The first joints, as many as there are ``velocities``, get velocity targets. The
-        remaining joints get position targets. The motors behave as after pybullet's
+        The first ``len(velocities)`` joints get velocity targets. The remaining joints
+        get position targets. The motors behave as after pybullet's
         ``setJointMotorControlArray``, but their position gain is
         `PhysicsParams.position_gain`.
 
@@ -549,9 +554,9 @@ class PhysicsClient:
         )
 
     def apply_torques(self, body: int, torques: Doubles) -> None:
-        """Apply torques [N m] to the first movable joints, in the next time step only.
+        """Apply torques [N m] to the first ``len(torques)`` movable joints of a body.
 
-        The first joints are as many as there are torques.
+        The torques act in the next time step only.
         """
         command = capi.motor_init(
             self.connection.handle, body, capi.CONTROL_MODE_TORQUE

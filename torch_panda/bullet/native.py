@@ -1,7 +1,7 @@
-"""The library that is compiled from the C files here: loading, structs.
+"""Loads the library compiled from this folder's C files, and declares its structs.
 
-The library is optional. Without it, `VectorSimulation` steps its clients in Python
-threads.
+The comments in the header files explain the fields of the structs. The library is
+optional. Without it, `VectorSimulation` steps its clients in Python threads.
 """
 
 import ctypes
@@ -40,10 +40,10 @@ LOOP_VARIABLE = "TORCH_PANDA_LOOP"
 # ``enum arm_mode``
 ARM_MODES = {"position": 0, "velocity": 1, "torque": 2}
 
-# Values of a `Failure` that are not status codes of Bullet.
-NO_ANSWER = -1  # as `answer`: Bullet gave no answer
-CLIENT_CLOSED = -2  # as `expected`: the client was closed before the command
-DIVERGED = -3  # as `expected`: no command failed, but the state is not finite
+# Values in the fields of a `Failure` that are not status codes of Bullet.
+NO_ANSWER = -1  # in the field "answer": Bullet gave no answer
+CLIENT_CLOSED = -2  # in the field "expected": the client was closed before the command
+DIVERGED = -3  # in the field "expected": no command failed; the state is not finite
 
 # Bullet's functions that the library calls, in the order of ``struct functions``.
 _BULLET = (
@@ -114,7 +114,7 @@ class Client(Structure):
     _fields_ = (
         ("handle", c_void_p),
         ("num_detections", c_int64),
-        ("num_substeps", c_int),
+        ("num_substeps", c_int),  # substeps taken so far in the present step
         ("broad_phase", POINTER(BroadPhase)),
     )
 
@@ -129,7 +129,7 @@ class Scene(Structure):
         ("num_objects", c_int),
         ("num_object_joints", c_int),
         ("num_markers", c_int),
-        ("num_substeps", c_int),
+        ("num_substeps", c_int),  # substeps of a whole step
         ("joints", POINTER(c_int)),
         ("objects", POINTER(c_int)),
         ("object_joint_counts", POINTER(c_int)),

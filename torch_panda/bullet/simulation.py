@@ -205,13 +205,15 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                self._pool.wait()  # Python threads may still work, after Ctrl-C twice
+                # After a second Ctrl-C, threads of an earlier step may still run.
+                self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
         def step_one(env: int) -> None:
             client = self._clients[env]
             control(client, self.scene.robot, setpoint[env])
             if isinstance(control, MotorControl):
+                # Torques last for one time step, so `advance` may apply them again.
                 control.advance(
                     client, self.scene.robot, setpoint[env], self.n_substeps
                 )

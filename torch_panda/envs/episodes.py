@@ -161,6 +161,8 @@ class Episodes:
             )
             self.entries = self._observer.entries
             self._randomizer = randomizer
+            # Draws the starts of episodes, and holds the goals, the step counts and the
+            # state tensors of the running episodes.
             self._starts = EpisodeStarts(
                 robot, task, self.simulation, randomizer, self.seeds
             )
@@ -295,7 +297,7 @@ class Episodes:
             yield
 
     def check_was_reset(self, env: int) -> None:
-        """Check that an environment exists and was reset, so that it can be drawn.
+        """Check that an environment exists and was reset, so that it can be rendered.
 
         Raises:
             ValueError: The index is out of range, or the environment needs a reset.
@@ -338,7 +340,8 @@ class Episodes:
     def _read_action(self, action: Tensor | None) -> Tensor:
         """Check and clip an action; return it as (n, action_dim) float32."""
         shape = self._action_shape
-        # C code clips most actions faster than torch does.
+        # For float32 actions on the CPU, C code is faster than torch. It returns 0 if a
+        # number is not finite. Then `check_action` raises the error.
         if (
             native.LIBRARY is not None
             and self.simulation.is_native
@@ -348,6 +351,7 @@ class Episodes:
             and action.is_cpu
             and action.is_contiguous()
         ):
+            # Faster than `torch.empty` with a shape and a dtype.
             clipped = torch.empty_like(self._template_action)
             if native.LIBRARY.environment_clip(
                 action.data_ptr(), clipped.data_ptr(), clipped.numel()
@@ -377,6 +381,7 @@ class Episodes:
         self._randomizer.check_state(start_state.values, envs)
         self._randomizer.check_state(start_state.start, envs)
         if self.simulation.scene.markers and "desired_goal" in start_state.values:
+            # Raises if the task computes an invalid pose, before anything changes.
             self._starts.marker_pose(start_state.values["desired_goal"], envs)
         return start_state
 
@@ -387,6 +392,7 @@ class Episodes:
             step_mask[acting] = True
             self._history.record(action, step_mask)
             self._advance(action, acting)
+            # Each sensor needs only the step that ended at the state.
             self._observer.after_step(last)
         self._starts.step_count[envs] = start_state.values["step_count"]
         start_state.check_arrival(envs, self._starts.state())

@@ -78,11 +78,13 @@ class EpisodeObserver:
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._readings, extra]
-        # Keys of a state, which would be taken for a state if they were observed. The
-        # sensor "joint_state" may use two of them; see `is_state`.
+        # Keys that sensors and tasks may not observe, because a reset would take
+        # observations with these keys for a state. The sensor "joint_state" may use
+        # two of them; see `is_state`.
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
+        # The randomizer comes afterwards, because it may observe a reserved key.
         self.entries = join_entries(observers, reserved) | randomizer.entries
         observers.append(randomizer)
         self._observers = [observer for observer in observers if observer.entries]
@@ -109,8 +111,8 @@ class EpisodeObserver:
                 after a reset.
 
         Returns:
-            Observation, goals, success and ends, and after a step ``reward``, (n, 1)
-            float32.
+            ``observation``, the goals, ``success``, ``terminated``, ``truncated`` and
+            ``done``; after a step also ``reward``, (n, 1) float32.
 
         Raises:
             ValueError: One of the first observations or rewards is NaN or infinite, or
@@ -118,10 +120,12 @@ class EpisodeObserver:
                 `Task.goal_entries` declares.
         """
         if self._compiled is None:
-            observed, is_complete = self._observe_goals(goal), False
+            observed, has_outcome = self._observe_goals(goal), False
         else:
-            observed, is_complete = self._compiled.observe(goal, step_count)
-        if not is_complete or self._has_reward or self._has_failure:
+            observed, has_outcome = self._compiled.observe(goal, step_count)
+        # C code computes success, ends and reward, unless the task has functions of
+        # its own for them.
+        if not has_outcome or self._has_reward or self._has_failure:
             self._add_outcome(observed, step_count, action)
         if action is None:
             observed.pop("reward", None)
@@ -266,7 +270,7 @@ class EpisodeObserver:
         )
         if self._has_reward:
             action = torch.zeros(n, robot.action_dim, dtype=torch.float32, device="cpu")
-            reward = task.reward(simulation, action, goals[1], goals[1].clone())
+            reward = task.reward(simulation, action, *goals)
             check_output(f"{task_name}.reward", reward, (n, 1))
         if self._has_failure:
             failure = task.failure(simulation)

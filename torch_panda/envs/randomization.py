@@ -156,9 +156,11 @@ class PhysicsFactors:
                 self._gravity = (index, physics.gravity)
                 continue
             argument, links, nominal_value = targets[name]
-            value_at_zero = 1.0 if name in _ABSOLUTE_AT_ZERO else 0.0
+            # Replaces a nominal value of 0: the factor multiplies 1 instead, or the
+            # link is left alone.
+            zero_substitute = 1.0 if name in _ABSOLUTE_AT_ZERO else 0.0
             for link in links:
-                if value := nominal_value(*link) or value_at_zero:
+                if value := nominal_value(*link) or zero_substitute:
                     self._changes.setdefault(link, []).append((argument, index, value))
             if name == "object_restitution":
                 for link in fixed:

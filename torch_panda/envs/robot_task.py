@@ -53,9 +53,9 @@ class RobotTaskEnv(EnvBase):
     An environment belongs to one thread at a time: a call while another thread is
     inside raises `BulletError`.
 
-    A pickle holds the class, the arguments and the last seed of all environments,
-    because the state of Bullet cannot be copied. An unpickled environment builds its
-    own clients and starts with the first episode of this seed.
+    A pickle holds the class, the arguments, and the seed that was last given to all
+    environments together, because the state of Bullet cannot be copied. An unpickled
+    environment builds its own clients and starts with the first episode of this seed.
 
     ``state_dict`` holds the seeds and the episode numbers, but not the state of the
     running episodes. After `load_state_dict`, the next reset starts the episode that
@@ -78,16 +78,16 @@ class RobotTaskEnv(EnvBase):
         terminate_on_success: Whether success ends an episode, as in panda-gym 3. In the
             paper, episodes continue after success.
         physics: How Bullet integrates: "exact" as in panda-gym, "fast", or parameters.
-        sensors: Sensors, or names of force sensors, whose readings are observed beside
-            ``observation``, each under its own keys.
+        sensors: Sensors to observe beside ``observation``, each under its own keys. A
+            sensor without arguments may be given by its name.
         observe_state: Whether to observe ``observation``. The goals are always
             observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: What happens when a step leaves an environment in a state that
             is not finite. The environment always starts its next episode. "raise" then
-            raises `BulletError`. "reset" returns the start of that episode as the
-            result of the step: with its observation and reward, without success, and
-            ``truncated``.
+            raises `BulletError`. With "reset", the result of the step is the first
+            observation of that episode and the reward for it; ``success`` is False and
+            ``truncated`` is True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
@@ -95,7 +95,8 @@ class RobotTaskEnv(EnvBase):
             of a state in which the task's goal is reached, with the objects at their
             goals and at rest, and the hand in its neutral pose (in Reach at the goal).
             Reward and success stay the task's, computed from the entries at
-            `goal_indices`. States keep the task's goal.
+            `goal_indices`. The ``desired_goal`` in states (`get_state`, `reset`) stays
+            the task's goal.
 
     Raises:
         ValueError: An argument is out of range.
@@ -164,7 +165,8 @@ class RobotTaskEnv(EnvBase):
         self.observation_spec, self.action_spec = specs.observation, specs.action
         self.reward_spec = specs.reward
         self.done_spec = specs.done  # type: ignore[misc]  # it has a setter
-        # EnvBase closes a forgotten environment only if this is its own attribute.
+        # torchrl's default is True, which would keep `EnvBase.__del__` from closing a
+        # forgotten environment.
         self.is_closed = False
 
     @property
@@ -255,12 +257,13 @@ class RobotTaskEnv(EnvBase):
                 tensordict holds observations and a state; or torchrl's `TransformedEnv`
                 or `ParallelEnv` would not pass the state on (see `StateTransform`).
         """
-        # In a rollout torchrl passes the last observations and `select_reset_only`,
-        # which is no state.
+        # In a rollout, torchrl passes the last observations with `select_reset_only`.
+        # Such a reset does not start from a state.
         if set_state is None and not kwargs.get("select_reset_only", False):
             set_state = is_state(tensordict, self.episodes.entries)
         if set_state and tensordict is not None:
-            # Copy it, because torchrl would overwrite the caller's float64 goal.
+            # torchrl writes the observed float32 goal into this tensordict. Copy it, so
+            # that the state of the caller keeps its float64 goal.
             tensordict = tensordict.copy()
         start = super().reset(tensordict, set_state=set_state, **kwargs)
         return start.exclude(*EXACT_KEYS) if set_state else start
@@ -360,7 +363,8 @@ class RobotTaskEnv(EnvBase):
     ) -> object:
         """Load a ``state_dict``. An empty one changes nothing.
 
-        torchrl's collectors leave the state of the environment out of their own.
+        Collectors of torchrl pass an empty one, because their ``state_dict`` does not
+        include that of the environment.
 
         Raises:
             ValueError: The ``state_dict`` holds another number of environments.
@@ -379,9 +383,9 @@ class RobotTaskEnv(EnvBase):
     def segmentation_ids(self) -> dict[str, int]:
         """The numbers in segmentations, by name.
 
-        The names are ``nothing`` (-1), ``robot``, ``ground``, ``table``, and
-        ``object``, or ``object1`` and ``object2``, unless the visuals of the task name
-        their bodies.
+        The shipped tasks have ``nothing`` (-1), ``robot``, ``ground``, ``table``, and
+        ``object`` (``object1`` and ``object2`` in Stack). A task can give a body
+        another name with `Visual.name`.
         """
         return segmentation_ids(self.episodes.simulation)
 
@@ -520,8 +524,11 @@ class RobotTaskEnv(EnvBase):
         return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     @property
-    def _supports_set_state(self) -> StateSupport:  # type: ignore[override]  # a bool
-        """Whether a reset may start from a state; torchrl's wrappers ask, too."""
+    def _supports_set_state(self) -> StateSupport:  # type: ignore[override]  # torchrl says bool
+        """Tells torchrl that a reset may start from a state.
+
+        The value is true, or raises an error; see `StateSupport`.
+        """
         return StateSupport(frozenset(self.episodes.entries))
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:

@@ -113,8 +113,10 @@ def is_state(
 
     Args:
         entries: The argument of the reset.
-        observed_keys: Keys of sensors. Beside an ``achieved_goal``, such an entry is an
-            observation, for example a ``joint_position`` of the sensor "joint_state".
+        observed_keys: Keys that sensors observe. If the argument has an
+            ``achieved_goal``, entries under these keys are observations and not parts
+            of a state. For example, the sensor "joint_state" observes
+            ``joint_position``.
 
     Raises:
         ValueError: The argument holds both a state and observations.
@@ -152,10 +154,11 @@ def read_state(
     envs: list[int],
     action_dim: int,
 ) -> StartState:
-    """Check a state and convert its entries to those of the environment.
+    """Check a state, and read the entries of the environments that start from it.
 
     Args:
-        state: Tensors of shape (*batch_shape, ...). Other entries are ignored.
+        state: Tensors of shape (*batch_shape, ...). Entries under keys that are not
+            part of a state are ignored.
         batch_shape: Batch shape of the environment.
         present: The present state of all environments, (n, ...) by key.
         envs: The environments that start from the state.
@@ -196,12 +199,12 @@ def read_state(
             f"leave out {sorted(exact_keys)} to start from the other entries"
         )
     n, length = len(next(iter(present.values()))), state[ACTIONS].shape[-2]
-    actions = torch.zeros(n, length, action_dim, dtype=torch.float32, device="cpu")
-    count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
     start_state.start = read(START)
-    actions = _read_entry(ACTIONS, state[ACTIONS], batch_shape, actions, envs)
+    like = torch.zeros(n, length, action_dim, dtype=torch.float32, device="cpu")
+    actions = _read_entry(ACTIONS, state[ACTIONS], batch_shape, like, envs)
     check_rows(ACTIONS, actions.abs() <= 1, envs, "in [-1, 1]")
-    count = _read_entry(NUM_ACTIONS, state[NUM_ACTIONS], batch_shape, count, envs)
+    like = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
+    count = _read_entry(NUM_ACTIONS, state[NUM_ACTIONS], batch_shape, like, envs)
     check_rows(NUM_ACTIONS, count <= length, envs, f"at most {length}")
     start_state.actions, start_state.num_actions = actions, count
     return start_state
@@ -211,14 +214,17 @@ def _read_entry(
     key: str,
     value: Tensor,
     batch_shape: tuple[int, ...],
-    present: Tensor,
+    like: Tensor,
     envs: list[int],
 ) -> Tensor:
-    """Check an entry of a state, (*batch_shape, ...); return (len(envs), ...)."""
-    shape = (*batch_shape, *present.shape[1:])
+    """Check an entry of a state, (*batch_shape, ...); return (len(envs), ...).
+
+    The result has the dtype of ``like``, which has the entry's shape, (n, ...).
+    """
+    shape = (*batch_shape, *like.shape[1:])
     if tuple(value.shape) != shape:
         raise ValueError(f"{key} must have shape {shape}, got {tuple(value.shape)}")
-    value = value.detach().to("cpu", present.dtype).reshape(present.shape)[envs]
+    value = value.detach().to("cpu", like.dtype).reshape(like.shape)[envs]
     if value.is_floating_point():
         is_small = value.abs() <= _LIMIT  # false for NaN
         check_rows(key, is_small, envs, f"finite and at most {_LIMIT:g}")
