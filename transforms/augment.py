@@ -1,4 +1,4 @@
-"""Hindsight goals at write time, as a transform of a replay buffer."""
+"""HindsightAugment: relabelled copies of the transitions that a buffer stores."""
 
 from typing import Any
 
@@ -15,13 +15,14 @@ from torch_panda.transforms.strategies import DESIRED, RANDOM
 class HindsightAugment(BufferTransform):
     """Stores k relabelled copies of every transition when its episode ends.
 
-    This is algorithm 1 of the paper (Andrychowicz et al. 2017, arXiv 1707.01495). The
-    transform holds back the transitions of an episode until it ends. Then `extend`
-    stores them and k copies of each, flat, under the same trajectory id.
+    This is algorithm 1 of the HER paper (Andrychowicz et al. 2017, arXiv 1707.01495).
+    The transform holds back the transitions of an episode until the episode ends. Then
+    `extend` stores them and k copies of each, in one dimension, under the same
+    trajectory id.
 
     Args:
         reward_fn: See `BufferTransform`. It is called once per `extend`.
-        k: Number of relabelled copies of a transition.
+        k: Number of relabelled copies of each transition.
         **options: Arguments of `BufferTransform`, with strategies that stay within one
             episode.
 
@@ -48,10 +49,13 @@ class HindsightAugment(BufferTransform):
     def _inv_call(  # type: ignore[override]  # buffers accept None
         self, tensordict: TensorDictBase
     ) -> TensorDictBase | None:
-        """Takes transitions, and returns those of the episodes that have ended."""
+        """Takes new transitions, and returns those to store: of all ended episodes."""
         buffer, method = find_buffer()
         if method == "add" or not tensordict.ndim:
-            raise ValueError("`add` takes many rows for one item: use `extend`")
+            raise ValueError(
+                "HindsightAugment returns several rows for each transition, but `add` "
+                "stores one: use `extend`"
+            )
         ndim = 1 if buffer is None else buffer.storage.ndim
         if ndim > 1 or samples_slices(buffer):
             raise RuntimeError(
@@ -62,7 +66,7 @@ class HindsightAugment(BufferTransform):
         batch = tensordict if mask is None else tensordict[mask]
         with self._lock:
             self._claim(buffer)
-            ended = self._take_ended(batch)  # type: ignore[arg-type]  # rows
+            ended = self._take_ended(batch)  # type: ignore[arg-type]  # a TensorDict
             if ended is None:
                 return None
             copies = ended.repeat_interleave(self.k, dim=0)
@@ -75,24 +79,28 @@ class HindsightAugment(BufferTransform):
         return TensorDict.cat([ended, copies]).exclude(SERIAL_KEY)
 
     def _take_ended(self, batch: TensorDictBase) -> TensorDictBase | None:
-        """Remembers a batch, and returns all transitions of ended episodes, if any."""
-        held_back = 0
+        """Adds a batch, and returns the transitions of all ended episodes, if any.
+
+        The transitions of unfinished episodes are kept for a later call.
+        """
+        num_remembered = 0  # transitions since the oldest one that is held back
         if self._unfinished:
             oldest = int(self._unfinished[0].get(SERIAL_KEY).min())
-            held_back = self._memory.count - oldest
-        batch = self._remember(batch, held_back)
-        self._unfinished.append(batch.reshape(-1).to_tensordict())  # dense, and a copy
+            num_remembered = self._memory.count - oldest
+        batch = self._remember(batch, num_remembered)
+        # A copy, because the caller may change its batch before the episode ends.
+        self._unfinished.append(batch.reshape(-1).to_tensordict())
         serials = [rows.get(SERIAL_KEY).numpy(force=True) for rows in self._unfinished]
-        is_open = self._memory.is_open(np.concatenate(serials))
-        if is_open.all():
+        is_unfinished = torch.from_numpy(self._memory.is_open(np.concatenate(serials)))
+        if is_unfinished.all():
             return None
-        transitions, stays = TensorDict.cat(self._unfinished), torch.from_numpy(is_open)
-        self._unfinished = [transitions[stays]] if is_open.any() else []
-        ended = transitions[~stays]
+        transitions = TensorDict.cat(self._unfinished)
+        self._unfinished = [transitions[is_unfinished]] if is_unfinished.any() else []
+        ended = transitions[~is_unfinished]
         return ended[ended.get(SERIAL_KEY).argsort()]  # in order of time
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Leaves sampled transitions as they are."""
+        """Returns sampled transitions unchanged."""
         return tensordict
 
     def _forget(self) -> None:
@@ -100,12 +108,12 @@ class HindsightAugment(BufferTransform):
         self._unfinished = []
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Returns the memory, the generator and the transitions held back."""
+        """Returns the memory, the generator, and the transitions that are held back."""
         held = TensorDict.cat(self._unfinished).to_dict() if self._unfinished else None
         return {**super().get_extra_state(), "held": held}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_extra_state` returned."""
+        """Restores the state that `get_extra_state` returned."""
         super().set_extra_state(state)
         held = state["held"]
         self._unfinished = [TensorDict(held, [len(held[SERIAL_KEY])])] if held else []

@@ -1,4 +1,4 @@
-"""What all hindsight transforms have in common: arguments, memory, checks, saving."""
+"""Base class of the hindsight transforms: arguments, memory, checks, saving."""
 
 import difflib
 import gc
@@ -37,6 +37,11 @@ _NORMALISERS = (envs.ObservationNorm, envs.VecNorm, envs.VecNormV2)
 class BufferTransform(envs.Transform):
     """A transform of a replay buffer that gives transitions other goals.
 
+    It remembers the goals of the transitions that the buffer stores, and it checks the
+    first batches for entries that would contradict another goal (see `data_checks`).
+    Subclasses decide when they draw goals: when a batch is sampled
+    (`SampleTimeTransform`) or when an episode ends (`HindsightAugment`).
+
     Args:
         reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
             (n, 1). Row i of the reward depends on row i of the goals only. The first
@@ -44,30 +49,32 @@ class BufferTransform(envs.Transform):
         strategy: Name of a strategy, a function `(step, first, end, generator) -> goal
             step` (see `strategies`), or a mapping of these to weights.
         discount: Discount per step of the strategy "geometric".
-        success_fn: Maps goals to the success, bool, (n, 1). With it, `success_key` is
-            rewritten.
-        terminated_fn: Maps goals to whether the episode terminates, for tasks that end
-            on success. With it, ("next", "terminated") and ("next", "done") are
-            rewritten. Failures and truncations stay as they were.
+        success_fn: Maps (achieved_goal, desired_goal) to the success, bool, (n, 1). If
+            it is given, `success_key` is rewritten.
+        terminated_fn: Maps (achieved_goal, desired_goal) to whether the episode
+            terminates, bool, (n, 1), for tasks that end on success. If it is given,
+            ("next", "terminated") and ("next", "done") are rewritten. Failures and
+            truncations stay as they were.
         goal_key: Key of the desired goal, at the root and under "next".
         achieved_goal_key: Key of the achieved goal, at the root and under "next".
         reward_key: Key of the reward.
         success_key: Key of the success.
-        trajectory_key: Key of the trajectory ids. Data without ids must be
-            [*environments, time].
-        single_env: Whether 1-d data without ids are successive steps of one
-            environment.
-        seed: Seed of the transform's own generator. By default torch's is used.
+        trajectory_key: Key of the trajectory ids. Data without ids must have the batch
+            shape [*environments, time].
+        single_env: Whether data of one dimension and without ids are successive steps
+            of one environment.
+        seed: Seed of the transform's own random generator. By default it draws from
+            torch's global generator.
 
     Raises:
         TypeError: an argument is unknown.
         ValueError: an argument has a value that is not accepted.
     """
 
-    # Processes that share the buffer would have to share this transform's memory.
+    # Tells torchrl that processes must not share this transform.
     requires_shared_write_state = True
     goal_parts: tuple[int, ...] | None = None
-    _shown: tuple[str, ...]  # attributes that the representation names
+    _shown: tuple[str, ...]  # names of the attributes in the repr
 
     def __init__(
         self,
@@ -101,13 +108,13 @@ class BufferTransform(envs.Transform):
         ignored = "action", "collector", "index", SERIAL_KEY, self.trajectory_key
         warned: set[str] = set()
         self._check_written = DataCheck(self._rewriter, ignored, warned)
-        # Transforms before this one in the buffer may add entries to what is sampled.
+        # Transforms before this one in the buffer may add entries to sampled batches.
         self._check_sampled = DataCheck(self._rewriter, ignored, warned)
         self._memory = GoalMemory()
         self._generator: torch.Generator | None = None
         if seed is not None:
             self._generator = torch.Generator("cpu").manual_seed(seed)
-        self._is_checked = False
+        self._has_checked_setup = False
         self._lock = threading.Lock()  # a prefetching buffer samples in threads
 
     @classmethod
@@ -119,17 +126,18 @@ class BufferTransform(envs.Transform):
             accepted += [x for x in names if x not in ("options", "unknown")]
         if "strategies" in accepted:  # GoalSampler has a strategy per key
             accepted.remove("strategy")
-        translation, has_ratio = None, "her_ratio" in accepted
+        suggestion, has_ratio = None, "her_ratio" in accepted
         is_count = isinstance(value, int) and value > 0
+        # Translate the arguments of Stable-Baselines3 and of the other transforms.
         if name in ("k", "n_sampled_goal") and is_count and has_ratio:
-            translation = f"her_ratio={value / (value + 1):.3g}"
+            suggestion = f"her_ratio={value / (value + 1):.3g}"
         elif name == "her_ratio" and isinstance(value, float) and 0 < value < 1:
-            translation = f"k={max(1, round(value / (1 - value)))}"
+            suggestion = f"k={max(1, round(value / (1 - value)))}"
         elif name == "goal_selection_strategy":
-            translation = f"strategy={str(getattr(value, 'value', value)).lower()!r}"
+            suggestion = f"strategy={str(getattr(value, 'value', value)).lower()!r}"
         elif similar := difflib.get_close_matches(name, accepted, n=1):
-            translation = similar[0]
-        hint = f"use {translation}; " if translation else ""
+            suggestion = similar[0]
+        hint = f"use {suggestion}; " if suggestion else ""
         return (
             f"{cls.__name__} has no argument {name!r}; {hint}accepted are "
             f"{', '.join(dict.fromkeys(accepted))}"
@@ -137,22 +145,23 @@ class BufferTransform(envs.Transform):
 
     @classmethod
     def from_env(cls, env: envs.EnvBase, **options: Any) -> Self:  # noqa: ANN401
-        """Makes the transform that belongs to an environment, such as a `RobotTaskEnv`.
+        """Makes the transform with the goal functions of an environment.
 
         The environment's `compute_reward` becomes `reward_fn`, and its `is_success`
-        becomes `success_fn`. If the environment is `terminate_on_success`, `is_success`
-        also becomes `terminated_fn`. A worker of a `ParallelEnv` or `SerialEnv` is
-        created and closed again.
+        becomes `success_fn`. If its attribute `terminate_on_success` is true,
+        `is_success` also becomes `terminated_fn`. For a `ParallelEnv` or `SerialEnv`,
+        one of its environments is created to read these functions, and then closed.
 
         Args:
-            env: The environment. Either the transformed environment or its base.
-            **options: Arguments of the transform. They replace what the environment
-                has.
+            env: A `RobotTaskEnv` or another environment with these attributes. It may
+                be wrapped in a `TransformedEnv`.
+            **options: Arguments of the transform. They take precedence over the
+                environment's functions.
 
         Raises:
             TypeError: an option is unknown.
             ValueError: the environment lacks a function that is not among the options,
-                or its transforms normalise a goal.
+                or the environment's transforms normalise a goal.
         """
         goal_keys = {
             unravel_key(options.get("goal_key", "desired_goal")),
@@ -197,9 +206,9 @@ class BufferTransform(envs.Transform):
             batch: Transitions, [*environments, time].
             stored: Number of earlier transitions that the buffer still holds.
         """
-        if not self._is_checked:
-            self._check_first(batch)
-            self._is_checked = True
+        if not self._has_checked_setup:
+            self._check_setup(batch)
+            self._has_checked_setup = True
         rewriter, shape, flat = self._rewriter, batch.batch_size, batch
         keys = (
             rewriter.achieved_goal_key,
@@ -208,10 +217,10 @@ class BufferTransform(envs.Transform):
             rewriter.next_goal_key,
             DONE,
         )
-        if batch.ndim > 1:  # storages fill up in order of time
+        if batch.ndim > 1:  # put time first: storages fill up in order of time
             flat = batch.select(self.trajectory_key, *keys, strict=False)
             flat = flat.movedim(-1, 0).reshape(-1)
-        root, achieved, desired, next_desired, done = (
+        root_goal, achieved, desired, next_desired, done = (
             flat.get(key, None) for key in keys
         )
         if achieved is None or desired is None or next_desired is None or done is None:
@@ -221,17 +230,17 @@ class BufferTransform(envs.Transform):
         goals: Any = [achieved.numpy(force=True)]
         if any(DESIRED in mixture.weights for mixture in self._get_mixtures()):
             goals.append(desired.numpy(force=True))
-        roots = None if root is None else root.numpy(force=True)
+        root_goals = None if root_goal is None else root_goal.numpy(force=True)
         is_done = done.numpy(force=True).reshape(-1)
         ids = self._get_ids(flat, shape)
-        serials = self._memory.write(ids, is_done, roots, goals, stored)
+        serials = self._memory.write(ids, is_done, root_goals, goals, stored)
         tags = torch.from_numpy(serials)
         if batch.ndim > 1:
             tags = tags.view(shape[-1], *shape[:-1]).movedim(0, -1)
         return batch.set(SERIAL_KEY, tags.to(desired.device))
 
     def _get_mixtures(self) -> Collection[Mixture]:
-        """Returns the mixtures of strategies that goals are drawn by."""
+        """Returns the mixtures of strategies from which goals are drawn."""
         return [self._mixture]
 
     def _claim(self, buffer: ReplayBuffer | None) -> None:
@@ -257,9 +266,10 @@ class BufferTransform(envs.Transform):
             self._memory.buffer = weakref.ref(buffer)
 
     def _find_mask(self, batch: TensorDictBase) -> torch.Tensor | None:
-        """Returns the mask that `split_trajectories` wrote, if it has padded rows.
+        """Returns which rows are real, (*batch,), or None if no row is padding.
 
-        The mask is beside the trajectory ids, true for real rows, of shape (*batch,).
+        torchrl's `split_trajectories` pads trajectories and writes this mask next to
+        the trajectory ids.
         """
         key = self.trajectory_key
         prefix = key[:-1] if isinstance(key, tuple) else ()
@@ -268,12 +278,12 @@ class BufferTransform(envs.Transform):
             return None
         return None if mask.all() else mask
 
-    def _check_first(self, batch: TensorDictBase) -> None:
-        """Refuses a chain of transforms, or data, for which hindsight cannot be right.
+    def _check_setup(self, batch: TensorDictBase) -> None:
+        """Checks that hindsight is possible with the buffer's transforms and its data.
 
         Raises:
-            RuntimeError: the chain has a `MultiStepTransform`.
-            KeyError: the data lack entries.
+            RuntimeError: the buffer has a `MultiStepTransform`.
+            KeyError: entries are missing in the data.
             ValueError: the goals have a wrong type, or do not fit `goal_parts`.
         """
         if any(isinstance(t, envs.MultiStepTransform) for t in get_chain(self)):
@@ -284,18 +294,26 @@ class BufferTransform(envs.Transform):
         is_vector, size = achieved.ndim == batch.ndim + 1, achieved.shape[-1]
         parts = self.goal_parts
         if parts is not None and not (is_vector and sum(parts) == size):
-            raise ValueError(f"goal_parts must add up to a vector of {size}: {parts}")
+            raise ValueError(
+                f"goal_parts must add up to {size}, the size of the goal vector, got "
+                f"{parts}"
+            )
         if torch.bfloat16 in (achieved.dtype, desired.dtype):
             raise ValueError("hindsight cannot hold goals of bfloat16: use float32")
 
     def _get_ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
-        """Returns trajectory ids, or numbers of environments, (n,)."""
+        """Returns trajectory ids, or without ids the numbers of the environments, (n,).
+
+        Args:
+            flat: Transitions in order of time, (n,).
+            shape: Batch shape before flattening, [*environments, time].
+        """
         key, ids = self.trajectory_key, flat.get(self.trajectory_key, None)
         if ids is None:
             if len(shape) < 2 and not self.single_env:
                 raise ValueError(
-                    f"the rows cannot be told apart, because there are no trajectory "
-                    f"ids at {key!r}: keep the collector's ids, name others "
+                    f"there are no trajectory ids at {key!r}, so the trajectory of a "
+                    "row is unknown: keep the collector's ids, name other ids "
                     "(trajectory_key=...), extend with [num_envs, time], or pass "
                     "single_env=True for steps of one environment"
                 )
@@ -317,28 +335,32 @@ class BufferTransform(envs.Transform):
             self._memory.end_trajectories()
 
     def empty(self) -> None:
-        """Forgets all transitions and the buffer; `buffer.empty()` does not call it."""
+        """Forgets all transitions and the buffer. `buffer.empty()` does not do this."""
         with self._lock:
             self._forget()
 
     def _forget(self) -> None:
-        self._memory, self._is_checked = GoalMemory(), False
+        self._memory, self._has_checked_setup = GoalMemory(), False
 
     def empty_cache(self) -> None:
-        """Makes the next `extend` check the chain again; called when it changes."""
+        """Makes the next `extend` check the setup again.
+
+        torchrl calls this method when the buffer's transforms change.
+        """
         super().empty_cache()
-        self._is_checked = False
+        self._has_checked_setup = False
 
     def share_memory_(self) -> None:
-        """Refuses to be shared. torchrl calls it for a buffer of several processes."""
+        """Raises an error. torchrl calls this method if processes share the buffer."""
         raise RuntimeError(
-            "hindsight has no share_memory_, because its memory is of one process: "
-            "do not pass the buffer to a multi-process collector (replay_buffer=...), "
-            "but extend it with what the collector yields"
+            "hindsight has no share_memory_, because other processes cannot see its "
+            "memory: do not pass the buffer to a multi-process collector "
+            "(replay_buffer=...), but extend it with the batches that the collector "
+            "yields"
         )
 
     def set_container(self, container: envs.Transform | envs.EnvBase) -> None:
-        """Joins a buffer's chain of transforms, and refuses an environment's."""
+        """Joins the transforms of a buffer, and refuses to join an environment's."""
         if isinstance(container, envs.EnvBase) or container.parent is not None:
             self._call(None)
         super().set_container(container)
@@ -355,7 +377,7 @@ class BufferTransform(envs.Transform):
             return {"memory": self._memory.state(), "generator": random_state}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_extra_state` returned."""
+        """Restores the state that `get_extra_state` returned."""
         with self._lock:
             self._memory.load(state["memory"])
             if state["generator"] is not None:
@@ -372,7 +394,7 @@ class BufferTransform(envs.Transform):
 def _refuse_normalised_goals(
     transform: envs.Transform, goal_keys: set[NestedKey]
 ) -> None:
-    """Refuses an environment's transforms that normalise a goal in place."""
+    """Raises a ValueError if an environment's transform normalises a goal in place."""
     for module in transform.modules():
         if isinstance(module, _NORMALISERS):
             normalised = goal_keys & set(map(unravel_key, module.out_keys))

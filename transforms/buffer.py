@@ -1,4 +1,4 @@
-"""The replay buffer that calls a transform, and the chain of transforms in it."""
+"""Finds the replay buffer that calls a transform, and the transforms next to it."""
 
 import inspect
 
@@ -8,15 +8,15 @@ from torchrl.envs import EnvBase, Transform
 
 
 def find_buffer() -> tuple[ReplayBuffer | None, str]:
-    """Finds the replay buffer that is calling, and its method.
+    """Finds the replay buffer that is calling the transform, and the calling method.
 
-    torchrl gives a transform no handle on its buffer. But the buffer's size, storage,
-    writer and sampler decide whether hindsight is right. So this function walks up the
-    stack (3 us) to the innermost function of `torchrl.data` whose `self` is a buffer.
+    torchrl gives a transform no reference to its buffer. But hindsight depends on the
+    buffer's size, storage, writer and sampler. So this function walks up the call stack
+    (3 us) to the innermost function of `torchrl.data` whose `self` is a buffer.
 
     Returns:
-        The buffer and the method's name, such as "extend"; or None and "" if no buffer
-        calls, as in `transform.forward(batch)`.
+        The buffer and the name of its method, such as "extend". If no buffer is
+        calling, as in `transform.forward(batch)`: None and "".
 
     Raises:
         RuntimeError: the buffer replaces stored rows (`rb[i] = ...`).
@@ -29,8 +29,8 @@ def find_buffer() -> tuple[ReplayBuffer | None, str]:
                 method = frame.f_code.co_name
                 if method == "__setitem__":
                     raise RuntimeError(
-                        "hindsight cannot follow rows that are replaced (rb[i] = ...): "
-                        "use extend()"
+                        "hindsight does not support replacing rows (rb[i] = ...): use "
+                        "extend()"
                     )
                 return buffer, method
         frame = frame.f_back
@@ -44,7 +44,10 @@ def samples_slices(buffer: ReplayBuffer | None) -> bool:
 
 
 def get_chain(transform: Transform) -> list[Transform | EnvBase]:
-    """Returns all transforms of the (nested) `Compose` that a transform belongs to."""
+    """Returns all transforms of a transform's buffer, in order.
+
+    The transforms may be nested in several `Compose`.
+    """
     root: Transform | EnvBase = transform
     while (container := root.__dict__["_container"]) and container():
         root = container()

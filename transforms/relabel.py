@@ -1,4 +1,4 @@
-"""Hindsight goals at sample time, as a transform of a replay buffer."""
+"""HindsightRelabel: hindsight goals for the batches that a replay buffer samples."""
 
 from typing import Any
 
@@ -17,25 +17,29 @@ class HindsightRelabel(SampleTimeTransform):
 
     Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): a random
     fraction `her_ratio` of the sampled rows gets another goal, with the reward of that
-    goal. The other rows come out as they were stored. README.md in this folder is a
-    guide.
+    goal. The other rows stay as they were stored. README.md in this folder is a guide.
 
-    Strategies draw the goal from what a transition's own trajectory achieved: at this
-    step or later, uniformly ("future") or preferring early steps ("geometric"), at this
-    step ("current"), at the last step ("final"), or at any step ("episode"). Or they
-    draw from all stored transitions: an achieved goal ("random") or a desired goal
-    ("desired").
+    The option `strategy` says where a new goal comes from:
+
+    - "future" (default): achieved at this step of the trajectory or later;
+    - "geometric": the same, but near steps are more likely;
+    - "current": achieved at this step;
+    - "final": achieved at the last step of the trajectory;
+    - "episode": achieved at any step of the trajectory;
+    - "random": achieved by any stored transition;
+    - "desired": the desired goal of any stored transition.
 
     Args:
         reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
             (n, 1).
-        her_ratio: Fraction of the rows to relabel; k / (k + 1) for the paper's k goals.
+        her_ratio: Fraction of the rows to relabel. The paper's k hindsight goals per
+            transition correspond to k / (k + 1).
         goal_parts: Sizes of the parts of a goal vector, such as (3, 3). Each part is
             relabelled on its own, with probability `her_ratio` (Lanier et al. 2019,
             arXiv 1906.03710).
         **options: `unit` and `capacity` (see `SampleTimeTransform`), and arguments of
-            `BufferTransform`. A `SliceSampler` overwrites the new ends with the stored
-            ones unless its `truncated_key` is None.
+            `BufferTransform`. With a `SliceSampler`, pass it `truncated_key=None`.
+            Otherwise it overwrites "terminated" and "done" of relabelled rows.
 
     Raises:
         TypeError: an argument is unknown.
@@ -61,41 +65,46 @@ class HindsightRelabel(SampleTimeTransform):
 
     def _draw(self, serials: Integers, batch: TensorDictBase) -> tuple[Integers, Goals]:
         """Draws which m rows to relabel, (m,), and their goals, (m, *goal)."""
-        last_rows, units = self._find_units(serials)
+        last_serials, units = self._find_units(serials)
         if self.goal_parts is None:
-            return self._draw_once(serials, last_rows, units)
+            return self._draw_once(serials, last_serials, units)
         stored_goals = batch.get(self._rewriter.goal_key)
         goals = stored_goals.reshape(len(serials), -1).numpy(force=True).copy()
         is_relabelled = np.zeros(len(goals), dtype=bool)
         for end, size in zip(np.cumsum(self.goal_parts), self.goal_parts, strict=True):
             part = slice(end - size, end)
-            rows, drawn = self._draw_once(serials, last_rows, units)
+            rows, drawn = self._draw_once(serials, last_serials, units)
             goals[rows, part] = drawn[:, part]
             is_relabelled[rows] = True
         return is_relabelled.nonzero()[0], goals[is_relabelled]
 
     def _draw_once(
-        self, serials: Integers, last_rows: Integers, units: Integers | None
+        self, serials: Integers, last_serials: Integers, units: Integers | None
     ) -> tuple[Integers, Goals]:
-        """Draws which units to relabel, and a goal for each of them.
+        """Draws which units (rows or slices) to relabel, and a goal for each of them.
+
+        Args:
+            serials: Serial numbers of the rows, (n,).
+            last_serials: Serial number of the last row of each unit, (num_units,).
+            units: Unit of each row, (n,). None if each row is a unit.
 
         Returns:
-            Rows of these units, (n,), and the goals of these rows, (n, *goal).
+            Indices of the m rows to relabel, (m,), and their goals, (m, *goal).
         """
-        u = draw_uniform(len(last_rows), self._generator)
+        u = draw_uniform(len(last_serials), self._generator)
         is_chosen = u < self.her_ratio
-        # Another thread may have overwritten a sampled row: it keeps its goal.
+        # A row that another thread has overwritten since it was sampled keeps its goal.
         is_forgotten = serials < self._memory.oldest
         is_chosen[is_forgotten if units is None else units[is_forgotten]] = False
-        chosen = is_chosen.nonzero()[0]
+        chosen_units = is_chosen.nonzero()[0]
         goals = self._memory.draw(
-            last_rows.take(chosen), self._mixture, self._generator
+            last_serials.take(chosen_units), self._mixture, self._generator
         )
         if units is None:
-            return chosen, goals
+            return chosen_units, goals
         rows = is_chosen[units].nonzero()[0]
-        index_of_unit = is_chosen.cumsum() - 1  # of chosen units, into `goals`
-        return rows, goals[index_of_unit[units[rows]]]
+        goal_index = is_chosen.cumsum() - 1  # of each chosen unit
+        return rows, goals[goal_index[units[rows]]]
 
     def _write(
         self,

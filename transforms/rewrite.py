@@ -1,4 +1,4 @@
-"""Writes other goals into transitions, with the rewards and ends that follow."""
+"""Writes other goals into transitions, with the rewards and ends of these goals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,13 +17,16 @@ GoalFunction = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass
 class Rewriter:
-    """Gives transitions another goal, and the reward, success and ends that follow.
+    """Gives transitions other goals, and recomputes the entries that depend on them.
+
+    These entries are the reward, the success, and the "ends": ("next", "terminated")
+    and ("next", "done").
 
     Attributes:
         reward_fn: Reward of a transition.
-        success_fn: Success of a transition, or None: success stays as stored.
+        success_fn: Success of a transition. If None, success stays as stored.
         terminated_fn: Whether a transition terminates its episode because its goal is
-            reached, or None: ends stay as stored.
+            reached. If None, the ends stay as stored.
         goal_key: Key of the desired goal, at the root and under "next".
         achieved_goal_key: Key of the achieved goal, at the root and under "next".
         reward_key: Key of the reward.
@@ -39,12 +42,12 @@ class Rewriter:
     success_key: NestedKey
 
     def __post_init__(self) -> None:
-        """Derives the keys under "next"."""
+        """Adds the keys of the goals under "next"."""
         self.next_goal_key = unravel_key(("next", self.goal_key))
         self.next_achieved_key = unravel_key(("next", self.achieved_goal_key))
 
     def check_entries(self, batch: TensorDictBase) -> None:
-        """Checks that the batch has all entries that are read or rewritten.
+        """Checks that the batch has all entries that this class reads or rewrites.
 
         Raises:
             KeyError: entries are missing.
@@ -68,9 +71,12 @@ class Rewriter:
         Args:
             batch: Transitions, of any batch shape.
             rows: Indices into the flattened batch, (n,).
-            goals: Their new goals, (n, *goal).
-            inplace: Whether to write into `batch`, which must be one-dimensional,
-                instead of a copy.
+            goals: New goals of these rows, (n, *goal).
+            inplace: Whether to change `batch`, which must be one-dimensional. Otherwise
+                a copy is changed.
+
+        Returns:
+            The changed batch.
         """
         flat = batch if inplace else batch.reshape(-1).to_tensordict()
         goals = goals.to(flat.get(self.goal_key).dtype)
@@ -83,7 +89,7 @@ class Rewriter:
     def evaluate(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor
     ) -> dict[NestedKey, Tensor]:
-        """Returns the entries of some rows that follow from other goals.
+        """Computes the entries of some rows that depend on the goal, for other goals.
 
         Args:
             batch: Transitions, (m,).
@@ -91,7 +97,8 @@ class Rewriter:
             goals: Goals of these rows, (n, *goal).
 
         Returns:
-            Reward and, if the functions for them are known, success and ends: (n, 1).
+            New values by key, (n, 1) each: the reward and, if there are functions for
+            them, the success and the ends.
         """
         achieved = batch.get(self.next_achieved_key).index_select(0, rows)
         stored_reward = batch.get(self.reward_key)
@@ -104,7 +111,8 @@ class Rewriter:
             )
         if self.terminated_fn is not None:
             done, terminated = batch.get(DONE), batch.get(TERMINATED)
-            # torchrl's trainers mark every row as truncated; `done` has the real ends.
+            # torchrl's trainers set "truncated" in every row, but "done" only where an
+            # episode ends.
             truncated = batch.get(TRUNCATED, ~terminated) & done
 
             def reaches(desired: Tensor) -> Tensor:
@@ -113,8 +121,8 @@ class Rewriter:
                     self.terminated_fn, achieved, desired, terminated
                 )
 
-            # An episode that terminated, but not by reaching its goal, failed. Its
-            # end does not depend on the goal.
+            # An episode that terminated without reaching its goal has failed. With
+            # another goal it would fail too, so it stays terminated.
             has_failed = terminated.index_select(0, rows)
             if has_failed.any():
                 stored_goals = batch.get(self.goal_key).index_select(0, rows)
@@ -146,7 +154,7 @@ def call_goal_function(
     if result != expected_shape:
         raise ValueError(
             "reward_fn, success_fn and terminated_fn must map (achieved_goal, "
-            f"desired_goal), (n, *goal) each, to a tensor: {function} to "
-            f"{expected_shape}, got {result}"
+            f"desired_goal), (n, *goal) each, to a tensor (n, 1): {function} should "
+            f"return shape {expected_shape}, got {result}"
         )
     return values.to(stored.dtype)

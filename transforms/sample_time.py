@@ -19,12 +19,15 @@ from torch_panda.transforms.strategies import Integers
 class SampleTimeTransform(BufferTransform):
     """Remembers stored transitions, and draws goals for sampled transitions.
 
+    On writing, the transform adds a serial number to each transition. On sampling, the
+    serial numbers say where the sampled rows are in their trajectories.
+
     Args:
         reward_fn: See `BufferTransform`.
-        unit: "row" draws a goal for each row; "slice" draws one for all rows of a
-            slice, for the slice's last row.
-        capacity: Number of transitions to remember if no buffer calls, because a buffer
-            would tell its size.
+        unit: Rows that share a goal. "row" draws a goal for each row. "slice" draws one
+            goal for all rows of a sampled slice, from the view of its last row.
+        capacity: Number of transitions to remember, for a transform that is called
+            without a buffer. With a buffer, it is the number that the buffer holds.
         **options: Other arguments of `BufferTransform`.
     """
 
@@ -43,7 +46,8 @@ class SampleTimeTransform(BufferTransform):
             raise ValueError(f"capacity must be a positive integer, got {capacity}")
         self.unit, self.capacity = unit, capacity
         self._is_first_sample = True
-        self._last_write = 0, 0  # transitions stored before the last write, and in it
+        # Transitions that the buffer held before the last write, and those written.
+        self._last_write = 0, 0
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Remembers the transitions that are about to be stored."""
@@ -65,7 +69,7 @@ class SampleTimeTransform(BufferTransform):
 
     def _count_stored(self, buffer: ReplayBuffer | None) -> int:
         """Returns how many of the remembered transitions the buffer holds."""
-        # An ensemble samples from several buffers, and does not tell from which.
+        # An ensemble samples from several buffers, and does not say from which one.
         if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):
             return len(buffer.storage)
         count = self._memory.count
@@ -88,7 +92,8 @@ class SampleTimeTransform(BufferTransform):
                 self._memory.forget(oldest)
             serials = tags.numpy(force=True).reshape(-1)
             drawn = self._draw(serials, tensordict)
-        # Other methods may return the storage itself, or a lazy stack.
+        # `_sample` returns a copy, which may be changed in place. Other methods may
+        # return the storage itself, or a lazy stack.
         is_copy = method == "_sample" and type(tensordict) is TensorDict
         inplace = is_copy and tensordict.ndim == 1
         batch = self._write(tensordict, drawn, inplace=inplace)
@@ -98,7 +103,7 @@ class SampleTimeTransform(BufferTransform):
 
     @abstractmethod
     def _draw(self, serials: Integers, batch: TensorDictBase) -> Any:  # noqa: ANN401
-        """Draws goals for the transitions of a batch, with the memory locked."""
+        """Draws goals for the transitions of a batch. The caller holds the lock."""
 
     @abstractmethod
     def _write(
@@ -108,33 +113,35 @@ class SampleTimeTransform(BufferTransform):
         *,
         inplace: bool,
     ) -> TensorDictBase:
-        """Writes what `_draw` returned into the batch, or into a copy of it."""
+        """Writes the goals that `_draw` returned into the batch, or into a copy."""
 
     def _find_oldest(self, buffer: ReplayBuffer | None) -> int:
         """Returns the serial number of the oldest transition that the buffer holds."""
         stored, (before, written) = self._count_stored(buffer), self._last_write
         size = 0 if buffer is None else getattr(buffer.storage, "max_size", 0)
-        if stored == before < size:  # the last write has not reached the storage yet
+        # Another thread may be between `_inv_call` and the storage: then the last write
+        # is remembered, but not stored yet.
+        if stored == before < size:
             stored += written
         return self._memory.count - stored
 
     def _find_units(self, serials: Integers) -> tuple[Integers, Integers | None]:
-        """Finds the units that get one goal each.
+        """Groups rows into units, which are rows or slices. Each unit gets one goal.
 
         Returns:
-            Serial number of the last row of each unit, (m,), and the unit of each row,
+            Serial number of the last row of each unit, (m,). Index of each row's unit,
             (n,), or None if each row is a unit.
         """
         if self.unit == "row":
             return serials, None
         numbers, steps = self._memory.find(serials.clip(self._memory.oldest))
-        # Padding repeats a step.
+        # A slice continues with the next step, or with the same one in padded rows.
         continues = (np.diff(numbers) == 0) & np.isin(np.diff(steps), (0, 1))
         is_last = np.append(~continues, True)
         return serials[is_last], is_last.cumsum() - is_last
 
     def _explain_unknown_rows(self, *, has_tags: bool) -> Exception:
-        """Returns the error for sampled rows that were not remembered."""
+        """Returns the error for sampled rows that are not in the memory."""
         name = type(self).__name__
         chain = get_chain(self)
         selecting = [
@@ -155,29 +162,33 @@ class SampleTimeTransform(BufferTransform):
         return RuntimeError(message) if has_tags else KeyError(message)
 
     def _warn_of_slices(self, buffer: ReplayBuffer | None) -> None:
-        """Warns if the rows of a sampled slice get several goals."""
+        """Warns if the buffer samples slices, but each row gets a goal of its own."""
         if self.unit == "row" and samples_slices(buffer):
             warnings.warn(
-                'the rows of a slice get several goals: pass unit="slice" for one goal '
-                "per slice",
+                'each row of a slice gets a goal of its own: pass unit="slice" for one '
+                "goal per slice",
                 stacklevel=2,
             )
 
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
-        """Remembers transitions that are stored already: a data set, or a storage.
+        """Remembers stored transitions, such as those of a data set.
 
         Args:
-            data: Transitions with trajectory ids, or [trajectories, time].
+            data: Transitions with trajectory ids, or of batch shape [trajectories,
+                time].
 
         Returns:
-            The transitions, flat and with serial numbers, for the `TensorStorage` of a
-            buffer with this transform. The tensors are not copied.
+            The transitions in one dimension, with serial numbers. Put them into the
+            `TensorStorage` of a buffer with this transform. The tensors are not copied.
 
         Raises:
-            RuntimeError: the transform has remembered other transitions.
+            RuntimeError: the transform has remembered other transitions before.
         """
         if self._memory.count:
-            raise RuntimeError("prepare() must come before other transitions")
+            raise RuntimeError(
+                "prepare() must come before any extend(): make a new transform, or "
+                "call empty() first"
+            )
         flat = data.reshape(-1)
         identified = flat.copy()
         if data.ndim > 1 and data.get(self.trajectory_key, None) is None:
@@ -195,10 +206,17 @@ class SampleTimeTransform(BufferTransform):
 def _check_layout(
     buffer: ReplayBuffer, method: str, data: TensorDictBase, *, is_padded: bool
 ) -> None:
-    """Checks that the buffer writes transitions in order of time.
+    """Checks that the buffer writes these transitions in order of time.
+
+    Args:
+        buffer: The buffer.
+        method: Method of the buffer that is writing: "add" or "extend".
+        data: The transitions.
+        is_padded: Whether some rows are padding.
 
     Raises:
-        RuntimeError: it does not.
+        RuntimeError: the buffer would write them in another order, or has padding that
+            cannot be removed.
     """
     ndim, writer = buffer.storage.ndim, type(buffer.writer)
     if is_padded and not ndim == data.ndim == 1:

@@ -1,4 +1,4 @@
-"""Several goals for each sampled transition, as a transform of a replay buffer."""
+"""GoalSampler: several goals for each transition that a replay buffer samples."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -15,10 +15,10 @@ from torch_panda.transforms.strategies import Integers, Mixture, StrategyOption
 
 
 class GoalSampler(SampleTimeTransform):
-    """Adds goals to sampled transitions, each drawn by strategies of its own.
+    """Adds several goals to sampled transitions, each with its own strategy.
 
-    Offline goal-conditioned learning draws goals for values and goals for policies
-    separately (OGBench, Park et al. 2025, arXiv 2410.20092):
+    Offline goal-conditioned algorithms draw different goals for the value function and
+    for the policy (OGBench, Park et al. 2025, arXiv 2410.20092):
 
         GoalSampler(
             {
@@ -29,9 +29,9 @@ class GoalSampler(SampleTimeTransform):
         )
 
     Every row gets a goal under each key, (n, *goal), and the same goal under "next".
-    The first key's goals determine the reward of all rows and, if the functions for
-    them are known, success and ends. The desired goals stay as stored, unless
-    `goal_key` is among the keys.
+    The goals of the first key determine the reward of all rows. They also determine
+    success, "terminated" and "done", if `success_fn` and `terminated_fn` are given. The
+    desired goals stay as stored, unless `goal_key` is one of the keys.
 
     Args:
         strategies: For each key, a strategy as in `HindsightRelabel`: a name, a
@@ -83,7 +83,10 @@ class GoalSampler(SampleTimeTransform):
         strategies: Mapping[Any, StrategyOption] | None = None,
         **options: Any,  # noqa: ANN401
     ) -> Self:
-        """Makes the transform that belongs to an environment; see `BufferTransform`."""
+        """Makes the transform with the goal functions of an environment.
+
+        See `BufferTransform.from_env`.
+        """
         return super().from_env(env, strategies=strategies, **options)
 
     def _get_mixtures(self) -> Collection[Mixture]:
@@ -91,20 +94,22 @@ class GoalSampler(SampleTimeTransform):
 
     def _draw(self, serials: Integers, batch: TensorDictBase) -> dict[NestedKey, Goals]:
         """Draws a goal for each row and key, (n, *goal)."""
-        last_rows, units = self._find_units(serials)
+        last_serials, units = self._find_units(serials)
         oldest = self._memory.oldest
         drawn = {}
         for key, mixture in self._mixtures.items():
-            goals = self._memory.draw(last_rows.clip(oldest), mixture, self._generator)
+            goals = self._memory.draw(
+                last_serials.clip(oldest), mixture, self._generator
+            )
             drawn[key] = goals if units is None else goals[units]
-        # Rows that were overwritten since they were sampled have left the memory. They
-        # get what they achieved themselves.
+        # The memory has forgotten rows that another thread has overwritten since they
+        # were sampled. Give them the goal that they achieved.
         is_forgotten = serials < oldest
         if is_forgotten.any():
             achieved = batch.get(self._rewriter.next_achieved_key)
-            own = achieved.reshape(len(serials), *achieved.shape[batch.ndim :])
+            achieved = achieved.reshape(len(serials), *achieved.shape[batch.ndim :])
             for goals in drawn.values():
-                goals[is_forgotten] = own.numpy(force=True)[is_forgotten]
+                goals[is_forgotten] = achieved.numpy(force=True)[is_forgotten]
         return drawn
 
     def _write(
@@ -117,8 +122,8 @@ class GoalSampler(SampleTimeTransform):
             for key, values in drawn.items()
         }
         rows = torch.arange(len(flat), device=stored_goals.device)
-        first = next(iter(goals.values()))
-        values = self._rewriter.evaluate(flat, rows, first)
+        first_goals = next(iter(goals.values()))
+        values = self._rewriter.evaluate(flat, rows, first_goals)
         for key, new in goals.items():
             values |= {key: new, unravel_key(("next", key)): new.clone()}
         for key, new in values.items():

@@ -1,10 +1,12 @@
-"""Goal strategies: the step whose goal a relabelled transition gets.
+"""Goal strategies, which choose the step whose goal a relabelled transition gets.
 
-The stored steps of a trajectory are numbered from `first` to `end - 1`. A strategy that
-stays within the trajectory chooses one of these steps for a transition of step `step`.
-Strategies "future", "final", "episode" and "random" are those of Andrychowicz et al.
-2017 (arXiv 1707.01495), section 4.5. "geometric" draws the step of a discounted future
-state, as in contrastive RL (Eysenbach et al. 2022, arXiv 2206.07568).
+The stored steps of a trajectory are numbered from `first` to `end - 1`. For a
+transition at step `step`, most strategies choose one of these steps. Only "random" and
+"desired" take goals from other trajectories.
+
+"future", "final", "episode" and "random" are the strategies of Andrychowicz et al. 2017
+(arXiv 1707.01495), section 4.5. "geometric" draws from the discounted future of a
+transition, as contrastive RL does (Eysenbach et al. 2022, arXiv 2206.07568).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -18,26 +20,27 @@ from torch import Generator, Tensor
 
 Integers = NDArray[np.integer[Any]]
 Rows = slice | Integers
-# A user's function: (step, first, end, generator) -> goal step, int32 tensors (n,) on
-# the CPU. Its steps count from the oldest stored step of the trajectory.
+# A user's function: (step, first, end, generator) -> goal step. All steps are int32
+# tensors (n,) on the CPU, and count from the oldest stored step of the trajectory.
 StrategyFunction = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
 Strategy = str | StrategyFunction
 StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
 RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
-# They need only later steps, which are stored as long as the transition is.
+# These strategies never draw an earlier step than the transition's own. A buffer
+# overwrites old transitions first, so it still holds the steps that they draw.
 LOOKING_AHEAD = ("current", "future", "geometric", "final")
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Strategies with the probability of each.
+    """A mixture of strategies. Each row's strategy is drawn from it.
 
     Attributes:
-        weights: Probability of each strategy. They add up to 1.
-        discount: "geometric" draws the goal that is achieved k steps later with a
-            probability proportional to discount**k, up to the last stored step.
+        weights: Probability of each strategy. The probabilities add up to 1.
+        discount: Discount of "geometric", which draws the goal achieved k steps later
+            with a probability proportional to discount**k, up to the last stored step.
     """
 
     weights: Mapping[Strategy, float]
@@ -45,7 +48,7 @@ class Mixture:
 
     @classmethod
     def parse(cls, strategy: StrategyOption, discount: float) -> "Mixture":
-        """Makes the mixture of a strategy, or of a mapping of strategies to weights.
+        """Makes a mixture from one strategy, or from strategies mapped to weights.
 
         Raises:
             ValueError: a strategy is unknown, a weight is not positive and finite, or
@@ -76,9 +79,9 @@ class Mixture:
     def split(
         self, n: int, generator: Generator | None
     ) -> Iterator[tuple[Strategy, Rows]]:
-        """Draws a strategy for each of n rows; yields strategies and their rows."""
+        """Draws a strategy for each of n rows. Yields each strategy with its rows."""
         if len(self.weights) == 1:
-            yield from ((strategy, slice(None)) for strategy in self.weights)
+            yield next(iter(self.weights)), slice(None)
             return
         upper_limits = np.cumsum([*self.weights.values()])[:-1]
         u = draw_uniform(n, generator)
@@ -88,7 +91,7 @@ class Mixture:
 
 
 def draw_uniform(n: int, generator: Generator | None) -> NDArray[np.float64]:
-    """Draws n numbers from [0, 1) with a generator of the CPU, torch's if None."""
+    """Draws n numbers from [0, 1) on the CPU, with torch's generator if it is None."""
     u = torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")
     return u.numpy()
 
@@ -110,7 +113,7 @@ def draw_geometric(
     u = draw_uniform(len(end), generator)
     if discount == 0:
         return np.zeros(len(end), dtype=np.int64)
-    # The inverse of P(k < x) = (1 - discount**x) / (1 - discount**end).
+    # Inverse transform sampling: P(k < x) = (1 - discount**x) / (1 - discount**end).
     x = np.log1p(-u * (1 - discount**end)) / np.log(discount)
     return np.minimum(x.astype(np.int64), end - 1)
 
@@ -123,7 +126,7 @@ def choose_steps(
     discount: float,
     generator: Generator | None,
 ) -> Integers:
-    """Chooses a step of its own trajectory for each transition.
+    """Chooses a step of the same trajectory for each transition.
 
     Args:
         strategy: Name of a strategy other than "random" and "desired", or a user's
@@ -135,7 +138,7 @@ def choose_steps(
         generator: Generator of the random draws, torch's if None.
 
     Raises:
-        ValueError: a user's function did not return stored steps.
+        ValueError: a user's function did not return integers from `first` to `end - 1`.
     """
     if strategy == "current":
         return step
@@ -157,9 +160,10 @@ def _call(
     end: Integers,
     generator: Generator | None,
 ) -> Integers:
-    """Calls a user's strategy, for trajectories whose oldest stored step is step 0."""
+    """Calls a user's strategy with steps that count from the oldest stored step."""
+    first = np.zeros_like(step)
     steps, firsts, ends = (
-        torch.from_numpy(numbers.astype(np.int32)) for numbers in (step, 0 * step, end)
+        torch.from_numpy(numbers.astype(np.int32)) for numbers in (step, first, end)
     )
     chosen = function(steps, firsts, ends, generator)
     is_integer = isinstance(chosen, Tensor) and not chosen.is_floating_point()
@@ -169,5 +173,5 @@ def _call(
             return goal_steps
     raise ValueError(
         f"the strategy must return a tensor of integer steps {tuple(steps.shape)}, "
-        f"from first up to end, got {chosen!r}"
+        f"from first to end - 1, got {chosen!r}"
     )

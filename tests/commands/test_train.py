@@ -168,7 +168,7 @@ def test_other_options_and_other_runs_are_refused(tmp_path):
     args.out = tmp_path
     train.main(args)
     for options, message in (
-        ({"resume": True, "batch_size": 16}, "batch_size was 256, is 16"),
+        ({"resume": True, "batch_size": 16}, "batch_size was 256 and is now 16"),
         ({}, "holds a run: continue it with --resume"),
     ):
         with pytest.raises(SystemExit, match=message):

@@ -72,7 +72,7 @@ def test_ddpg_has_torchrls_losses(env):
     actor, (critic,) = as_modules(agent)
     loss = DDPGLoss(actor, critic, delay_actor=True, loss_function="l2")
     loss.make_value_estimator(gamma=agent.gamma)
-    agent.lowest = None  # torchrl does not clip targets
+    agent.min_return = None  # torchrl does not clip targets
     theirs = loss(normalized(agent, batch.clone()))
     penalty = saturation(agent, batch)
     ours = agent.update(batch)
@@ -83,7 +83,7 @@ def test_ddpg_has_torchrls_losses(env):
 @pytest.mark.parametrize("double_q", [True, False])
 def test_td3_has_torchrls_losses(env, double_q):
     agent = make(env, "td3", action_l2=0.0, double_q=double_q)
-    agent.lowest = None
+    agent.min_return = None
     batch = make_transitions(env, 64)
     actor, critics = as_modules(agent)
     assert len(critics) == 1 + double_q
@@ -154,7 +154,7 @@ class PushGently(torch_panda.Push):
 def test_only_the_librarys_own_sparse_rewards_bound_returns(task, gamma, expected):
     scene = {"robot": torch_panda.Panda(block_gripper=True), "task": task}
     with torch_panda.RobotTaskEnv(**scene, num_envs=1) as env:
-        assert make(env, "ddpg", gamma=gamma).lowest == expected
+        assert make(env, "ddpg", gamma=gamma).min_return == expected
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])

@@ -73,31 +73,31 @@ def test_differences(task):
         torch.testing.assert_close(result, expected)
 
 
-def test_turns_are_the_same_for_the_24_orientations_that_look_alike():
+def test_rotations_are_the_same_for_the_24_orientations_that_look_alike():
     generator = torch.Generator().manual_seed(0)
     with torch_panda.make("PandaFlip-v1", seed=0) as env:
         geometry = read_geometry(env)
-    place = slice(geometry.orientation, geometry.orientation + 4)
+    columns = slice(geometry.orientation, geometry.orientation + 4)
     observation = torch.randn(20, 20, generator=generator)
     goal = normalize(torch.randn(20, 4, generator=generator), dim=-1)
-    cube = observation[:, place] = normalize(observation[:, place], dim=-1)
-    seen, turn, matrix, likeness = geometry.turns(observation, goal)
+    cube = observation[:, columns] = normalize(observation[:, columns], dim=-1)
+    seen, to_goal, matrix, similarity = geometry.rotations(observation, goal)
     # The rotation leads from the cube to the goal, and none of the 24 is smaller.
-    torch.testing.assert_close(matrix, to_matrix(turn).flatten(-2))
+    torch.testing.assert_close(matrix, to_matrix(to_goal).flatten(-2))
     torch.testing.assert_close(
         matrix.view(20, 3, 3) @ to_matrix(cube), to_matrix(goal), atol=1e-5, rtol=0
     )
     others = compose(cube[:, None], STRAIGHT)
-    torch.testing.assert_close(seen[:, place][:, 3], others[..., 3].abs().amax(1))
+    torch.testing.assert_close(seen[:, columns][:, 3], others[..., 3].abs().amax(1))
     # Similarity of the goal with each rotation of the cube's straight orientation.
     turned = compose(STRAIGHT, straighten(cube)[:, None])
     left = rotation_distance(turned, goal[:, None]).squeeze(-1)
-    torch.testing.assert_close(likeness, 1 - left)
+    torch.testing.assert_close(similarity, 1 - left)
     for same in STRAIGHT:
         alike = observation.clone()
-        alike[:, place] = compose(cube, same)
-        again = geometry.turns(alike, compose(goal, same))
-        expected = (seen, turn, matrix, likeness)
+        alike[:, columns] = compose(cube, same)
+        again = geometry.rotations(alike, compose(goal, same))
+        expected = (seen, to_goal, matrix, similarity)
         torch.testing.assert_close(again, expected, atol=1e-5, rtol=0)
 
 

@@ -15,9 +15,9 @@ def states():
     return states_at_objects("PandaPush-v1", seed=3)
 
 
-def place(env, states):
+def start_in(states, env):
     """Start the first environments in these states."""
-    return env.reset(states[: env.num_envs].exclude("placed"), set_state=True)
+    return env.reset(states[: env.num_envs].exclude("first_to_goal"), set_state=True)
 
 
 @pytest.mark.parametrize("task", ["Push", "Slide"])
@@ -25,7 +25,7 @@ def test_hand_beside_an_object_at_rest(task):
     states = states_at_objects(f"Panda{task}-v1", seed=0)
     assert len(states) >= 24
     with torch_panda.make(f"Panda{task}-v1", num_envs=24) as env:
-        td = place(env, states)
+        td = start_in(states, env)
         offset = td["observation"][:, :3] - td["achieved_goal"]
         still = env.step(td.set("action", torch.zeros(24, 3)))["next", "achieved_goal"]
     distance = offset[:, :2].norm(dim=-1)
@@ -41,52 +41,53 @@ def test_hand_holds_an_object(task, number):
     states = states_at_objects(f"Panda{task}-v1", seed=0)
     assert len(states) >= 20
     with torch_panda.make(f"Panda{task}-v1", num_envs=20) as env:
-        td = place(env, states)
+        td = start_in(states, env)
         before = td["achieved_goal"].unflatten(-1, (number, 3))
         for _ in range(6):
             up = torch.tensor([0.0, 0.0, 0.5, -1.0]).repeat(20, 1)
             td = env.step(td.set("action", up))["next"]
         lifted = td["achieved_goal"].unflatten(-1, (number, 3)) - before
     raised = lifted[..., 2] > 0.05
-    placed = states["placed"][:20, 0]
-    assert placed.any() == (task == "Stack")
-    assert (raised[~placed].sum(1) == 1).all()
+    first_to_goal = states["first_to_goal"][:20, 0]
+    assert first_to_goal.any() == (task == "Stack")
+    assert (raised[~first_to_goal].sum(1) == 1).all()
     assert raised.any(0).all()  # every object is held in some state
-    assert not raised[placed][:, :-1].any()
-    if placed.any():
-        # In the other states the last object lies on the table.
-        assert 0.3 < raised[placed, -1].double().mean() < 0.7
+    assert not raised[first_to_goal][:, :-1].any()
+    if first_to_goal.any():
+        # In half of these states the last object lies on the table.
+        assert 0.3 < raised[first_to_goal, -1].double().mean() < 0.7
 
 
 def test_lower_cube_of_a_stack_can_be_at_its_goal():
     """The lower cube is at its goal in half of the states, and it stays there."""
     states = states_at_objects("PandaStack-v1", seed=0, number=64)
-    placed = states[states["placed"][:, 0]]
-    assert 0.4 < len(placed) / len(states) < 0.6
+    with_goal = states[states["first_to_goal"][:, 0]]
+    assert 0.4 < len(with_goal) / len(states) < 0.6
     torch.manual_seed(0)
     with torch_panda.make("PandaStack-v1", num_envs=NUM_ENVS, seed=0) as base:
-        env = TransformedEnv(base, StartFrom(placed, 1.0))
+        env = TransformedEnv(base, StartFrom(with_goal, 1.0))
         td = env.reset()
         lower, upper = td["achieved_goal"].split(3, -1)
         goal = td["desired_goal"][:, :3]
-        begun = (lower - goal).norm(dim=1) < 1e-3
+        at_goal = (lower - goal).norm(dim=1) < 1e-3
         # The other environments had no room and start as usual.
-        assert begun.sum() >= NUM_ENVS / 2
+        assert at_goal.sum() >= NUM_ENVS / 2
         held = upper[:, 2] > 0.1
-        assert (begun & held).any()
-        assert (begun & ~held).any()
+        assert (at_goal & held).any()
+        assert (at_goal & ~held).any()
         for _ in range(10):
             hold = torch.tensor([0.0, 0.0, 0.0, -1.0]).repeat(NUM_ENVS, 1)
             td = env.step(td.set("action", hold))["next"]
             lower, upper = td["achieved_goal"].split(3, -1)
-            torch.testing.assert_close(lower[begun], goal[begun], atol=2e-3, rtol=0)
-            assert (upper[begun & held, 2] > 0.08).all()
+            torch.testing.assert_close(lower[at_goal], goal[at_goal], atol=2e-3, rtol=0)
+            assert (upper[at_goal & held, 2] > 0.08).all()
         assert len(goal.unique(dim=0)) == NUM_ENVS
 
 
 def test_without_room_for_the_object_an_episode_starts_as_usual():
     states = states_at_objects("PandaStack-v1", seed=0)
-    lies = states["placed"][:, 0] & (states["object_pose"][:, -1, 2] < 0.1)
+    last_lies = states["object_pose"][:, -1, 2] < 0.1
+    lies = states["first_to_goal"][:, 0] & last_lies
     with torch_panda.make("PandaStack-v1", num_envs=1, seed=0) as base:
         goal = base.reset()["desired_goal"][0, :2]
         base.set_seed(0)
@@ -140,6 +141,6 @@ def test_partial_reset_leaves_the_others_alone(states):
 
 
 @pytest.mark.parametrize("env_id", ["PandaReach-v1", "PandaPushJoints-v1"])
-def test_tasks_without_such_states(env_id):
+def test_states_at_objects_need_objects_and_end_effector_control(env_id):
     with pytest.raises(ValueError, match=f"end-effector .* got {env_id}"):
         states_at_objects(env_id, seed=0)

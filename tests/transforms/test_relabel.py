@@ -227,7 +227,7 @@ def test_strategy_of_the_user():
 @pytest.mark.parametrize(
     ("strategy", "message"),
     [
-        (lambda step, first, end, rng: end, "from first up to end"),
+        (lambda step, first, end, rng: end, "from first to end - 1"),
         (lambda step, first, end, rng: step.float(), "integer steps"),
         (lambda step, first, end, rng: step[:-1], "integer steps"),
         (lambda step, first, end, rng: step.numpy(), "a tensor of integer.*array"),

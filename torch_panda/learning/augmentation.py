@@ -1,7 +1,8 @@
 """Data augmentation: mirrors transitions and shifts them over the table.
 
-The scene is nearly symmetric, so the augmented transitions are nearly as likely as the
-observed ones. For mirrors see Invariant Transform Experience Replay (arXiv 1909.10707).
+The physics of the scene is nearly the same after a mirroring or a shift, so the
+augmented transitions are nearly as realistic as the observed ones. Mirroring follows
+Invariant Transform Experience Replay (arXiv 1909.10707).
 """
 
 import torch
@@ -18,8 +19,8 @@ class Augmentation:
     """Augments some rows of a batch.
 
     Args:
-        geometry: Layout of observations, goals and actions.
-        mode: Which augmentation to use.
+        geometry: Layout of observations, goals and actions; None if it is unknown.
+        mode: "none", "mirror", or "mirror-shift" for both augmentations.
 
     Raises:
         ValueError: The robot is not under end-effector control.
@@ -60,9 +61,10 @@ def mirror(rows: Transitions, geometry: Geometry) -> Transitions:
 
 
 def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions:
-    """Shift a random half of the rows by up to ``distance`` along x and y [m].
+    """Shift about half of the rows by up to ``distance`` along x and y [m].
 
-    Hand, objects and goals move together, as if the robot's base stood elsewhere.
+    All positions in a row move by the same offset, as if the robot's base stood
+    elsewhere.
     """
     offset = torch.empty_like(rows.goal[:, :2]).uniform_(-distance, distance)
     offset *= torch.rand_like(offset[:, :1]) < 0.5

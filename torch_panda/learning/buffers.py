@@ -12,13 +12,14 @@ from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "augment", "none"]
 
-# From the panda-gym paper (arXiv 2106.13687): hindsight goals per original goal, the
-# HER paper's k, and the capacity in original transitions.
-K = 4
-BUFFER_SIZE = 1_000_000
-SETTLED = 4  # steps after which Slide's puck, which starts in the air, has fallen
-MOVED = 0.01  # change of a goal that counts as motion: [m], or of a quaternion's entry
-POSITION = 3  # entries of each object in a goal
+# Both numbers are from the panda-gym paper (arXiv 2106.13687).
+K = 4  # hindsight goals per original goal; the HER paper's k
+BUFFER_SIZE = 1_000_000  # capacity in original transitions
+SETTLING_STEPS = 4  # steps in which Slide's puck, which starts in the air, falls
+# Smallest change of an achieved goal that counts as motion. The unit is [m], or 1 for
+# the entries of a quaternion.
+MIN_MOTION = 0.01
+POSITION_SIZE = 3  # numbers of each object in a goal
 STORED_KEYS: list[NestedKey] = [
     "observation",
     "desired_goal",
@@ -47,11 +48,11 @@ def make_buffer(
         env: Environment whose transitions will be stored.
         capacity: Number of transitions before relabelling, at most `BUFFER_SIZE`.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
-            hindsight goal. "parts" does so for each object's part of a goal separately.
-            "augment" stores K relabelled copies of each transition. "none" uses the
-            original goals.
+            hindsight goal. "parts" draws for each object separately whether its part of
+            the goal is relabelled. "augment" stores K relabelled copies of each
+            transition. "none" keeps the original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of other
-            transitions. The others were achieved later in the same episode.
+            transitions. The rest are goals achieved later in the same episode.
         seed: Seed of the choice of goals.
 
     Raises:
@@ -67,8 +68,8 @@ def make_buffer(
             env, success_fn=None, k=K, strategy=strategy, seed=seed
         )
     elif her != "none":
-        objects, rest = divmod(env.task.goal_dim, POSITION)
-        if her == "parts" and (rest or objects < 2):
+        num_objects, rest = divmod(env.task.goal_dim, POSITION_SIZE)
+        if her == "parts" and (rest or num_objects < 2):
             raise ValueError(
                 "--her parts needs goals of several objects, such as those of Stack: "
                 "pass --her relabel"
@@ -78,7 +79,7 @@ def make_buffer(
             success_fn=None,
             her_ratio=K / (K + 1),
             strategy=strategy,
-            goal_parts=(POSITION,) * objects if her == "parts" else None,
+            goal_parts=(POSITION_SIZE,) * num_objects if her == "parts" else None,
             seed=seed,
         )
     storage = LazyTensorStorage(capacity, device=env.device)
@@ -88,8 +89,8 @@ def make_buffer(
 def has_moved(data: TensorDictBase) -> Tensor:
     """Find the episodes in which the achieved goal changed.
 
-    In an episode without motion every hindsight goal is achieved already, so it teaches
-    little (arXiv 2012.08850).
+    If an object does not move in an episode, all hindsight goals of this episode are
+    achieved from the start. Such episodes teach little (arXiv 2012.08850).
 
     Args:
         data: Episodes [num_envs, steps].
@@ -98,9 +99,9 @@ def has_moved(data: TensorDictBase) -> Tensor:
         Whether the goal changed, (num_envs,) bool.
     """
     goal = data["next", "achieved_goal"]
-    goal = goal[:, min(SETTLED, goal.shape[1] // 2) :]
+    goal = goal[:, min(SETTLING_STEPS, goal.shape[1] // 2) :]
     change = (goal - goal[:, :1]).abs()
-    return (change > MOVED).flatten(1).any(1)
+    return (change > MIN_MOTION).flatten(1).any(1)
 
 
 def select_episodes(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase:
@@ -108,12 +109,13 @@ def select_episodes(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase
 
     Args:
         data: Episodes [num_envs, steps].
-        keep_unmoved: Fraction to keep of the episodes in which nothing moved.
+        keep_unmoved: Fraction of the episodes without motion that is kept.
 
     Returns:
         Episodes [n, steps] with the entries `STORED_KEYS`.
     """
-    # The next batch begins with a reset, so unfinished episodes end here.
+    # The collector resets all environments before the next batch, so episodes that are
+    # still running end here.
     data["next", "done"][:, -1] = True
     data = data.select(*STORED_KEYS)
     if keep_unmoved == 1:

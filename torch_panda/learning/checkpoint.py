@@ -1,4 +1,4 @@
-"""Saves runs, and resumes them bit for bit."""
+"""Checkpoints of runs, from which a run resumes bit for bit, and locks of folders."""
 
 import json
 import os
@@ -21,9 +21,10 @@ from torch_panda.learning.policy_files import save_policy
 from torch_panda.learning.recipes import find_changes
 
 LOCK = "run.lock"  # file that the process of a run keeps locked
-RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")  # files that show a run
+# A folder with one of these files holds a run.
+RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
 SAVE_INTERVAL = 20_000  # environment steps, or imitation updates, between two saves
-# Options that may differ between a run and its continuation.
+# Options that may change when a run is resumed.
 FREE_OPTIONS = {"resume", "out", "video", "imports"}
 
 
@@ -33,7 +34,7 @@ class Progress:
 
     Attributes:
         steps: Environment steps so far.
-        pretrained: Imitation updates so far.
+        pretrained: Gradient steps of imitation so far.
         seconds: Time spent on stepping and learning, without evaluations.
         curve: One row for each evaluation.
     """
@@ -45,7 +46,7 @@ class Progress:
 
     @property
     def success(self) -> str:
-        """The last success rate in words."""
+        """The last success rate as text, such as "95%"."""
         return f"{self.curve[-1]['success']:.0%}" if self.curve else "unknown"
 
 
@@ -68,7 +69,7 @@ class Checkpoint:
     progress: Progress
 
     def save(self) -> None:
-        """Write the state, and the current policy into checkpoint.pt.
+        """Write the state into ``path``, and the policy into checkpoint.pt beside it.
 
         Raises:
             OSError: A file cannot be written.
@@ -91,21 +92,21 @@ class Checkpoint:
         """Restore the state that `save` wrote.
 
         Raises:
-            ValueError: The file is damaged, or belongs to a run with other options.
+            ValueError: The file is damaged, or its run had other options.
         """
         keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
         finite = ("agent", "optimizer")
         state = files.read(self.path, "the state of a run", keys, finite=finite)
         saved = state["args"]
         differing = [
-            f"{key} was {saved.get(key)!r}, is {value!r}"
+            f"{key} was {saved.get(key)!r} and is now {value!r}"
             for key, value in fixed_options(self.args).items()
             if saved.get(key) != value
         ]
         if differing:
             raise ValueError(
-                f"cannot resume {self.path.parent} with other options: "
-                f"{'; '.join(differing)}"
+                f"cannot resume {self.path.parent} with other options "
+                f"({'; '.join(differing)}): repeat the options of the run"
             )
         self.agent.load_state_dict(state["agent"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
@@ -124,7 +125,7 @@ def crossed(interval: int, before: int, after: int) -> bool:
 
 
 def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
-    """The options that must be the same when a run is resumed."""
+    """Options that must be the same when a run is resumed, as JSON values."""
     options = json.loads(json.dumps(asdict(args), default=str))
     return {key: value for key, value in options.items() if key not in FREE_OPTIONS}
 
@@ -135,12 +136,13 @@ def write_options(
     default: Any,  # noqa: ANN401 (of the same)
     **more: str,
 ) -> None:
-    """Make the folder of a run and write its options into args.json, for plots.
+    """Make the folder of a run, and write its options into args.json.
 
     Args:
         out: Folder of the run.
         args: Options of the run.
-        default: Default options; the file lists the differences under ``changed``.
+        default: Default options. The file lists the options that differ from them under
+            ``changed``, for the legends of plots.
         **more: Further entries of the file.
 
     Raises:
@@ -153,10 +155,11 @@ def write_options(
 
 
 def check_folder(out: Path, *, resume: bool) -> None:
-    """Check that a folder holds a run to resume, or no run if a new one starts.
+    """Check that a run can start in a folder, or be resumed there.
 
     Raises:
-        ValueError: The folder holds a run, or none, or another process uses it.
+        ValueError: There is no run to resume, a new run would overwrite another one, or
+            another process uses the folder.
     """
     if out.exists() and not out.is_dir():
         raise ValueError(f"out must be a folder, got the file {out}")
@@ -176,12 +179,13 @@ def check_folder(out: Path, *, resume: bool) -> None:
 
 @contextmanager
 def lock_folder(out: Path) -> Iterator[None]:
-    """Make the folder of a run, and keep other processes from writing into it.
+    """Context manager that makes the folder of a run, and locks it.
 
-    The operating system releases the lock when the process ends, however it ends.
+    Other processes cannot lock the folder meanwhile. The operating system releases the
+    lock even if the process is killed.
 
     Raises:
-        ValueError: Another process has the lock; the error names it.
+        ValueError: Another process has the lock. The error names the process.
         OSError: The folder cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -191,8 +195,8 @@ def lock_folder(out: Path) -> Iterator[None]:
     except Timeout:
         name = process.read_text() if process.exists() else "another process"
         raise ValueError(
-            f"{name} writes into {out}: stop it first, or choose another folder with "
-            "--out"
+            f"{name} writes into {out}: stop this process first, or choose another "
+            "folder with --out"
         ) from None
     try:
         files.save_text(process, f"process {os.getpid()} on {socket.gethostname()}")
@@ -203,7 +207,7 @@ def lock_folder(out: Path) -> Iterator[None]:
 
 
 class StopSignal:
-    """True after Ctrl-C or SIGTERM. The second signal ends the program as usual."""
+    """Becomes true on Ctrl-C or SIGTERM. A second signal ends the program at once."""
 
     def __init__(self) -> None:
         self.received = False
@@ -216,7 +220,7 @@ class StopSignal:
         tqdm.write("stopping after this iteration; repeat to stop at once")
 
     def release(self) -> None:
-        """Restore the usual effect of the signals."""
+        """Give the signals their usual effect again."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 

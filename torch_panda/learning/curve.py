@@ -1,4 +1,4 @@
-"""Evaluates the agent of a run, and writes and draws its success curve."""
+"""Success curve of a run: evaluates the agent, and writes the curve and its picture."""
 
 import csv
 import io
@@ -16,7 +16,7 @@ from torch_panda.learning.policy_files import save_policy
 from torch_panda.registry import make
 
 EPISODES = 80  # episodes of each evaluation
-NUM_ENVS = 16  # environments that play them in parallel
+NUM_ENVS = 16  # environments that run these episodes in parallel
 
 
 class Curve:
@@ -34,11 +34,13 @@ class Curve:
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
-        """Evaluate the policy, add a row to the curve, and write and draw the curve.
+        """Evaluate the policy, and add a row with the result to the curve.
+
+        This writes curve.csv, curve.png and checkpoint.pt.
 
         Args:
-            progress: Progress of the run, whose curve gets the row.
-            losses: Mean losses since the last evaluation, further columns of the row.
+            progress: Progress of the run. The row is added to its attribute ``curve``.
+            losses: Mean losses since the last evaluation, which are further columns.
 
         Raises:
             OSError: A file cannot be written.
@@ -69,5 +71,9 @@ class Curve:
 
 
 def reseed(env: RobotTaskEnv) -> None:
-    """Seed the next episodes from torch's global generator, which runs save."""
+    """Seed the next episodes from torch's global generator.
+
+    A checkpoint saves the state of this generator. So a resumed run has the same
+    episodes.
+    """
     env.set_seed(int(torch.randint(2**62, ())))

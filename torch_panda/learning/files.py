@@ -1,4 +1,4 @@
-"""Files of tensors and numbers: written whole, and read without running code."""
+"""Files of tensors and numbers, which are written atomically and read safely."""
 
 import os
 import zipfile
@@ -25,17 +25,17 @@ def prepare(path: Path) -> None:
 
 
 def replace(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file whole or not at all, also if the process is killed meanwhile.
+    """Replace a file atomically: even if the process is killed, no half file remains.
 
-    A temporary file in the same folder takes the new content, and then the name.
+    The new content is written into a temporary file, which is then renamed.
 
     Args:
         path: The file.
-        write: Writes the content.
+        write: Function that writes the content into an open file.
 
     Raises:
         OSError: The content cannot be written, for example because the disk is full.
-            The file stays as it was.
+            The old file is kept.
     """
     temporary = path.with_name(path.name + ".new")
     try:
@@ -54,7 +54,7 @@ def replace(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def save(path: Path, content: object) -> None:
-    """Write tensors, numbers, strings and dicts.
+    """Write tensors, numbers, strings and dicts of these into a file.
 
     Raises:
         OSError: The file cannot be written.
@@ -63,7 +63,7 @@ def save(path: Path, content: object) -> None:
 
 
 def save_text(path: Path, text: str) -> None:
-    """Write text.
+    """Write text into a file.
 
     Raises:
         OSError: The file cannot be written.
@@ -79,17 +79,17 @@ def read(
     finite: Iterable[NestedKey] = (),
     **options: Any,  # noqa: ANN401 (those of torch.load)
 ) -> Any:  # noqa: ANN401 (the content)
-    """Read a file that `save` wrote. No code in it is run.
+    """Read a file that `save` wrote. Code in the file is not run.
 
     Args:
         path: The file.
-        what: Content that the file should have, for the error.
-        keys: Keys of this content.
+        what: Description of the expected content for the error, such as "a policy".
+        keys: Keys that the content must have.
         finite: Keys under which all numbers must be finite.
         **options: Options of `torch.load`.
 
     Raises:
-        ValueError: The file is missing or damaged, or has another content.
+        ValueError: The file is missing or damaged, or lacks a key.
     """
     if not path.exists():
         raise ValueError(f"there is no file {path}")
@@ -109,14 +109,12 @@ def read(
 
 
 def get(content: Any, key: NestedKey) -> Any:  # noqa: ANN401 (nested dicts)
-    """The content under a key, which may be a tuple of keys."""
+    """Return the value under a key, which may be a tuple of nested keys."""
     return reduce(getitem, key if isinstance(key, tuple) else (key,), content)
 
 
 def check_archive(path: Path) -> None:
-    """Compare the checksums in an archive of `torch.save` with its content.
-
-    `torch.load` does not compare them.
+    """Verify the checksums of a file of `torch.save`, which `torch.load` does not do.
 
     Raises:
         ValueError: The checksums differ, or the file is not such an archive.

@@ -1,8 +1,8 @@
-"""Finger actions on the scale of cube roots.
+"""Cube roots of finger actions, for a finer control of the fingers.
 
-A tenth of a millimetre decides how firmly the fingers hold a cube. That is a thousandth
-of their action, less than the error of a network. On the scale of cube roots it is a
-tenth.
+How firmly the fingers hold a cube depends on tenths of a millimetre. Such a distance is
+0.001 of the fingers' action, which is less than the error of a network. The cube root
+of 0.001 is 0.1, which a network can learn. So networks output cube roots.
 """
 
 import torch

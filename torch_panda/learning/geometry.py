@@ -1,4 +1,4 @@
-"""Geometry of the tasks: where positions are in observations, and the symmetry."""
+"""Geometry of a task: where its observations hold positions, and how to mirror them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -32,14 +32,14 @@ _MIRROR: dict[Quantity, tuple[float, ...]] = {
     "number": (1.0,),
 }
 
-WIDTH: Quantity = "number"  # of the fingers
+WIDTH: Quantity = "number"  # the distance between the fingers is one number
 
 
 class Part(NamedTuple):
-    """A quantity in an observation or in a goal.
+    """A quantity, such as a position, in an observation or in a goal.
 
     Attributes:
-        quantity: What it is.
+        quantity: The quantity.
         start: Index of its first entry.
     """
 
@@ -51,17 +51,22 @@ class Part(NamedTuple):
 class Geometry:
     """Layout and symmetry of observations, goals and actions.
 
+    The robot and the table are symmetric in the plane y = 0. Multiplying a vector by
+    its factors, which are 1 and -1, mirrors it in this plane.
+
     Attributes:
-        points: Indices into (observation, goal) of the positions of objects and goals.
-        origins: Indices of the positions that are subtracted from them: those of the
-            end-effector for objects, and those of objects for their goals.
+        points: Indices of the coordinates of all objects and goals, in the
+            concatenation of observation and goal.
+        origins: Indices of the coordinates that are subtracted from ``points``: the
+            hand's for an object, and the object's for its goal.
         observation: Factors that mirror an observation, (observation size,).
         goal: Factors that mirror a goal, (goal size,).
         action: Factors that mirror an action, (action size,); None for joint control.
         positions: Indices at which positions start in an observation.
         goal_positions: Indices at which positions start in a goal.
-        goal_height: Height that replaces the height of all goals if the networks see
-            differences of positions [m]; None leaves the goals as they are.
+        goal_height: Height of all goals that the task draws [m]. Networks that see
+            differences of positions get this height for all goals, because achieved
+            goals are lower. None leaves the goals unchanged.
         orientation: Index at which the object's quaternion starts in an observation, if
             goals are orientations; else None.
     """
@@ -77,33 +82,41 @@ class Geometry:
     orientation: int | None
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Offsets of objects from the hand and of goals from objects, (..., n) [m]."""
+        """Offsets from the hand to objects and from objects to goals, (..., n) [m]."""
         inputs = torch.cat((observation, goal), -1)
         return inputs[..., self.points] - inputs[..., self.origins]
 
-    def turns(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
-        """Orientations of a cube without colours, of which 24 look alike.
+    def rotations(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+        """Express the orientations of cube and goal as inputs of the networks.
+
+        A cube without colours looks the same in 24 orientations. Equal looks should
+        give equal inputs, because the fingers grasp the cube in the same way.
 
         Returns:
-            The observation, in which the smallest rotation of the 24 that look alike
-            replaces the cube's. The rotation from the cube to the goal, a quaternion
-            (..., 4). The matrix of this rotation, (..., 9). The similarity of the
-            rotation from the cube's nearest straight orientation to the goal with each
-            of the 24 straight orientations, from 0 to 1, (..., 24).
+            Four tensors:
+
+            - The observation, in which the cube's quaternion is replaced by the
+              smallest rotation that looks the same, (..., observation size).
+            - The rotation from the cube to the goal, quaternion xyzw, (..., 4).
+            - The matrix of this rotation, (..., 9).
+            - The rotation from the cube's nearest straight orientation to the goal, as
+              its similarity with each of the 24 straight orientations, from 0 to 1,
+              (..., 24).
         """
         assert self.orientation is not None
-        place = slice(self.orientation, self.orientation + 4)
-        cube = observation[..., place]
+        columns = slice(self.orientation, self.orientation + 4)
+        cube = observation[..., columns]
         observation = observation.clone()
-        back = inverse(straighten(cube))
-        observation[..., place] = same_half(compose(cube, back))
-        turn = same_half(compose(goal, inverse(cube)))
-        likeness = (compose(goal, back) @ STRAIGHT.to(goal).T).square()
-        return observation, turn, to_matrix(turn).flatten(-2), likeness
+        inverse_straight = inverse(straighten(cube))
+        observation[..., columns] = same_half(compose(cube, inverse_straight))
+        to_goal = same_half(compose(goal, inverse(cube)))
+        straight_to_goal = compose(goal, inverse_straight)
+        similarity = (straight_to_goal @ STRAIGHT.to(goal).T).square()
+        return observation, to_goal, to_matrix(to_goal).flatten(-2), similarity
 
 
 def read_geometry(env: RobotTaskEnv) -> Geometry | None:
-    """The geometry of an environment; None if its task does not declare its layout."""
+    """Return the geometry of an environment, or None if its task declares no layout."""
     robot, task = env.robot, env.task
     if task.observation_layout is None or task.goal_entries is None:
         return None
@@ -119,7 +132,8 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
     _, *objects = (part.start for part in parts if part.quantity == "position")
     positions = [goal for goal in goals if goal[0].quantity == "position"]
     rotations = [goal for goal in goals if goal[0].quantity == "quaternion"]
-    # An object is seen from the hand, and a goal from the object that should go to it.
+    # Pairs of origin and point: the hand and an object, or an object and its goal. The
+    # hand's position is at index 0.
     pairs = [(0, start) for start in objects]
     pairs += [(part.start, size + start) for part, start in positions]
     return Geometry(
@@ -138,7 +152,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
 
 
 def locate(layout: Sequence[Quantity]) -> list[Part]:
-    """The quantities of an observation with the indices at which they start."""
+    """Return the quantities of an observation, with the indices of their starts."""
     parts, start = [], 0
     for quantity in layout:
         parts.append(Part(quantity, start))
@@ -149,15 +163,16 @@ def locate(layout: Sequence[Quantity]) -> list[Part]:
 def locate_goals(
     parts: Iterable[Part], task: Task, first: int
 ) -> list[tuple[Part, int]]:
-    """The quantities that a goal consists of.
+    """Return the quantities of a goal.
 
     Args:
         parts: Quantities of the observation.
         task: The task.
-        first: Index of the first entry of the task in an observation.
+        first: Index at which the task's part of an observation starts.
 
     Returns:
-        Each quantity in the observation, and the index at which it starts in a goal.
+        Each quantity of the goal as a part of the observation, and the index at which
+        it starts in a goal.
     """
     assert task.goal_entries is not None
     offset = first if task.goal_entries.part == "task" else 0

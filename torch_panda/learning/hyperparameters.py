@@ -1,6 +1,6 @@
-"""Hyperparameters of the agents.
+"""Hyperparameters of the agents, which are also options of the commands.
 
-Numbers that no published command changes are constants where they are used.
+Numbers that nobody needs to change are constants in the files that use them.
 """
 
 from dataclasses import dataclass
@@ -22,32 +22,34 @@ class Hyperparameters:
     algo: Algo = "ddpg"
     """algorithm"""
     double_q: bool = True
-    """learn two critics. Targets take the smaller value (TD3, SAC) or the lower
-    quantiles of both (TQC). DDPG always has one critic"""
+    """learn two critics, and use the smaller value (TD3, SAC) or the lower quantiles
+    (TQC) as target. DDPG always has one critic"""
     gamma: Discount | None = None
-    """discount factor; None means 1 - 1 / (steps of an episode), as in Baselines"""
+    """discount factor; None means 1 - 1 / (steps of an episode), as in OpenAI
+    Baselines"""
     network: Network = "paper"
     """hidden layers of actors and critics: three of 256 units ("paper"), the same with
     LayerNorm ("layer-norm"), or three of 448 units with LayerNorm ("wide")"""
     target_interval: Positive = 1
-    """gradient steps between two moves of the target networks"""
+    """gradient steps between two updates of the target networks"""
     action_l2: Weight = 1.0
     """DDPG, TD3: weight of the mean squared action in the actor's loss"""
     noise_eps: Weight = 0.2
     """DDPG, TD3: standard deviation of the Gaussian noise on actions"""
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)
-    """ratio of exploring steps in the first and in the last of the parallel
-    environments; those between are evenly spaced. SAC and TQC need "points" for it"""
+    """fraction of exploring steps in the first and in the last of the parallel
+    environments. The fractions of the other environments are evenly spaced between
+    them. SAC and TQC use this option only with exploration "points" """
     exploration: Exploration = "actions"
-    """explore with random actions (DDPG, TD3), or by moving towards random points
-    ("points"; joint control moves to random joint positions)"""
+    """how to explore: with random actions ("actions"; DDPG, TD3), or by moving the hand
+    towards random points ("points"; under joint control, random joint positions)"""
     relative_inputs: RelativeInputs = "none"
-    """further inputs of the networks: offsets of objects from the hand and of goals
-    from objects ("coarse"); these and their values clipped at 3 cm, so that millimetres
-    count ("fine")"""
+    """additional inputs of the networks: "coarse" adds the offsets from the hand to
+    objects and from objects to goals; "fine" also adds these offsets clipped at 3 cm,
+    which shows differences of millimetres"""
     fine_fingers: bool = False
-    """let networks and noise act on the cube root of the fingers' action, so that a
-    tenth of a millimetre counts"""
+    """let networks and noise work with the cube root of the fingers' action, which
+    makes differences of 0.1 mm visible"""
     augmentation: AugmentationKind = "none"
     """mirror half of each batch in the robot's plane of symmetry ("mirror"), and also
-    shift half of it over the table ("mirror-shift")"""
+    shift half of each batch over the table ("mirror-shift")"""

@@ -1,4 +1,4 @@
-"""Imitation of demonstrations in the actor's loss (Nair et al., arXiv 1709.10089)."""
+"""Imitation loss of the actor, which Nair et al. add to DDPG (arXiv 1709.10089)."""
 
 from torch import Tensor
 
@@ -8,7 +8,9 @@ BC_WEIGHT = 20.0  # weight of imitation in the actor's loss
 def imitation_loss(
     action: Tensor, demonstrated: Tensor, value: Tensor, demonstrated_value: Tensor
 ) -> Tensor:
-    """Mean squared difference to those demonstrated actions that the critic prefers.
+    """Weighted squared distance from the demonstrated actions that the critic prefers.
+
+    Demonstrated actions with a lower value than the policy's actions count as 0.
 
     Args:
         action: Actions of the policy, (n, action size).

@@ -36,7 +36,7 @@ Discount = Annotated[float, Limit("above 0 and at most 1", lambda x: 0 < x <= 1)
 
 
 def check_limits(args: object) -> None:
-    """Check the options of a command; None is always accepted.
+    """Check the options of a command. An option that is None is always accepted.
 
     Raises:
         ValueError: An option is out of its limits.
@@ -52,7 +52,7 @@ def check_limits(args: object) -> None:
 
 
 def find_limits(hint: Any) -> Iterator[Limit]:  # noqa: ANN401 (any type)
-    """The limits in a type, also inside a union or a tuple."""
+    """Yield the limits in a type, also those inside a union or a tuple."""
     for part in get_args(hint):
         if isinstance(part, Limit):
             yield part

@@ -1,17 +1,24 @@
-"""Networks of actors and critics."""
+"""Multilayer perceptrons of actors and critics."""
 
 from torch import nn
 from torchrl.modules import MLP
 
 from torch_panda.learning.hyperparameters import Network
 
-# Units of each of the three hidden layers: the panda-gym paper's number, and the most
-# for which a policy's file stays below 2 MB.
-HIDDEN_SIZE, WIDE_SIZE = 256, 448
+# Units of each hidden layer.
+HIDDEN_SIZE = 256  # as in the panda-gym paper
+WIDE_SIZE = 448  # the largest size with which the file of a policy is below 2 MB
 
 
 def make_mlp(inputs: int, outputs: int, network: Network) -> MLP:
-    """Make a network with three hidden layers that concatenates its inputs."""
+    """Make a network with three hidden layers, which concatenates its arguments.
+
+    Args:
+        inputs: Number of inputs, over all arguments of the network.
+        outputs: Number of outputs.
+        network: Size of the hidden layers, and whether they have LayerNorm; see
+            `Hyperparameters.network`.
+    """
     size = WIDE_SIZE if network == "wide" else HIDDEN_SIZE
     is_normalized = network != "paper"
     norm = {"normalized_shape": size}

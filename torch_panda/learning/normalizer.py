@@ -1,4 +1,4 @@
-"""Inputs of the networks: observation and goal, standardised."""
+"""Standardised inputs of the networks: observation, goal, and differences of both."""
 
 import torch
 from torch import Tensor, nn
@@ -8,15 +8,16 @@ from torch_panda.learning.spaces import Spaces
 
 CLIP_OBSERVATION = 200.0  # from the panda-gym paper
 CLIP_NORMALIZED = 5.0  # from the HER of OpenAI Baselines
-FINE = 0.03  # limit at which "fine" differences are clipped [m]
+FINE_LIMIT = 0.03  # "fine" inputs are differences that are clipped at this limit [m]
 
 
 class Normalizer(nn.Module):
-    """Running standardisation of the inputs, as in OpenAI Baselines.
+    """Subtracts the running mean and divides by the deviation, as OpenAI Baselines.
 
     Args:
         spaces: Sizes and layout of observations and goals.
-        relative_inputs: Differences of positions that the networks see in addition.
+        relative_inputs: Whether differences of positions are inputs too; see
+            `Hyperparameters.relative_inputs`.
     """
 
     count: Tensor
@@ -33,7 +34,9 @@ class Normalizer(nn.Module):
             num_parts = ("none", "coarse", "fine").index(relative_inputs)
             size += len(geometry.points) * num_parts
             if num_parts and geometry.orientation is not None:
-                size += 9 + 24  # the turn's matrix and likenesses
+                size += (
+                    9 + 24
+                )  # the matrix and the similarities of `Geometry.rotations`
         self.geometry, self.relative_inputs = geometry, relative_inputs
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
@@ -58,6 +61,7 @@ class Normalizer(nn.Module):
         return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Concatenate observation, goal and relative inputs, (..., state size)."""
         inputs = [observation, goal]
         geometry = self.geometry
         if geometry is not None and self.relative_inputs != "none":
@@ -68,7 +72,7 @@ class Normalizer(nn.Module):
             differences = geometry.differences(observation, goal)
             inputs = [observation, goal, differences]
             if geometry.orientation is not None:
-                inputs = [*geometry.turns(observation, goal), differences]
+                inputs = [*geometry.rotations(observation, goal), differences]
             if self.relative_inputs == "fine":
-                inputs.append(differences.clamp(-FINE, FINE))
+                inputs.append(differences.clamp(-FINE_LIMIT, FINE_LIMIT))
         return torch.cat(inputs, -1).clamp_(-CLIP_OBSERVATION, CLIP_OBSERVATION)

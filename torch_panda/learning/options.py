@@ -1,4 +1,4 @@
-"""Options of a training, and checks that they fit together."""
+"""Options of a training, and checks of their values."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,23 +26,23 @@ class Args(Hyperparameters):
 
     preset: Literal["paper", "tuned"] = "paper"
     """defaults of the other options: those of the panda-gym paper ("paper"), or the
-    task's recipe ("tuned"). "tuned" also stores only a tenth of the episodes in which
-    nothing moved"""
+    task's recipe ("tuned"). "tuned" also skips nine of ten episodes in which no object
+    moved"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
-    """hindsight, with four hindsight goals for each original one: relabel sampled
-    transitions ("relabel"), or each object's part of the goal separately ("parts"),
-    store relabelled copies ("augment"), or use none ("none")"""
+    """hindsight goals, four for each original goal: relabel transitions when they are
+    sampled ("relabel"), the same for each object's part of the goal separately
+    ("parts"), or store relabelled copies ("augment"). "none" uses no hindsight"""
     desired_ratio: Ratio = 0.0
-    """fraction of the hindsight goals that are desired goals of other transitions; the
-    others were achieved later in the same episode"""
+    """fraction of the hindsight goals that are desired goals of other transitions. The
+    rest are goals achieved later in the same episode"""
     seed: Seed = 0
     """seed of the environments, the networks and the sampling"""
     num_envs: Positive = 4
     """number of environments stepped in parallel"""
     total_steps: Count = 4_000
-    """environment steps, counted over all environments; 0 stops after the
+    """environment steps, summed over all environments; 0 stops after the
     `pretrain_updates`"""
     updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
@@ -52,17 +52,17 @@ class Args(Hyperparameters):
     """let the learning rate fall linearly to 0"""
     start_at_object: Ratio = 0.0
     """fraction of training episodes that start in the middle of the task: the hand is
-    at an object or holds it, or the first cube of Stack is placed. Episodes then last
-    at most 50 steps"""
+    at an object or holds it, or the first cube of Stack is at its goal. If it is above
+    0, all episodes last at most 50 steps"""
     randomize: Factor = 1.0
-    """draw masses and frictions of objects and table for every training episode, from
-    the task's values divided by this factor to the values multiplied by it"""
+    """draw the masses and frictions of objects and table for every training episode,
+    between 1 / factor and factor times the task's values"""
     demos: Path | None = None
-    """demonstrations to learn from, in addition to the run's own transitions: a file of
-    `record`, or the folder of a data set"""
+    """demonstrations to learn from, in addition to the transitions of the run: a file
+    of `record`, or the folder of a data set"""
     pretrain_updates: Count = 0
-    """gradient steps that imitate the demonstrations before the first environment step;
-    the learning rate falls to 0 meanwhile"""
+    """gradient steps that imitate the demonstrations before the first environment step.
+    During these, the learning rate falls to 0"""
     eval_interval: Positive = 400
     """environment steps between evaluations"""
     out: Path | None = None
@@ -70,7 +70,7 @@ class Args(Hyperparameters):
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
-    """continue the run in that folder, with the same other options"""
+    """continue the run in the folder; the other options must be the same"""
     device: str = "cpu"
     """device of the networks and the replay buffer"""
     video: bool = True
@@ -78,10 +78,10 @@ class Args(Hyperparameters):
 
 
 def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
-    """Check that the exploration noise is not 0 in all environments.
+    """Check that DDPG and TD3 explore, which they do only by noise.
 
     Raises:
-        ValueError: It is, and the algorithm needs it.
+        ValueError: The exploration noise is 0 in all environments.
     """
     explores = hp.noise_eps or any(hp.random_eps[:num_envs])
     if hp.algo in ("ddpg", "td3") and not explores:
@@ -107,7 +107,7 @@ def check(args: Args) -> None:
 
 
 def default_args(preset: str, env_id: str) -> Args:
-    """Default options of a preset for the task of an id."""
+    """Return the default options of a preset for the task of an id."""
     if preset == "paper":
         return Args(env_id=env_id)
     return Args(preset="tuned", env_id=env_id, **find_recipe(env_id))

@@ -1,4 +1,4 @@
-"""Trained policies as files: their weights, and the numbers to build them from."""
+"""Files of trained policies: their weights, and the numbers to build the networks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -22,11 +22,11 @@ from torch_panda.policies import shipped_policies
 class Policy(TensorDictModuleBase):
     """A trained policy, from ``observation`` and ``desired_goal`` to ``action``.
 
-    It acts deterministically, whatever torchrl's exploration type is, and computes no
+    It acts deterministically under every exploration type of torchrl, and computes no
     gradients. Batches may have any shape.
 
     Args:
-        module: The networks, as `Agent.policy`.
+        module: Module that writes ``action``, such as `Agent.policy`.
         env_id: Id of the environment that the policy was trained on.
         spaces: Sizes of observations, goals and actions.
     """
@@ -43,10 +43,10 @@ class Policy(TensorDictModuleBase):
     def forward(  # type: ignore[override]
         self, tensordict: TensorDictBase
     ) -> TensorDictBase:
-        """Write the action for every observation and goal.
+        """Write an action for every observation and goal.
 
         Raises:
-            ValueError: Observations or goals have other sizes than in training.
+            ValueError: The size of observations or goals is not that of the training.
         """
         state = tensordict.select(*self.in_keys)
         sizes = (self.spaces.observation_size, self.spaces.goal_size)
@@ -82,7 +82,7 @@ class SavedPolicy:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read what `save_policy` wrote, onto the CPU. No code in the file is run.
+        """Read a file of `save_policy` onto the CPU. Code in the file is not run.
 
         Args:
             path: The file, or the folder of a run.
@@ -108,15 +108,15 @@ class SavedPolicy:
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
     def make_agent(self, env: RobotTaskEnv | None = None) -> Agent:
-        """A new agent with this policy, and with critics that have learned nothing.
+        """Make an agent with this policy, and with untrained critics.
 
         Args:
-            env: Environments in which the agent explores; None means such as in
-                training.
+            env: Environments in which the agent will explore. None means as many
+                environments as in the training.
 
         Raises:
-            ValueError: The environments have other spaces than in training, or the
-                weights do not fit the hyperparameters.
+            ValueError: The sizes of the environments' spaces are not those of the
+                training, or the weights do not fit the hyperparameters.
         """
         spaces = self.spaces
         if env is not None:
@@ -141,16 +141,17 @@ class SavedPolicy:
 
 
 def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparameters:
-    """Build hyperparameters from those of a file.
+    """Make the hyperparameters that a file holds.
 
     Raises:
-        ValueError: The file has options or values that this version does not have.
+        ValueError: This version of torch_panda does not know one of their names or
+            values.
     """
     accepted = {field.name for field in fields(Hyperparameters)}
     if unknown := values.keys() - accepted:
         raise ValueError(
             f"{path} was saved by another version of torch_panda, with options that "
-            f"this one does not have: {', '.join(sorted(unknown))}"
+            f"this version does not have: {', '.join(sorted(unknown))}"
         )
     for name, hint in get_type_hints(Hyperparameters).items():
         choices = get_args(hint) if get_origin(hint) is Literal else ()
@@ -163,7 +164,7 @@ def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparamet
 
 
 def save_policy(path: Path, agent: Agent, env_id: str) -> None:
-    """Write what `load_policy` needs: tensors, numbers and strings.
+    """Write a policy into a file that `load_policy` reads.
 
     Args:
         path: The file to write.
@@ -185,19 +186,19 @@ def save_policy(path: Path, agent: Agent, env_id: str) -> None:
 def load_policy(id_or_path: str | Path) -> Policy:
     """Load a trained policy: one that torch_panda ships, or one of your own runs.
 
-    The file is read without running code in it. Neither the environment's id nor an
-    extra is needed.
+    Code in the file is not run. No extra of the package is needed.
 
     Args:
         id_or_path: Id of an environment whose policy ships with torch_panda, such as
-            ``"PandaPush-v1"``; or the folder of a run; or a file of such a folder.
+            ``"PandaPush-v1"``; or the folder of a run; or a policy's file, such as
+            checkpoint.pt in this folder.
 
     Returns:
         A TensorDictModule on the CPU, which acts deterministically and computes no
         gradients.
 
     Raises:
-        ValueError: There is no such policy, or the file holds none.
+        ValueError: There is no such policy, or the file does not hold a policy.
     """
     shipped = shipped_policies()
     if isinstance(id_or_path, str) and id_or_path in shipped:
@@ -207,7 +208,7 @@ def load_policy(id_or_path: str | Path) -> Policy:
     if not path.exists():
         raise ValueError(
             f"no policy {str(id_or_path)!r}: pass the folder of a run, a .pt file, or "
-            f"an id with a policy, which are {', '.join(shipped)}"
+            f"one of the ids that have a policy, {', '.join(shipped)}"
         )
     saved = SavedPolicy.read(path)
     with torch.random.fork_rng(devices=[]):  # new networks draw random weights

@@ -1,4 +1,4 @@
-"""Imitation of demonstrations by gradient steps, before or without rewards."""
+"""Imitation of demonstrations before (or without) reinforcement learning."""
 
 import time
 
@@ -10,7 +10,7 @@ from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint
 
 
 def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:
-    """Make a buffer that holds these transitions with their original goals."""
+    """Make a replay buffer that holds demonstrations, without hindsight."""
     storage = LazyTensorStorage(len(demos), device=demos.device or "cpu")
     buffer = TensorDictReplayBuffer(storage=storage)
     buffer.extend(demos)
@@ -26,17 +26,18 @@ def pretrain(
     learning_rate: float = 1.0,
     stop: object = False,
 ) -> None:
-    """Imitate demonstrations, from the current progress of a run on, and save the run.
+    """Take the gradient steps of imitation that a run has not taken yet, and save it.
 
     The learning rate falls linearly to 0.
 
     Args:
         checkpoint: State of the run.
         demos: Demonstrations.
-        updates: Number of gradient steps, with those that the run has taken already.
+        updates: Total number of gradient steps, including those before a resume.
         batch_size: Transitions per gradient step.
-        learning_rate: Factor on the learning rate of training, at the first step.
-        stop: Ends the imitation early when it is true.
+        learning_rate: Learning rate of the first step, as a fraction of that of
+            training.
+        stop: Object that becomes true to end the imitation early, such as `StopSignal`.
     """
     agent, progress = checkpoint.agent, checkpoint.progress
     bar = tqdm(

@@ -1,7 +1,7 @@
 """Recipes: the options of ``train --preset tuned`` for each task.
 
-Options that a recipe leaves out have the default, which is the panda-gym paper's. An
-option on the command line overrides the recipe.
+An option that is not in a recipe keeps its default, which is the value of the panda-gym
+paper. An option on the command line overrides the recipe.
 """
 
 from dataclasses import asdict
@@ -29,21 +29,22 @@ OBJECT: dict[str, Any] = {
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
 }
-# Options that do not make another way to train, so not another line in a plot.
-PLAIN_OPTIONS = {
+# Options that plots do not name. Runs that differ only in these options belong to the
+# same line of a plot.
+UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
     *("out", "resume", "device", "video", "imports"),
 }
-# Options that need end-effector control.
+# Options that are left out under joint control, because they need the end-effector's.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
 RECIPES: dict[type[Task], dict[str, Any]] = {
     Reach: {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
-    # The first environment takes no random actions, and the last one half of them. The
-    # policy learns in half the steps that it needs with 30 to 100 %.
+    # With 0 to 50 % random actions, learning needs half as many steps as with 30 to
+    # 100 %.
     Push: {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
-    # Goals out of reach are rarely achieved, so half of the hindsight goals are desired
-    # goals of other transitions. The first environment takes no random actions: the
-    # whole strike decides where the puck stops, and random actions spoil most strikes.
+    # The goals are out of the arm's reach and rarely achieved, so half of the hindsight
+    # goals are desired goals of other transitions. There are few random actions,
+    # because a single one during a strike changes where the puck stops.
     Slide: {
         "num_envs": 8,
         "gamma": 0.98,
@@ -83,8 +84,9 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 1_000_000,
         "eval_interval": 20_000,
     },
-    # For imitation; rewards alone have not solved the task. Tenths of a millimetre
-    # separate a firm grasp from one in which the cube swings.
+    # For training with demonstrations: without them no training has solved the task. A
+    # tenth of a millimetre separates a firm grasp from one in which the cube swings, so
+    # the recipe has fine fingers.
     Flip: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -93,7 +95,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 1_000_000,
     },
     Drawer: {**OBJECT, "anneal_lr": True, "total_steps": 20_000},
-    # For imitation; not tested without demonstrations.
+    # For training with demonstrations; not tested without them.
     PegInsertion: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -105,7 +107,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
 
 
 def find_recipe(env_id: str) -> dict[str, Any]:
-    """The recipe for the task of an id; empty if there is none.
+    """Return the recipe for the task of an id, which is empty if there is none.
 
     Raises:
         ValueError: The id is unknown.
@@ -114,13 +116,26 @@ def find_recipe(env_id: str) -> dict[str, Any]:
     recipe = RECIPES.get(type(registration.make_task()), {})
     if registration.make_robot().control_type == "ee":
         return recipe
-    return {k: x for k, x in recipe.items() if k not in END_EFFECTOR_OPTIONS}
+    return {
+        name: value
+        for name, value in recipe.items()
+        if name not in END_EFFECTOR_OPTIONS
+    }
 
 
 def find_changes(args: Any, default: Any) -> dict[str, Any]:  # noqa: ANN401 (dataclasses)
-    """The options that differ from the default, for the labels of plots."""
+    """Return the options that differ from their defaults, for the labels of plots.
+
+    Args:
+        args: Options of a run.
+        default: Default options, of the same dataclass.
+    """
     options, defaults = asdict(args), asdict(default)
-    plain = PLAIN_OPTIONS
-    if options.get("anneal_lr"):  # then the learning rate depends on the total steps
-        plain = plain - {"total_steps"}
-    return {k: x for k, x in options.items() if x != defaults[k] and k not in plain}
+    unplotted = UNPLOTTED_OPTIONS
+    if options.get("anneal_lr"):  # the learning rate depends on the total steps
+        unplotted = unplotted - {"total_steps"}
+    return {
+        name: value
+        for name, value in options.items()
+        if value != defaults[name] and name not in unplotted
+    }

@@ -1,6 +1,7 @@
-"""The numbers of an environment that agents are built from.
+"""Sizes and layout of an environment, from which agents build their networks.
 
-They are saved with a policy, so that a file alone is enough to build it again.
+They are saved with a policy, so that its file alone is enough to build the networks
+again.
 """
 
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ class Spaces:
         observation_size: Size of ``observation``.
         goal_size: Size of ``desired_goal``.
         action_size: Size of ``action``.
-        num_envs: Number of environments that explore in parallel.
+        num_envs: Number of environments in which the agent explores in parallel.
         max_episode_steps: Number of steps after which an episode is truncated.
         has_free_gripper: Whether the last number of an action moves the fingers.
         has_sparse_reward: Whether every reward is -1 or 0.
@@ -53,25 +54,25 @@ class Spaces:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Undo `to_dict`."""
+        """Make the object from the return value of `to_dict`."""
         geometry = values["geometry"]
         if geometry is not None:
             geometry = Geometry(**geometry)
         return cls(**{**values, "geometry": geometry})
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as nested dicts of numbers and tuples, which `torch.save` writes."""
+        """Convert to nested dicts of numbers and tuples, for `torch.save`."""
         return asdict(self)
 
     def action_spec(self, *batch_size: int) -> TensorSpec:
-        """The spec of actions in [-1, 1], on torch's default device."""
+        """Make the spec of actions, (*batch_size, action size), on the default device."""
         device = torch.get_default_device()
         shape = torch.Size((*batch_size, self.action_size))
         return Bounded(-1.0, 1.0, shape, device=device)
 
 
 def read_spaces(env: RobotTaskEnv) -> Spaces:
-    """The numbers of a batch of environments."""
+    """Read the sizes and the layout of an environment."""
     robot, task = env.robot, env.task
     return Spaces(
         observation_size=env.observation_spec["observation"].shape[-1],
@@ -88,7 +89,7 @@ def read_spaces(env: RobotTaskEnv) -> Spaces:
 
 
 def has_sparse_reward(task: Task) -> bool:
-    """Whether the rewards of a task are the sparse ones of `Task`, -1 and 0."""
+    """Whether all rewards of a task are the -1 and 0 of `Task`, not a subclass's own."""
     cls = type(task)
     overrides = (
         cls.compute_reward is not Task.compute_reward or cls.reward is not Task.reward

@@ -3,7 +3,8 @@
 Hindsight goals teach nothing about an object until something moves it. The authors of
 HER started half of the episodes of pick-and-place with the box in the hand (arXiv
 1707.01495, section 4.1). Lanier et al. started with some blocks stacked (arXiv
-1906.03710). Here a scripted hand makes such states.
+1906.03710). Here a scripted hand makes such states before the training, and `StartFrom`
+starts some training episodes in them.
 """
 
 from math import pi
@@ -15,24 +16,34 @@ from torchrl.envs import Transform
 from torch_panda.experts.moves import carry, go_over, is_held, norm
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.registry import make
+from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Flip, Push, Slide, Stack
 
-APPROACH = 45  # steps that the scripted hand takes
+SCRIPT_STEPS = 45  # steps in which the scripted hand reaches its position
 # Distance at which a hand with a blocked gripper stops beside an object, between the
 # centres [m]. The fingers, at most 2.3 cm long and wide, do not touch it then.
 GAP = (0.055, 0.08)
-# Height at which the hand holds the last of several objects above the first [m].
+# Height of an object that is held up above the others [m].
 LIFTED = (0.12, 0.2)
 ROOM = 0.08  # smallest distance between the centres of two objects [m]
-OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # action of a hand that waits
+OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # action of a hand that waits with open fingers
 PLACED_KEYS = ["joint_position", "joint_velocity", "object_pose", "object_velocity"]
 
 
 def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict:
-    """Make states in which the hand holds an object, or is beside it.
+    """Make states in which the hand is at an object.
 
-    With two objects, the states take them in turn. In half of these states the first
-    object can be placed anywhere, and the last one is held up or lies on the table.
+    A hand with a blocked gripper stops beside the object. A hand with a free gripper
+    holds the object. With two objects (Stack) there are four situations, which are
+    equally frequent:
+
+    - The hand holds the first object.
+    - The hand holds the last object.
+    - The hand holds the last object up. ``first_to_goal`` is true.
+    - The hand waits above the objects. ``first_to_goal`` is true.
+
+    Where ``first_to_goal`` is true, `StartFrom` moves the first object to the goal of
+    the episode, so that the last object remains to be placed.
 
     Args:
         env_id: Id of the environment.
@@ -40,8 +51,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
         number: Number of attempts.
 
     Returns:
-        States (n,) of robot and objects as in `RobotTaskEnv.get_state`, and whether the
-        first object can be ``placed``. Failed attempts are left out, so n is at most
+        States (n,) with the entries `PLACED_KEYS` of `RobotTaskEnv.get_state` and
+        ``first_to_goal``, (n, 1) bool. Failed attempts are left out, so n is at most
         ``number``.
 
     Raises:
@@ -62,32 +73,35 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 f"PickAndPlace, Slide, Stack and Flip, got {env_id}: pass "
                 "--start-at-object 0"
             )
+        # For each situation, the index at which the position of the hand's object
+        # starts in an observation.
         _, *objects = geometry.positions
         last = objects[-1]
-        turns = [*objects, last, last] if len(objects) > 1 else objects
-        turn = (torch.arange(number) % len(turns)).unsqueeze(1)
-        place = torch.tensor(turns)[turn] + torch.arange(3)
-        placed, waits = turn >= len(objects), turn > len(objects)
+        targets = [*objects, last, last] if len(objects) > 1 else objects
+        situation = (torch.arange(number) % len(targets)).unsqueeze(1)
+        target_columns = torch.tensor(targets)[situation] + torch.arange(3)
+        first_to_goal = situation >= len(objects)
+        waits = situation > len(objects)
         angle, gap, lift = uniform(0, 2 * pi), uniform(*GAP), uniform(*LIFTED)
         beside = gap * torch.cat((angle.cos(), angle.sin(), 0 * angle), -1)
-        blocked = env.action_spec_unbatched.shape[-1] == 3
+        has_blocked_gripper = env.action_spec_unbatched.shape[-1] == 3
         td = env.reset()
-        for _ in range(APPROACH):
+        for _ in range(SCRIPT_STEPS):
             observation = td["observation"]
             hand, width = observation[:, :3], observation[:, 6:7]
-            item = observation.gather(1, place)
-            if blocked:
-                action = go_over(hand, item + beside, 0.1, limit=0.6)
-                arrived = norm(item + beside - hand) < 0.01
+            target = observation.gather(1, target_columns)
+            if has_blocked_gripper:
+                action = go_over(hand, target + beside, 0.1, limit=0.6)
+                arrived = norm(target + beside - hand) < 0.01
             else:
-                height = torch.where(placed, lift, item[:, 2:])
-                goal = torch.cat((item[:, :2], height), 1)
-                action = carry(hand, width, item, goal)
-                arrived = is_held(hand, width, item) & (norm(goal - item) < 0.02)
+                height = torch.where(first_to_goal, lift, target[:, 2:])
+                point = torch.cat((target[:, :2], height), 1)
+                action = carry(hand, width, target, point)
+                arrived = is_held(hand, width, target) & (norm(point - target) < 0.02)
                 arrived = arrived | waits
                 action = torch.where(waits, torch.tensor(OPEN_HAND), action)
             td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
-        state = env.get_state().select(*PLACED_KEYS).set("placed", placed)
+        state = env.get_state().select(*PLACED_KEYS).set("first_to_goal", first_to_goal)
     speed = state["object_velocity"].abs().flatten(1).amax(1, keepdim=True)
     return state[(arrived & (speed < 0.1)).squeeze(1)]
 
@@ -97,7 +111,8 @@ class StartFrom(Transform):
 
     Args:
         states: States (n,) of `states_at_objects`.
-        ratio: Fraction of the episodes; torch's global generator chooses them.
+        ratio: Fraction of the episodes that start in these states. torch's global
+            generator chooses the episodes.
     """
 
     def __init__(self, states: TensorDict, ratio: float) -> None:
@@ -110,29 +125,31 @@ class StartFrom(Transform):
     ) -> TensorDictBase:
         assert self.parent is not None
         env = self.parent.base_env
-        chosen = torch.rand(*env.batch_size, 1) < self.ratio
+        is_chosen = torch.rand(*env.batch_size, 1) < self.ratio
         requested = tensordict.get("_reset", None)
         if requested is not None:
-            chosen &= requested.cpu()
-        if not chosen.any():
+            is_chosen &= requested.cpu()
+        if not is_chosen.any():
             return tensordict_reset
-        drawn = torch.randint(len(self.states), env.batch_size)
+        indices = torch.randint(len(self.states), env.batch_size)
         state: TensorDict
-        state = self.states[drawn].clone()  # type: ignore[assignment]  # a TensorDict
-        placed: torch.Tensor = state.pop("placed")
-        placed = placed.squeeze(-1)
-        if placed.any():  # put the first object at the goal of its episode
+        state = self.states[indices].clone()  # type: ignore[assignment]  # a TensorDict
+        first_to_goal: torch.Tensor = state.pop("first_to_goal")
+        first_to_goal = first_to_goal.squeeze(-1)
+        if first_to_goal.any():
             goal = tensordict_reset["desired_goal"].to(state["object_pose"])
-            rest = goal.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goal), 4)
-            pose, last = torch.cat((goal[:, :3], rest), 1), state["object_pose"][:, -1]
-            # It must not touch the other object.
-            free = (pose - last)[:, :3].norm(dim=1) > ROOM
-            chosen &= (free | ~placed).unsqueeze(-1)
-            if not chosen.any():
+            rotation = goal.new_tensor(NO_ROTATION).expand(len(goal), 4)
+            pose_at_goal = torch.cat((goal[:, :3], rotation), 1)
+            # If the last object is in the way, the episode starts as usual.
+            to_last = (pose_at_goal - state["object_pose"][:, -1])[:, :3]
+            has_room = to_last.norm(dim=1) > ROOM
+            is_chosen &= (has_room | ~first_to_goal).unsqueeze(-1)
+            if not is_chosen.any():
                 return tensordict_reset
-            state["object_pose"][placed, 0] = pose[placed]
-            state["object_velocity"][placed, 0] = 0.0
-        # The other environments keep the observations of their first reset.
+            state["object_pose"][first_to_goal, 0] = pose_at_goal[first_to_goal]
+            state["object_velocity"][first_to_goal, 0] = 0.0
+        # Reset the chosen environments again, to these states. The others keep the
+        # observations of the first reset.
         start = tensordict_reset.copy().update(state.to(env.device))
-        start = env.reset(start.set("_reset", chosen.to(env.device)), set_state=True)
+        start = env.reset(start.set("_reset", is_chosen.to(env.device)), set_state=True)
         return start.select(*tensordict_reset.keys(True, True))

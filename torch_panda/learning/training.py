@@ -1,9 +1,9 @@
 """The training loop: episodes of parallel environments, then gradient steps.
 
-An iteration is one episode of every environment and the gradient steps that are due
-after it. Between two iterations, the state of a run is its weights, its buffer and its
-random generators, so `--resume` continues it bit for bit. Gradient steps use
-OMP_NUM_THREADS threads, by default one.
+Each iteration runs one episode in every environment, and then takes
+``updates_per_step`` gradient steps per environment step. A run is saved between two
+iterations only. No episode is unfinished then, so ``--resume`` continues the run bit
+for bit. Gradient steps use OMP_NUM_THREADS threads, by default one.
 """
 
 import os
@@ -35,8 +35,9 @@ from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
-STARTED_STEPS = 50  # longest episode if some start in the middle of the task
-# Fraction of the episodes in which nothing moved that --preset tuned keeps.
+# Longest episode [steps] if some episodes start in the middle of the task.
+MAX_STEPS_FROM_MIDDLE = 50
+# Fraction of the episodes without motion of an object that --preset tuned stores.
 KEEP_UNMOVED = 0.1
 
 
@@ -46,11 +47,12 @@ class Run:
     Args:
         args: Options of the training.
         out: Folder of the results.
-        demos: Demonstrations (n,) of `torch_panda.datasets.read_demos`, from which the
-            agent learns too.
+        demos: Transitions (n,) of `torch_panda.datasets.read_demos`, from which the
+            agent learns in addition.
 
     Raises:
-        ValueError: Options do not fit each other, the task or the files.
+        ValueError: An option does not fit the task or another option, or the run to
+            resume cannot be read.
     """
 
     def __init__(
@@ -76,16 +78,16 @@ class Run:
         self.agent = make_agent(self.env, args)
         steps = self.env.max_episode_steps
         if args.start_at_object:
-            steps = min(steps, STARTED_STEPS)
-        iteration = args.num_envs * steps
+            steps = min(steps, MAX_STEPS_FROM_MIDDLE)
+        steps_per_iteration = args.num_envs * steps
         self.buffer = make_buffer(
             self.env,
-            args.total_steps + iteration,
+            args.total_steps + steps_per_iteration,  # the last iteration may exceed
             her=args.her,
             desired_ratio=args.desired_ratio,
             seed=args.seed,
         )
-        self.num_demos = 0  # demonstrations in each batch
+        self.num_demos = 0  # demonstrated transitions in each batch
         if demos is not None:
             demos = demos.to(self.env.device)
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
@@ -95,13 +97,12 @@ class Run:
         if args.start_at_object:
             states = states_at_objects(args.env_id, seed=args.seed)
             env = TransformedEnv(env, StartFrom(states, args.start_at_object))
-        # Each batch [num_envs, steps] begins with a reset and has `steps` steps of
-        # every environment: whole episodes, unless some start in the middle of the
-        # task.
+        # A batch [num_envs, steps] begins with a reset of all environments. Episodes
+        # that last longer than `steps` steps are cut.
         self.collector = Collector(
             env,
             self.agent.explore,
-            frames_per_batch=iteration,
+            frames_per_batch=steps_per_iteration,
             total_frames=-1,
             reset_at_each_iter=True,
             # torchrl makes the members of this enum strings.
@@ -119,6 +120,10 @@ class Run:
     def train(self, stop: object = False) -> bool:
         """Train until the last step, or until ``stop`` is true after an iteration.
 
+        Args:
+            stop: Object that becomes true to end the training early, such as
+                `StopSignal`.
+
         Returns:
             Whether the training reached the last step.
 
@@ -132,9 +137,14 @@ class Run:
             self.curve.add(progress)  # the untrained policy
             checkpoint.save()
         if progress.pretrained < args.pretrain_updates:
-            count, size = args.pretrain_updates, args.batch_size
-            pretrain(checkpoint, self.demos, updates=count, batch_size=size, stop=stop)
-            if progress.pretrained < count:
+            pretrain(
+                checkpoint,
+                self.demos,
+                updates=args.pretrain_updates,
+                batch_size=args.batch_size,
+                stop=stop,
+            )
+            if progress.pretrained < args.pretrain_updates:
                 return False
         if args.pretrain_updates and len(progress.curve) == 1:
             self.curve.add(progress)  # the policy after imitation
@@ -169,25 +179,27 @@ class Run:
         keep_unmoved = KEEP_UNMOVED if self.args.preset == "tuned" else 1.0
         data = select_episodes(data, keep_unmoved)
         if len(data):
-            stored = self.buffer[self.buffer.extend(data.reshape(-1))]
-            # As in Baselines, the statistics include the hindsight goals.
+            indices = self.buffer.extend(data.reshape(-1))
+            # Reading rows back relabels them. As in Baselines, the normaliser's
+            # statistics include hindsight goals.
+            stored = self.buffer[indices]
             normalizer = self.agent.normalizer
             normalizer.update(stored["observation"], stored["desired_goal"])
 
     def learn(self) -> dict[str, float]:
-        """Take the gradient steps that are due.
+        """Take the gradient steps that are due after the environment steps so far.
 
         Returns:
-            The mean of each loss.
+            The mean of each loss over these steps.
         """
         args, agent = self.args, self.agent
         losses: dict[str, list[Tensor]] = defaultdict(list)
         due = int(self.progress.steps * args.updates_per_step) - agent.updates
         for _ in range(due if len(self.buffer) else 0):
             if args.anneal_lr:
-                last = args.updates_per_step * args.total_steps
-                # Steps come in whole iterations, so updates may exceed `last`.
-                agent.set_learning_rate(max(0.0, 1 - agent.updates / last))
+                total = args.updates_per_step * args.total_steps
+                # The last iteration may exceed the total number of updates.
+                agent.set_learning_rate(max(0.0, 1 - agent.updates / total))
             batch = self.buffer.sample(args.batch_size - self.num_demos)
             demos = self.demos.sample(self.num_demos) if self.num_demos else None
             for key, loss in agent.update(batch, demos).items():

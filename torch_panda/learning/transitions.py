@@ -1,4 +1,4 @@
-"""Batches of transitions as plain tensors, which cost less time than TensorDicts."""
+"""Batches of transitions as tuples of tensors, which are faster than TensorDicts."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,16 @@ from torch import Tensor
 
 
 class Transitions(NamedTuple):
-    """n transitions from a replay buffer.
+    """A batch of n transitions.
 
     Attributes:
         observation: Observations before the step, (n, observation size).
-        goal: Desired goals before and after the step, (n, goal size).
+        goal: Desired goals, which are the same before and after the step, (n, goal
+            size).
         action: Actions, (n, action size).
         reward: Rewards, (n, 1).
-        terminated: Whether the step ends the return, (n, 1) bool.
+        terminated: Whether the episode ends with this step for another reason than its
+            step limit, (n, 1) bool. Targets of critics then have no next value.
         next_observation: Observations after the step, (n, observation size).
     """
 

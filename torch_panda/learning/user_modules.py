@@ -1,4 +1,4 @@
-"""Modules of users that a command imports first, because they register ids."""
+"""The option ``--import``: modules of the user, which register ids for a command."""
 
 import importlib
 import sys
@@ -22,8 +22,8 @@ class UserModule(NamedTuple):
 
     Attributes:
         name: Dotted name of a module, or path of a .py file.
-        source: Content of that file, so that machines without the file can run it;
-            None for a module's name.
+        source: Content of the .py file, so that other machines can run it without the
+            file. None for the name of a module.
     """
 
     name: str
@@ -49,16 +49,16 @@ def read_modules(names: Iterable[str]) -> tuple[UserModule, ...]:
 
 
 def import_modules(modules: Iterable[UserModule]) -> None:
-    """Import modules in this process; an error inside one of them is passed on.
+    """Import modules in this process, also from the current folder.
 
     A file becomes a module that is named after it, so that its classes can be pickled.
-    Modules are also looked for in the current folder.
+    An error inside a module is not caught.
 
     Raises:
         ValueError: There is no module of that name.
     """
     folder = str(Path.cwd())
-    if folder not in sys.path:  # a console script's folder is there instead
+    if folder not in sys.path:  # a console script has its own folder there instead
         sys.path.insert(0, folder)
     for name, source in modules:
         if source is None:
@@ -66,7 +66,7 @@ def import_modules(modules: Iterable[UserModule]) -> None:
                 importlib.import_module(name)
             except ModuleNotFoundError as error:
                 if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-                    raise  # a module that the user's module imports
+                    raise  # the user's module exists, but imports a missing module
                 raise ValueError(
                     f"cannot import {name!r}: there is no such module; --import takes "
                     "the name of a module or the path of a .py file"

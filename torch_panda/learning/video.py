@@ -1,6 +1,7 @@
 """Videos of a policy in several environments side by side.
 
-Goals are translucent. Every cell shows its step, and its frame turns green on success.
+Each environment has a cell of the picture, whose frame is green while its goal is
+reached. Markers of goals are translucent.
 """
 
 from collections.abc import Iterator
@@ -20,9 +21,9 @@ from tqdm import tqdm
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.files import prepare
 
-CELL = (240, 320)  # height and width [pixels]
-FPS = 25  # frames per second, in real time: the control frequency
-BORDER = 4  # [pixels]
+CELL = (240, 320)  # height and width of a cell [pixels]
+FPS = 25  # frames per second; one frame per step shows the episode in real time
+BORDER = 4  # width of a cell's frame [pixels]
 GREEN, GREY = (40, 170, 70), (120, 120, 120)
 
 
@@ -31,11 +32,11 @@ def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
 
     Args:
         env: Batch of environments.
-        policy: Policy that writes ``action``; it runs without exploration noise.
+        policy: Policy that writes ``action``. It acts without exploration noise.
         path: An .mp4 or .gif file.
 
     Raises:
-        ValueError: The name of the file has another ending.
+        ValueError: The name of the file does not end in .mp4 or .gif.
         OSError: The file cannot be written.
     """
     if path.suffix not in (".mp4", ".gif"):
@@ -54,7 +55,7 @@ def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
 
 
 def play(env: RobotTaskEnv, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
-    """Run one episode, and yield its start and the result of every step."""
+    """Run one episode, and yield its first state and the state after every step."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
         yield state
@@ -78,11 +79,13 @@ def draw(env: RobotTaskEnv, state: TensorDictBase, step: int) -> npt.NDArray[np.
 
 
 def tile(cells: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
-    """Join pictures of one size to a grid, about as wide as high."""
-    columns = int(np.ceil(np.sqrt(len(cells))))
-    rows = int(np.ceil(len(cells) / columns))
+    """Join pictures of one size into a grid with about as many rows as columns."""
+    num_columns = int(np.ceil(np.sqrt(len(cells))))
+    num_rows = int(np.ceil(len(cells) / num_columns))
     empty = np.full_like(cells[0], 255)
-    cells = cells + [empty] * (rows * columns - len(cells))
-    return np.vstack(
-        [np.hstack(cells[r * columns : (r + 1) * columns]) for r in range(rows)]
-    )
+    cells = cells + [empty] * (num_rows * num_columns - len(cells))
+    rows = [
+        np.hstack(cells[row * num_columns : (row + 1) * num_columns])
+        for row in range(num_rows)
+    ]
+    return np.vstack(rows)

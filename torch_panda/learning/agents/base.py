@@ -1,4 +1,4 @@
-"""Base class of the agents: inputs, exploration, gradient steps, target networks."""
+"""Base class of the agents: the parts that DDPG, TD3, SAC and TQC share."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -19,11 +19,15 @@ from torch_panda.learning.transitions import Transitions
 
 POLICY_INPUTS: list[NestedKey] = ["observation", "desired_goal"]
 LEARNING_RATE = 1e-3  # of actor and critic, from the panda-gym paper
-TAU = 0.05  # fraction that target networks move towards their networks
+TAU = 0.05  # weight of the online networks when the target networks are updated
 
 
 class Agent(nn.Module, ABC):
     """A policy with its exploration and its learning algorithm.
+
+    A subclass makes its networks in the constructor and then calls `assemble`. It also
+    defines `backward` and `move_targets`. The input of the networks is the "state": the
+    tensor that the normaliser computes from observations and goals.
 
     Args:
         spaces: Sizes and layout of observations, goals and actions.
@@ -32,12 +36,15 @@ class Agent(nn.Module, ABC):
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
         hp: Hyperparameters.
-        normalizer: Standardises observations and goals.
+        normalizer: Computes states from observations and goals.
+        augmentation: Augments the batches of gradient steps.
+        state_size: Size of a state.
+        gamma: Discount factor.
         policy: Module from ``observation`` and ``desired_goal`` to ``action``, which is
             deterministic under ``ExplorationType.DETERMINISTIC``.
         explore: The policy with the exploration noise of the algorithm.
-        optimizer: Optimizer of all networks that learn.
-        updates: Number of gradient steps so far.
+        optimizer: Optimizer of all trained parameters.
+        updates: Number of gradient steps so far, without those of imitation.
 
     Raises:
         ValueError: The hyperparameters do not fit the spaces.
@@ -63,28 +70,28 @@ class Agent(nn.Module, ABC):
         noise: Sequence[TensorDictModuleBase],
         trained: Sequence[Tensor],
     ) -> None:
-        """Assemble policy, exploration and optimizer at the end of a constructor.
+        """Make policy, exploration and optimizer, at the end of a constructor.
 
         Args:
-            actor: Module from ``normalized`` to ``action``.
+            actor: Module from ``normalized``, which is the state, to ``action``.
             noise: Modules that change ``action`` for exploration.
-            trained: Parameters that the optimizer changes.
+            trained: Parameters that the optimizer trains.
         """
         normalize = TensorDictModule(self.normalizer, POLICY_INPUTS, ["normalized"])
-        last: list[TensorDictModuleBase] = []
+        to_env_action: list[TensorDictModuleBase] = []
         if self.hp.fine_fingers:
-            last = [TensorDictModule(from_fine, ["action"], ["action"])]
+            to_env_action = [TensorDictModule(from_fine, ["action"], ["action"])]
         # The overloads of TensorDictSequential lack modules as arguments.
         self.policy = TensorDictSequential(  # type: ignore[call-overload]
-            normalize, actor, *last
+            normalize, actor, *to_env_action
         )
         self.explore = TensorDictSequential(  # type: ignore[call-overload]
-            normalize, actor, *noise, *last
+            normalize, actor, *noise, *to_env_action
         )
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
     def random_points(self) -> RandomPointModule:
-        """Exploration towards random points, by ``random_eps`` of the options."""
+        """Make the exploration towards random points, for exploration "points"."""
         spaces = self.spaces
         gripper_size = int(spaces.has_free_gripper)
         return RandomPointModule(
@@ -98,10 +105,14 @@ class Agent(nn.Module, ABC):
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None
     ) -> dict[str, Tensor]:
-        """Take one gradient step on a batch of transitions and demonstrations.
+        """Take one gradient step on a batch of transitions.
+
+        Args:
+            batch: Transitions from the replay buffer, (n,).
+            demos: Demonstrated transitions, (m,), which are appended to the batch.
 
         Returns:
-            The losses, scalars without gradients.
+            The losses by name, scalars without gradients.
         """
         rows = Transitions.from_tensordict(batch)
         num_demos = 0
@@ -127,34 +138,38 @@ class Agent(nn.Module, ABC):
         """Compute the losses and their gradients.
 
         Args:
-            state: Inputs of the networks before the step, (n, state size).
-            next_state: Inputs of the networks after the step, (n, state size).
-            rows: The transitions; demonstrations are the last rows.
+            state: States before the environment's step, (n, state size).
+            next_state: States after it, (n, state size).
+            rows: The transitions. The last ones are demonstrations.
             num_demos: Number of demonstrations.
 
         Returns:
-            The losses, scalars.
+            The losses by name, scalars.
         """
 
     @abstractmethod
     def move_targets(self) -> None:
-        """Move the target networks towards their networks, by TAU."""
+        """Move the target networks towards the online networks, by the fraction TAU."""
 
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """Take one gradient step of the policy towards demonstrated actions.
 
-        The loss is the mean absolute difference, as in ACT (arXiv 2304.13705). Where
-        demonstrators differ, this loss picks the more frequent action. A squared loss
-        would lead to an action between the two.
+        The loss is the mean absolute difference, as in ACT (arXiv 2304.13705). If there
+        are two different actions for the same state, this loss leads to the more
+        frequent one. A squared loss would lead to an action between the two.
+
+        Args:
+            demos: Demonstrated transitions, (n,).
 
         Returns:
             The loss, a scalar without gradients.
         """
         rows = self._prepare(Transitions.from_tensordict(demos))
-        states = dict(zip(POLICY_INPUTS, (rows.observation, rows.goal), strict=True))
+        inputs = dict(zip(POLICY_INPUTS, (rows.observation, rows.goal), strict=True))
+        # The loss compares actions before `from_fine`.
         normalize, actor = self.policy.module[:2]  # type: ignore[index]  # a ModuleList
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            td = normalize(demos.empty().update(states))
+            td = normalize(demos.empty().update(inputs))
             loss = nn.functional.l1_loss(actor(td)["action"], rows.action)
         self.optimizer.zero_grad()
         loss.backward()
@@ -163,14 +178,14 @@ class Agent(nn.Module, ABC):
         return loss.detach()
 
     def _prepare(self, rows: Transitions) -> Transitions:
-        """Augment a batch, and scale its actions as the networks do."""
+        """Augment a batch, and convert its actions to those of the networks."""
         rows = self.augmentation(rows)
         if self.hp.fine_fingers:
             rows = rows._replace(action=to_fine(rows.action))
         return rows
 
     def set_learning_rate(self, factor: float) -> None:
-        """Multiply the learning rate of the next gradient steps by a factor."""
+        """Set the learning rate of the next gradient steps to factor * LEARNING_RATE."""
         for group in self.optimizer.param_groups:
             group["lr"] = factor * LEARNING_RATE
 

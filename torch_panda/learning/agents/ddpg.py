@@ -1,7 +1,7 @@
-"""Deep deterministic policy gradient (arXiv 1509.02971), as OpenAI Baselines' HER.
+"""Deep deterministic policy gradient (arXiv 1509.02971), with the details of Baselines.
 
-The losses are plain torch, because gradient steps with torchrl's DDPGLoss take a sixth
-more time.
+The losses are written in plain torch. With torchrl's DDPGLoss, a gradient step takes a
+sixth longer.
 """
 
 import copy
@@ -19,16 +19,20 @@ from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
-# Weight of the squared inputs of the actor's tanh. Large inputs make gradients vanish,
-# which ruined policies of Slide (arXiv 1707.01495, appendix A).
+# Weight of the squared inputs of the actor's tanh in its loss. Without this penalty the
+# inputs can grow until the gradient of the tanh vanishes, which ruined policies of
+# Slide (arXiv 1707.01495, appendix A).
 SATURATION_L2 = 0.01
 
 
 class DDPG(Agent):
-    """A critic, and a deterministic actor that ascends the critic's value."""
+    """A deterministic actor that maximises the value of a critic.
+
+    The subclass `TD3` changes the class attributes.
+    """
 
     num_critics = 1
-    actor_interval = 1  # the actor learns in every n-th gradient step
+    actor_interval = 1  # gradient steps of the critics for each one of the actor
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
@@ -40,7 +44,7 @@ class DDPG(Agent):
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.lowest = lowest_return(self.gamma) if spaces.has_sparse_reward else None
+        self.min_return = min_return(self.gamma) if spaces.has_sparse_reward else None
 
         action_spec = spaces.action_spec(spaces.num_envs)
         noise = AdditiveGaussianModule(
@@ -51,9 +55,10 @@ class DDPG(Agent):
             random_action = self.random_points()
         else:
             random_action = EGreedyModule(action_spec)
-            # (num_envs,), so each environment has a probability of its own.
+            # A probability for each environment, (num_envs,).
             random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
         self.actor_parameters = list(self.actor.parameters())
+        # Parameters of the trained networks and, in the same order, of their targets.
         self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
         self.target: list[Tensor] = [
             *self.target_actor.parameters(),
@@ -66,20 +71,32 @@ class DDPG(Agent):
         )
 
     def target_action(self, next_state: Tensor) -> Tensor:
-        """Action in the target of the critics, (n, action size)."""
+        """Choose the actions whose values are the target of the critics.
+
+        Args:
+            next_state: States after the environment's step, (n, state size).
+
+        Returns:
+            Actions, (n, action size).
+        """
         return self.target_actor(next_state)
 
     def backward(
         self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
-        """Regress the critics to their target, and let the actor ascend one of them."""
+        """Compute the losses of critics and actor, and their gradients.
+
+        See `Agent.backward`.
+        """
         with torch.no_grad():
-            action = self.target_action(next_state)
-            values = [critic(next_state, action) for critic in self.target_critics]
-            next_value = torch.stack(values).amin(0)
+            next_action = self.target_action(next_state)
+            next_values = [
+                critic(next_state, next_action) for critic in self.target_critics
+            ]
+            next_value = torch.stack(next_values).amin(0)
             target = rows.reward + self.gamma * next_value * ~rows.terminated
-            if self.lowest is not None:
-                target.clamp_(self.lowest, 0.0)
+            if self.min_return is not None:
+                target.clamp_(self.min_return, 0.0)
         values = [critic(state, rows.action) for critic in self.critics]
         losses = [nn.functional.mse_loss(value, target) for value in values]
         critic_loss = torch.stack(losses).sum()
@@ -98,15 +115,16 @@ class DDPG(Agent):
             actor_loss = actor_loss + imitation_loss(
                 action[demos], rows.action[demos], value[demos], values[0][demos]
             )
+        # Only for the actor: the critics already have the gradients of their own loss.
         actor_loss.backward(inputs=self.actor_parameters)
         return {"critic_loss": critic_loss, "actor_loss": actor_loss}
 
     def move_targets(self) -> None:
-        """Move the target networks towards their networks, by TAU."""
+        """Move the target networks towards the online networks, by the fraction TAU."""
         with torch.no_grad():
             torch._foreach_lerp_(self.target, self.online, TAU)
 
 
-def lowest_return(gamma: float) -> float:
-    """Lower bound of returns whose rewards are -1 and 0, as in Baselines."""
+def min_return(gamma: float) -> float:
+    """Lower bound of the discounted return if all rewards are -1 or 0."""
     return -1 / (1 - gamma) if gamma < 1 else -math.inf

@@ -1,4 +1,4 @@
-"""Soft actor-critic (arXiv 1801.01290), over torchrl's loss."""
+"""Soft actor-critic (arXiv 1801.01290), with torchrl's loss."""
 
 from typing import Any
 
@@ -14,11 +14,14 @@ from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
 
-ALPHA = 0.2  # the entropy coefficient, a constant
+ALPHA = 0.2  # entropy coefficient, which is not trained
 
 
 class SAC(Agent):
-    """A stochastic policy that is rewarded for its entropy."""
+    """A stochastic policy that maximises the value of critics and its entropy.
+
+    The subclass `TQC` has another loss, and critics with more outputs.
+    """
 
     critic_outputs = 1
 
@@ -47,7 +50,7 @@ class SAC(Agent):
             action_spec=spaces.action_spec(),
         )
         self.loss.make_value_estimator(gamma=self.gamma)
-        # Create this lazy buffer now, so that it is in every saved state.
+        # Reading this attribute registers a buffer, which every saved state must have.
         _ = self.loss.target_entropy
         self.soft_update = SoftUpdate(self.loss, tau=TAU)
         noise = [self.random_points()] if hp.exploration == "points" else []
@@ -59,24 +62,27 @@ class SAC(Agent):
         critic: TensorDictModule,
         **options: Any,  # noqa: ANN401 (options of the loss)
     ) -> LossModule:
-        """Make the losses of actor and critics."""
+        """Make torchrl's loss module for actor and critics."""
         return SACLoss(actor, critic, loss_function="l2", **options)
 
     def backward(
         self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
-        """Descend torchrl's losses, with demonstrations as ordinary transitions."""
+        """Compute torchrl's losses and their gradients; see `Agent.backward`.
+
+        Demonstrations count as ordinary transitions.
+        """
         flags = {"terminated": rows.terminated, "done": rows.terminated}
-        following = {"normalized": next_state, "reward": rows.reward, **flags}
-        batch = {"normalized": state, "action": rows.action, "next": following}
-        every = self.loss(TensorDict(batch, [len(state)]))
+        after_step = {"normalized": next_state, "reward": rows.reward, **flags}
+        batch = {"normalized": state, "action": rows.action, "next": after_step}
+        torchrl_losses = self.loss(TensorDict(batch, [len(state)]))
         losses = {
-            "critic_loss": every["loss_qvalue"],
-            "actor_loss": every["loss_actor"],
+            "critic_loss": torchrl_losses["loss_qvalue"],
+            "actor_loss": torchrl_losses["loss_actor"],
         }
         (losses["critic_loss"] + losses["actor_loss"]).backward()
         return losses
 
     def move_targets(self) -> None:
-        """Move the target networks towards their networks, by TAU."""
+        """Move the target networks towards the online networks, by the fraction TAU."""
         self.soft_update.step()

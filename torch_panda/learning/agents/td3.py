@@ -8,11 +8,11 @@ from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.spaces import Spaces
 
 POLICY_NOISE = 0.2  # standard deviation of the noise on target actions
-NOISE_CLIP = 0.5  # limit of this noise
+NOISE_CLIP = 0.5  # limit at which this noise is clipped
 
 
 class TD3(DDPG):
-    """DDPG with two critics, a delayed actor, and noise on target actions."""
+    """DDPG with two critics, noise on target actions, and fewer steps of the actor."""
 
     actor_interval = 2
 
@@ -21,7 +21,7 @@ class TD3(DDPG):
         super().__init__(spaces, hp)
 
     def target_action(self, next_state: Tensor) -> Tensor:
-        """The target actor's action with clipped noise, (n, action size)."""
+        """Add clipped noise to the actions of the target actor, (n, action size)."""
         action = super().target_action(next_state)
         noise = POLICY_NOISE * torch.randn_like(action)
         return (action + noise.clamp_(-NOISE_CLIP, NOISE_CLIP)).clamp_(-1.0, 1.0)

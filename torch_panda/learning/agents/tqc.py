@@ -1,4 +1,4 @@
-"""Truncated quantile critics (arXiv 2005.04269), over torchrl's loss."""
+"""Truncated quantile critics (arXiv 2005.04269), with torchrl's loss."""
 
 from typing import Any
 
@@ -9,11 +9,15 @@ from torchrl.objectives import LossModule, TQCLoss
 from torch_panda.learning.agents.sac import SAC
 
 NUM_QUANTILES = 25  # quantiles of each critic
-DROPPED = 2  # highest quantiles of each critic that the target leaves out
+NUM_DROPPED = 2  # highest quantiles of each critic that the target leaves out
 
 
 class TQC(SAC):
-    """SAC whose critics learn quantiles of the return; targets drop the highest."""
+    """SAC with critics that learn quantiles of the return.
+
+    The target of the critics leaves out the highest quantiles, so that values are not
+    overestimated.
+    """
 
     critic_outputs = NUM_QUANTILES
 
@@ -23,6 +27,8 @@ class TQC(SAC):
         critic: TensorDictModule,
         **options: Any,  # noqa: ANN401 (options of the loss)
     ) -> LossModule:
-        """Make the losses of actor and critics."""
-        dropped = DROPPED if self.hp.double_q else 0
-        return TQCLoss(actor, critic, top_quantiles_to_drop_per_net=dropped, **options)
+        """Make torchrl's loss module for actor and critics."""
+        num_dropped = NUM_DROPPED if self.hp.double_q else 0
+        return TQCLoss(
+            actor, critic, top_quantiles_to_drop_per_net=num_dropped, **options
+        )
