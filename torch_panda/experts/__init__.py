@@ -1,9 +1,9 @@
 """Scripted experts, which solve the tasks and give demonstrations.
 
-An expert maps a batch of observations and goals to actions of end-effector control. Its
-action follows from the observation alone, without state and without access to the
-simulation, so experts serve rollouts and collectors of any batch size. Positions are in
-the world frame [m]. An action of 1 displaces the end-effector by 5 cm.
+An expert maps a batch of observations and goals to actions of end-effector control. It
+has no state and no access to the simulation, so rollouts and collectors of any batch
+size can use it. Positions are in the world frame [m]. An action of 1 displaces the
+end-effector by 5 cm.
 """
 
 from collections.abc import Callable
@@ -41,17 +41,19 @@ Act = Callable[[Tensor, Tensor, Tensor], Tensor]
 """A function of observation, achieved goal and desired goal, (..., size) each, to the
 action."""
 
-# Lateral friction from which on a table counts as rough: 0.5 of -v3, not 0.1 of -v1.
+# Tables with at least this lateral friction count as rough. It is 0.1 in -v1 and 0.5 in
+# -v3.
 ROUGH_FRICTION = 0.3
 
 
 class Expert(NamedTuple):
-    """An expert for the Panda with end-effector control.
+    """The functions of an expert for the Panda with end-effector control.
 
     Attributes:
-        act: Its actions.
-        act_on_rough_table: Its actions on the table of -v3; None means the same.
-        uses_fingers: Whether it opens and closes the gripper.
+        act: Computes the actions.
+        act_on_rough_table: Computes the actions on the rough table of -v3; None means
+            that ``act`` does.
+        uses_fingers: Whether the expert opens and closes the gripper.
     """
 
     act: Act
@@ -61,7 +63,7 @@ class Expert(NamedTuple):
 
 EXPERTS: dict[type[Task], Expert] = {
     Reach: Expert(reach.act),
-    # On a rough table a cube can be pushed; on a slippery one it would slide on.
+    # After a push, a cube would slide too far on the slippery table of -v1.
     Push: Expert(push.drag, push.push),
     Slide: Expert(slide.act),
     PickAndPlace: Expert(pick_and_place.act, uses_fingers=True),
@@ -95,7 +97,7 @@ def make_expert(env_id: str) -> TensorDictModule:
         )
 
     def act_within_limits(*observed: Tensor) -> Tensor:
-        # The environment clips actions; a network that imitates them must see that.
+        # The environment clips actions. Demonstrations should hold the clipped ones.
         return act(*observed).clamp(-1.0, 1.0)
 
     return TensorDictModule(
@@ -104,7 +106,7 @@ def make_expert(env_id: str) -> TensorDictModule:
 
 
 def find_expert(robot: Robot, task: Task) -> Act | None:
-    """The expert for a robot at a task; None if there is none."""
+    """Return the function of the expert for a robot and a task, or None."""
     expert = EXPERTS.get(type(task))
     if expert is None or type(robot) is not Panda or robot.control_type != "ee":
         return None

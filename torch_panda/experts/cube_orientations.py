@@ -1,4 +1,8 @@
-"""Orientations of a cube: quaternions xyzw (..., 4), and the 24 straight ones."""
+"""Orientations of a cube as quaternions xyzw, (..., 4).
+
+Orientations in which the edges of the cube are parallel to the world's axes are called
+straight. There are 24 of them.
+"""
 
 import math
 
@@ -26,7 +30,7 @@ def to_matrix(quaternion: Tensor) -> Tensor:
 
 
 def same_half(quaternion: Tensor) -> Tensor:
-    """The same orientations by quaternions with w >= 0, (..., 4)."""
+    """Negate quaternions with w < 0, which does not change the rotation, (..., 4)."""
     return quaternion * torch.where(quaternion[..., 3:] < 0, -1.0, 1.0)
 
 
@@ -39,10 +43,15 @@ def turn(axis: int, angle: Tensor) -> Tensor:
 
 
 def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-    """Best rotation about y towards a goal.
+    """Find the rotation about y that comes closest to a goal.
+
+    Args:
+        start: Orientations before the rotation, (..., 4).
+        goal: Orientations of the goal, (..., 4).
 
     Returns:
-        The distance that it leaves, and its angle [rad], (..., 1) each.
+        The distance to the goal after the rotation, and the angle of the rotation
+        [rad], (..., 1) each.
     """
     half_turn = compose(start.new_tensor((0.0, 1.0, 0.0, 0.0)), start)
     cosine, sine = dot(goal, start), dot(goal, half_turn)
@@ -52,7 +61,7 @@ def best_pitch(start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _straight_orientations() -> Tensor:
-    """The 24 orientations in which a cube lies along the axes, (24, 4)."""
+    """Compute the straight orientations, (24, 4)."""
     quarters = torch.arange(4.0)[:, None] * math.pi / 2
     faces = torch.cat((turn(0, quarters), turn(1, quarters[1::2])))
     return compose(turn(2, quarters)[:, None], faces).flatten(0, 1)
@@ -62,6 +71,6 @@ STRAIGHT = _straight_orientations()
 
 
 def straighten(cube: Tensor) -> Tensor:
-    """The nearest of the 24 straight orientations, (..., 4)."""
+    """Return the nearest straight orientation of each cube, (..., 4)."""
     straight = STRAIGHT.to(cube)
     return straight[dot(cube[..., None, :], straight).squeeze(-1).abs().argmax(-1)]

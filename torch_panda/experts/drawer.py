@@ -5,22 +5,25 @@ from torch import Tensor
 
 from torch_panda.experts.moves import go_over, move
 
-BEHIND = 0.03  # from the handle's bar to the middle between bar and front [m]
-REACH = 0.025  # distance from this middle at which the hand is still inside [m]
-BESIDE = 0.045  # the same along the bar, which is longer [m]
-LOW = 0.01  # height above the bar's middle below which the fingers hook it [m]
-GAP = 0.015  # distance between the fingers and the bar or the front [m]
-DONE = 0.008  # distance from the goal at which the hand stops [m]
+# The fingers act in the gap between the handle's bar and the front of the drawer. All
+# distances are in metres.
+BAR_TO_GAP = 0.03  # distance from the bar to the middle of the gap, along x
+GAP_X = 0.025  # largest distance from this middle at which the hand is in the gap, x
+GAP_Y = 0.045  # the same along y, the direction of the bar
+GAP_Z = 0.01  # largest height above the middle of the gap at which the hand is in it
+CLEARANCE = 0.015  # distance between the fingers and the bar or the front
+DONE = 0.008  # distance from the goal at which the hand stops
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Reach behind the handle's bar from above, and pull it or push the front."""
     ee, handle = observation[..., :3], achieved_goal
-    middle = handle + handle.new_tensor((BEHIND, 0.0, 0.0))
-    offset = middle - ee
-    x, y, z = offset.split(1, -1)
-    hooked = (x.abs() < REACH) & (y.abs() < BESIDE) & (z > -LOW)
-    left = (desired_goal - handle)[..., :1]
-    slide = torch.where(left.abs() < DONE, 0.0, left + GAP * left.sign())
-    along = move(torch.cat((slide, torch.zeros_like(y), z), -1))
-    return torch.where(hooked, along, go_over(ee, middle, 0.05))
+    gap = handle + handle.new_tensor((BAR_TO_GAP, 0.0, 0.0))
+    x, y, z = (gap - ee).split(1, -1)
+    is_in_gap = (x.abs() < GAP_X) & (y.abs() < GAP_Y) & (z > -GAP_Z)
+    remaining = (desired_goal - handle)[..., :1]
+    # The fingers cross the clearance before they move the drawer.
+    step = remaining + CLEARANCE * remaining.sign()
+    step = torch.where(remaining.abs() < DONE, 0.0, step)
+    move_drawer = move(torch.cat((step, torch.zeros_like(y), z), -1))
+    return torch.where(is_in_gap, move_drawer, go_over(ee, gap, 0.05))

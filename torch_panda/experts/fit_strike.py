@@ -1,8 +1,8 @@
-"""Fits the strike of Slide's scripted expert to strikes of random strength.
+"""Fits the polynomials of Slide's scripted expert to strikes of random strength.
 
     python -m torch_panda.experts.fit_strike
 
-It prints the numbers in `slide.py`, for the physics of PandaSlide-v1.
+The script prints the coefficients for `slide.py`, for the physics of PandaSlide-v1.
 """
 
 import torch
@@ -23,10 +23,11 @@ def strike_at_random(seed: int) -> Tensor:
     """Strike once in every environment.
 
     Returns:
-        Rows of 8 numbers, (strikes, 8): position of the puck (3), direction (2),
-        distance along the direction [m], strength, and the angle by which the puck left
-        the direction [rad], positive towards the side of the strike. Strikes that
-        missed or went too far are left out.
+        A row for each strike, (strikes, 8): position of the puck (3 numbers), direction
+        of the strike (2), distance that the puck slid in this direction [m], strength,
+        and the angle between the direction and the puck's path [rad]. The angle is
+        positive towards the side of the strike. Strikes that missed the puck, or sent
+        it outside `DISTANCES`, are left out.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = STRENGTHS
@@ -54,13 +55,21 @@ def strike_at_random(seed: int) -> Tensor:
     across = slid[:, 1:] * aim[:, :1] - slid[:, :1] * aim[:, 1:]
     deviation = across / along * aim[:, 1:].sign()
     low, high = DISTANCES
-    used = struck & (puck[:, 2:] > 0) & (along > low) & (along < high)
-    strikes = torch.cat((start, aim, along, strength, deviation), 1)
-    return strikes[used.squeeze(1)].double()
+    is_usable = struck & (puck[:, 2:] > 0) & (along > low) & (along < high)
+    rows = torch.cat((start, aim, along, strength, deviation), 1)
+    return rows[is_usable.squeeze(1)].double()
 
 
 def fit(terms: Tensor, values: Tensor) -> Tensor:
-    """Fit coefficients (terms,) by least squares with small weights for outliers."""
+    """Fit a polynomial by least squares, with small weights for outliers.
+
+    Args:
+        terms: Values of the polynomial's terms, (strikes, terms).
+        values: Values to fit, (strikes, 1).
+
+    Returns:
+        The coefficients, (terms,).
+    """
     weight = torch.ones_like(values)
     for _ in range(10):
         root = weight.sqrt()
@@ -70,11 +79,11 @@ def fit(terms: Tensor, values: Tensor) -> Tensor:
 
 
 def main() -> None:
-    """Fit to four fifths of the strikes, test on the others, and print."""
+    """Fit to four fifths of the strikes, test on the others, and print the result."""
     strikes = torch.cat([strike_at_random(seed) for seed in tqdm(range(ROUNDS))])
     start, aim, distance, strength, deviation = strikes.split((3, 2, 1, 1, 1), 1)
     test = torch.arange(len(strikes)) % 5 == 0
-    # Effect of an error of 1 on the puck's final position [m].
+    # `effect` is the displacement of the puck's end by an error of 1 [m].
     for name, polynomial, values, effect in (
         ("STRENGTH", STRENGTH, strength, 2 * distance.sqrt() / 0.95),
         ("DEVIATION", DEVIATION, deviation, distance),

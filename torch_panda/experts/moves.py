@@ -10,13 +10,13 @@ from torch import Tensor
 
 from torch_panda.rotations import dot
 
-GAIN = 0.8 / 0.05  # actions per metre, to cover 0.8 of an offset in one step
+GAIN = 0.8 / 0.05  # action per metre of offset; a step covers 0.8 of the offset
 GRIPPER = 0.2  # distance by which an action of 1 opens the fingers [m]
 OPEN = 0.075  # distance between the fingers before a grasp [m]
 CUBE = 0.04  # edge length of a cube [m]
-# Deceleration of a sliding cube for a friction of 0.5 * 0.5, as on the table of -v3
-# [m/s^2]. On the table of -v1 the cubes of Stack, with 5 * 0.1, stop sooner.
-ROUGH = 0.25 * 9.81
+# Deceleration of a cube that slides on the table of -v3 [m/s^2]: the friction of the
+# contact is 0.5 * 0.5. The cubes of Stack-v1 stop sooner, with 5 * 0.1.
+DECELERATION = 0.25 * 9.81
 
 
 def norm(vector: Tensor) -> Tensor:
@@ -43,12 +43,20 @@ def go_to(position: Tensor, point: Tensor, limit: float = 1.0) -> Tensor:
 def go_over(
     position: Tensor, point: Tensor, clearance: float, limit: float = 1.0
 ) -> Tensor:
-    """Move to a point from above: rise by ``clearance``, and descend over the point."""
+    """Move to a point from above: rise by ``clearance``, and descend over the point.
+
+    Args:
+        position: Present position, (..., 3).
+        point: Point to reach, (..., 3).
+        clearance: Height above the point at which the way leads to it [m].
+        limit: Largest length of the action.
+    """
     offset = point - position
     height = (2 * (norm(offset[..., :2]) - 0.01)).clamp(0.0, clearance)
     rise = offset[..., 2:] + height
-    free = (1 - rise / 0.05).clamp(0.0, 1.0)  # 1 if it is high enough to pass
-    return move(torch.cat((offset[..., :2] * free, rise), -1), limit)
+    # Move sideways only as far as the hand is high enough: 0 below, 1 at the height.
+    sideways = (1 - rise / 0.05).clamp(0.0, 1.0)
+    return move(torch.cat((offset[..., :2] * sideways, rise), -1), limit)
 
 
 def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
@@ -66,11 +74,12 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     lateral = beside - along * direction
     behind = torch.cat((cube[..., :2] - 0.06 * direction, height), -1)
     pushing = (along < -0.02) & (norm(lateral) < 0.02) & (ee[..., 2:] < height + 0.02)
-    left = distance - dot(velocity, velocity) / (2 * ROUGH)
-    step = (0.5 * left).clamp(0.0, 0.025) * direction - lateral
+    # Distance to the goal from the point at which the cube will stop by itself.
+    remaining = distance - dot(velocity, velocity) / (2 * DECELERATION)
+    step = (0.5 * remaining).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
     # Leave a cube within 3 cm alone, because another approach would disturb it.
-    done = (left < 0.01) | ~pushing & (distance < 0.03)
+    done = (remaining < 0.01) | ~pushing & (distance < 0.03)
     action = torch.where(pushing, advance, go_over(ee, behind, 0.06))
     return torch.where(done, 0.0, action)
 
@@ -89,7 +98,18 @@ def open_to(width: Tensor, wanted: float | Tensor) -> Tensor:
 def carry(
     ee: Tensor, width: Tensor, cube: Tensor, goal: Tensor, clearance: float = 0.0
 ) -> Tensor:
-    """Grasp a cube and carry it to a point; the action has 4 entries."""
+    """Grasp a cube and carry it to a point.
+
+    Args:
+        ee: Position of the end-effector, (..., 3).
+        width: Distance between the fingers, (..., 1).
+        cube: Position of the cube, (..., 3).
+        goal: Position to which the cube should go, (..., 3).
+        clearance: Height above the goal from which the cube is lowered [m].
+
+    Returns:
+        The action with the gripper's entry, (..., 4).
+    """
     offset = cube - ee
     near = (norm(offset[..., :2]) < 0.015) & (offset[..., 2:].abs() < 0.01)
     held = is_held(ee, width, cube)

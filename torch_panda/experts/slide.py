@@ -13,11 +13,13 @@ from torch_panda.rotations import dot
 FINGERS_X, FINGERS_Y, PUCK_RADIUS = 0.008, 0.0217, 0.029
 STRIKE_GAP = 0.014  # distance between fingers and puck before the strike [m]
 STRIKE_HEIGHT = 0.02  # height of the end-effector in the strike [m]
-# Polynomials of the strength of a strike, and of the angle by which the puck leaves its
-# direction [rad]. Their variables are s, the root of the distance; x and y, the puck's
-# position; n, the sine of the direction. "sxn" is a product and "" is 1. fit_strike.py
-# fits them to strikes of random strength. 90 % of other strikes end within 5 cm along
-# the direction, and 99 % across it. Terms of a full cubic without effect are left out.
+# Two polynomials describe a strike. STRENGTH is the action that sends the puck to a
+# distance. DEVIATION is the angle between the strike and the puck's path [rad]. Their
+# variables are s, the root of the distance; x and y, the puck's position; and n, the
+# sine of the direction. The keys are terms: "sxn" stands for s * x * n, and "" for 1.
+# fit_strike.py fits the coefficients to random strikes, and it tests them on others: 90
+# % of the pucks stop within 5 cm of the predicted distance, and 99 % within 5 cm
+# sideways. Cubic terms that do not improve the fit are left out.
 STRENGTH = {
     "": 0.3047, "s": 0.5741, "x": 0.8988, "ss": 0.2025, "sn": -0.1505, "xn": -2.9521,
     "yn": 0.6878, "sxx": 7.388, "sxn": 3.4006, "xxx": 22.7439,
@@ -26,13 +28,13 @@ DEVIATION = {
     "": -0.0092, "xx": 1.5458, "xy": -4.1378, "xn": 3.2703, "yy": 1.8564,
     "yn": -2.3399, "nn": 0.4009, "xyn": 8.9578, "xnn": -3.859, "ynn": 3.1839,
 }  # fmt: skip
-OVERSHOOT = 0.006  # median by which such strikes go too far [m]
+OVERSHOOT = 0.006  # median distance by which these strikes go too far [m]
 
 
 def strike_terms(
     terms: Iterable[str], puck: Tensor, distance: Tensor, aim: Tensor, side: Tensor
 ) -> Tensor:
-    """Terms of a polynomial for strikes, which are mirrored to go to the left.
+    """Compute the terms of a polynomial, after mirroring all strikes to the left.
 
     Args:
         terms: Variables of each term; see `STRENGTH`.
@@ -57,10 +59,18 @@ def strike_terms(
 def strike(
     observation: Tensor, puck: Tensor, aim: Tensor, side: Tensor, strength: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Prepare a strike, or strike.
+    """Move the hand to the start of a strike and, once it is there, strike.
 
-    A corner of the closed fingers strikes along ``aim``. It starts from rest, so it
-    always meets the puck at the same speed. For the arguments see `strike_terms`.
+    A corner of the closed fingers strikes along ``aim``. The hand starts from rest at a
+    fixed distance, so the speed at the puck depends on ``strength`` alone. After the
+    strike, while the puck moves, the action is 0.
+
+    Args:
+        observation: Observations, (..., 18).
+        puck: Position of the puck, (..., 3).
+        aim: Direction of the strike, (..., 2).
+        side: 1 for strikes to the left, -1 to the right, (..., 1).
+        strength: Length of the action that strikes, (..., 1).
 
     Returns:
         The action, and whether it is the strike, (..., 1).
@@ -77,10 +87,7 @@ def strike(
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Strike the puck once with a corner of the fingers, so that it stops at the goal.
-
-    The puck leaves nearly along the line from the corner to its centre.
-    """
+    """Strike the puck once with a corner of the fingers so that it stops at the goal."""
     puck, offset = achieved_goal, (desired_goal - achieved_goal)[..., :2]
     direction = unit(offset)
     distance = (norm(offset) - OVERSHOOT).clamp(min=0.01)
@@ -92,6 +99,6 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
         return dot(terms, terms.new_tensor([*polynomial.values()]))
 
     aim = direction
-    for _ in range(3):  # correct the aim until the puck goes to the goal
+    for _ in range(3):  # a fixed-point iteration: aim against the deviation
         aim = unit(direction - evaluate(DEVIATION, aim) * side * left)
     return strike(observation, puck, aim, side, evaluate(STRENGTH, aim))[0]

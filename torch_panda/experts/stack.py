@@ -35,15 +35,16 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     # The fingers need room beside the lower cube and beside its goal.
     room = upper.new_tensor((0.045, 0.085))
 
-    def crowds(point: Tensor) -> Tensor:
+    def upper_crowds(point: Tensor) -> Tensor:
         return ((upper - point)[..., :2].abs() < room).all(-1, True)
 
-    at = torch.where(crowds(lower) | placed, lower, goal)
-    apart = (upper - at)[..., :2]
+    # Push the upper cube away from this point, along x or along y.
+    crowded = torch.where(upper_crowds(lower) | placed, lower, goal)
+    apart = (upper - crowded)[..., :2]
     along_x = apart[..., :1].abs() > apart[..., 1:].abs()
     # `push_to` may leave the cube 3 cm short of this point.
     sign = torch.where(apart < 0, -1.0, 1.0)
-    side = at[..., :2] + sign * apart.new_tensor((0.1, 0.125))
+    side = crowded[..., :2] + sign * apart.new_tensor((0.1, 0.125))
     x, y, z = upper.split(1, -1)
     x, y = (
         torch.where(along_x, side[..., :1], x),
@@ -53,7 +54,8 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     clear = push_to(ee, upper, observation[..., 25:27], aside)
     clear = torch.cat((clear, 0 * width - 1), -1)
     on_top = upper[..., 2:] > 0.03
-    blocked = crowds(at) & ~(lower_held | upper_held | placed & on_top)
+    is_holding = lower_held | upper_held
+    blocked = upper_crowds(crowded) & ~(is_holding | placed & on_top)
     action = torch.where(placed, finish, carry(ee, width, lower, goal))
     action = torch.where(blocked, torch.where(leave, rise, clear), action)
     # Leave two cubes at their goals alone.

@@ -1,4 +1,4 @@
-"""Evaluates a policy over many episodes, which run in parallel."""
+"""Evaluation of a policy over many episodes, which run in parallel."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,9 +28,9 @@ class Evaluation:
     """Results of n episodes.
 
     Attributes:
-        success: Whether the last state of each episode is a success, (n,) bool.
-        ever: Whether any state after the first step is a success, (n,) bool.
-        at_start: Whether the start of each episode is a success, (n,) bool.
+        success: Whether each episode ends with its goal reached, (n,) bool.
+        ever: Whether the goal was reached after any step of each episode, (n,) bool.
+        at_start: Whether each episode starts with its goal reached, (n,) bool.
         returns: Sum of the rewards of each episode, (n,).
         lengths: Number of steps of each episode, (n,).
         tasks: Results of each fixed task by its name, empty for random episodes. All
@@ -52,17 +52,17 @@ class Evaluation:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval of the success rate."""
+        """Wilson's 95 % confidence interval of the success rate."""
         return wilson_interval(int(self.success.sum()), len(self.success))
 
     @property
     def mean_return(self) -> float:
-        """Mean of the returns."""
+        """Mean return of the episodes."""
         return float(self.returns.double().mean())
 
     @property
     def mean_length(self) -> float:
-        """Mean number of steps; episodes of ``-v3`` end with their first success."""
+        """Mean number of steps. Episodes of ``-v3`` end with their first success."""
         return float(self.lengths.double().mean())
 
     def __repr__(self) -> str:
@@ -91,16 +91,17 @@ def evaluate(
 
     Args:
         policy: Trained policy, scripted expert, or any module that writes ``action``
-            into a batch of observations.
+            into a TensorDict with the observations.
         env_id: Id of the environment.
         episodes: Number of episodes.
-        seed: Seed of the episodes; None draws one.
-        num_envs: Number of environments stepped in parallel, at most one per episode.
-        tasks: "random" draws the starts and goals as the task does. "fixed" starts from
-            the five `torch_panda.evaluation_tasks` and reports the success of each one.
-            Every task has the same number of episodes, so ``episodes`` is rounded up to
-            a multiple of five. Each episode begins with `RANDOM_ACTIONS` random
-            actions, drawn from ``seed``, so that the episodes of a task differ.
+        seed: Seed of the episodes; None draws a random seed.
+        num_envs: Number of environments stepped in parallel. No more than ``episodes``
+            are used.
+        tasks: "random" lets the task draw starts and goals. "fixed" starts from the
+            five `torch_panda.evaluation_tasks` and reports the success of each of them.
+            Then ``episodes`` is rounded up to a multiple of five, because every task
+            gets the same number of episodes. Each episode begins with `RANDOM_ACTIONS`
+            random actions, drawn from ``seed``, so that the episodes of a task differ.
         **options: Other arguments of `make`, such as ``task_options`` and ``device``.
 
     Raises:
@@ -148,10 +149,10 @@ def evaluate_fixed_in(
         policy: Policy that writes ``action``.
         episodes: Number of episodes, rounded up to the same number for each start.
         states: Start states by name, as `evaluation_tasks` returns them.
-        seed: Seed of the first `RANDOM_ACTIONS` actions; None draws one. The episodes
-            do not depend on the number of environments.
+        seed: Seed of the first `RANDOM_ACTIONS` actions; None draws a random seed. The
+            episodes do not depend on the number of environments.
     """
-    episodes += -episodes % len(states)
+    episodes += -episodes % len(states)  # round up
     num_envs = env.batch_size[0]
     generator = torch.Generator()
     if seed is None:
@@ -166,8 +167,8 @@ def evaluate_fixed_in(
         # The last batch repeats episodes that `_join` leaves out.
         numbers = torch.arange(first, first + num_envs) % episodes
         start = env.reset(starts[numbers % len(states)], set_state=True)
-        begin = _RandomStart(policy, actions[numbers])
-        parts.append(_summarize(*play_episodes(env, begin, start=start)))
+        randomized = _RandomStart(policy, actions[numbers])
+        parts.append(_summarize(*play_episodes(env, randomized, start=start)))
     tasks = {
         name: _join(parts, range(index, episodes, len(states)))
         for index, name in enumerate(states)
@@ -176,7 +177,12 @@ def evaluate_fixed_in(
 
 
 class _RandomStart(TensorDictModuleBase):
-    """Replaces the first actions of a policy, (num_envs, steps, action_dim)."""
+    """Replaces the first actions of a policy by given ones.
+
+    Args:
+        policy: The policy.
+        actions: Actions of the first steps, (num_envs, steps, action_dim).
+    """
 
     def __init__(self, policy: TensorDictModuleBase, actions: Tensor) -> None:
         super().__init__()
@@ -192,7 +198,12 @@ class _RandomStart(TensorDictModuleBase):
 
 
 def _summarize(rollout: TensorDictBase, lengths: Tensor) -> Evaluation:
-    """Results of episodes [num_envs, steps] with these numbers of steps."""
+    """Return the results of episodes [num_envs, steps].
+
+    Args:
+        rollout: Transitions of the episodes.
+        lengths: Number of steps of each episode, (num_envs,).
+    """
     success = rollout["next", "success"].squeeze(-1)
     reward = rollout["next", "reward"].squeeze(-1)
     steps = torch.arange(rollout.shape[1], device=lengths.device)
@@ -211,7 +222,13 @@ def _join(
     episodes: range,
     tasks: Mapping[str, Evaluation] | None = None,
 ) -> Evaluation:
-    """Results of these episodes of all parts."""
+    """Concatenate results, and select some episodes.
+
+    Args:
+        parts: Results of successive batches of episodes.
+        episodes: Indices of the selected episodes in the concatenation.
+        tasks: Results of each fixed task by its name.
+    """
     names = ("success", "ever", "at_start", "returns", "lengths")
     joined = {
         name: torch.cat([getattr(part, name) for part in parts]) for name in names
@@ -221,7 +238,13 @@ def _join(
 
 
 def wilson_interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson, 1927)."""
+    """Confidence interval of a proportion (Wilson, 1927).
+
+    Args:
+        successes: Number of successes.
+        n: Number of trials.
+        z: Quantile of the normal distribution; 1.96 gives the 95 % interval.
+    """
     p = successes / n
     center = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z * sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)

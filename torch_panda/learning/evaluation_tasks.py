@@ -7,7 +7,7 @@ from torch_panda.registry import make
 
 NUM_STARTS = 41  # starts from which the tasks are chosen
 SEED = 0
-# Names of the tasks, and the quantile of their start's distance from its goal.
+# Name of each task, and how its distance between start and goal ranks among all starts.
 QUANTILES = {
     "very_near": 0.05,
     "near": 0.25,
@@ -18,10 +18,10 @@ QUANTILES = {
 
 
 def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
-    """Five named states to start from, with their goals.
+    """Return five named start states of a task, each with its goal.
 
-    They are chosen among `NUM_STARTS` starts of the task by the distance between the
-    achieved and the desired goal, so a registered task of your own has them too.
+    They are selected from `NUM_STARTS` random starts of the task, by the distance
+    between achieved and desired goal. This works for registered tasks of your own, too.
 
     Args:
         env_id: Id of the task.

@@ -1,4 +1,4 @@
-"""Draws success curves of runs: one panel per task, one line per way to train.
+"""Plots of success curves: one panel per task, and one line per set of options.
 
 A run is a folder with args.json and curve.csv. A line is the median over the seeds, and
 a band shows the interquartile range, as in the panda-gym paper. A panel has at most

@@ -1,4 +1,4 @@
-"""Plays whole episodes in a batch of environments."""
+"""Rollouts of whole episodes in a batch of environments."""
 
 import torch
 from tensordict import TensorDictBase
@@ -20,13 +20,13 @@ def play_episodes(
     Args:
         env: Batch of environments.
         policy: Policy that writes ``action``.
-        exploration: Whether the policy may add its noise.
+        exploration: torchrl's exploration type; RANDOM lets the policy add noise.
         start: First observations, as `RobotTaskEnv.reset` returns them; None resets the
             environments.
 
     Returns:
         Transitions [num_envs, steps], and the number of steps of each episode,
-        (num_envs,). Steps after the end of an episode have no meaning.
+        (num_envs,). Ignore the transitions after the end of an episode.
     """
     with torch.no_grad(), set_exploration_type(exploration):
         rollout = env.rollout(

@@ -65,7 +65,7 @@ class Spaces:
         return asdict(self)
 
     def action_spec(self, *batch_size: int) -> TensorSpec:
-        """Make the spec of actions, (*batch_size, action size), on the default device."""
+        """Make the spec of actions on the default device."""
         device = torch.get_default_device()
         shape = torch.Size((*batch_size, self.action_size))
         return Bounded(-1.0, 1.0, shape, device=device)
@@ -89,7 +89,7 @@ def read_spaces(env: RobotTaskEnv) -> Spaces:
 
 
 def has_sparse_reward(task: Task) -> bool:
-    """Whether all rewards of a task are the -1 and 0 of `Task`, not a subclass's own."""
+    """Whether a task has the sparse rewards of `Task`, -1 and 0."""
     cls = type(task)
     overrides = (
         cls.compute_reward is not Task.compute_reward or cls.reward is not Task.reward

@@ -185,7 +185,7 @@ class Agent(nn.Module, ABC):
         return rows
 
     def set_learning_rate(self, factor: float) -> None:
-        """Set the learning rate of the next gradient steps to factor * LEARNING_RATE."""
+        """Use factor * LEARNING_RATE as learning rate of the next gradient steps."""
         for group in self.optimizer.param_groups:
             group["lr"] = factor * LEARNING_RATE
 
