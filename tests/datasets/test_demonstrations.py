@@ -36,7 +36,8 @@ def test_demonstrations_keep_their_goals(env, make_demos):
 def test_demonstrations_of_another_task(env, make_demos):
     path = make_demos("PandaReach-v1")
     with pytest.raises(
-        ValueError, match="its observation has size 6, that of the environment 18"
+        ValueError,
+        match="its observation has size 6, that of the environment has size 18",
     ):
         read_demos(path, env)
 

@@ -74,9 +74,12 @@ def test_a_policy_learns_from_it(recorded):
 def test_bad_names_are_one_line(recorded):
     for name, message in (
         (recorded[1], "already"),
-        ("push", "'push' is no id of .*: it must end in a version"),
-        ("x/y-v0", "'x/y-v0' is no id of .* a namespace must have at least two"),
-        ("panda/x.y-v0", "'panda/x.y-v0' is no id of .* as in panda/push-expert-v0"),
+        ("push", "'push' is not an id of .*: it must end in a version"),
+        ("x/y-v0", "'x/y-v0' is not an id of .* a namespace must have at least two"),
+        (
+            "panda/x.y-v0",
+            "'panda/x.y-v0' is not an id of .* as in panda/push-expert-v0",
+        ),
     ):
         with pytest.raises(SystemExit, match=message):
             record("minari", name, "PandaReach-v1", 1)

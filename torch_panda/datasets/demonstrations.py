@@ -1,4 +1,4 @@
-"""Reads demonstrations: transitions of an expert for an agent to learn from."""
+"""Reads demonstrations: transitions of an expert from which an agent learns."""
 
 from pathlib import Path
 
@@ -10,8 +10,8 @@ from torch_panda.datasets.formats import format_of, load_format
 from torch_panda.learning import files
 from torch_panda.learning.buffers import STORED_KEYS
 
-# Fraction of rewards that may differ from those of the task: a goal at the edge of
-# success may be rounded to the other side.
+# Fraction of the stored rewards that may differ from those of the task. Rounding a goal
+# near the success threshold can change its reward.
 DIFFERENT_REWARDS = 0.01
 
 
@@ -20,7 +20,7 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
 
     Args:
         path: File that ``python -m torch_panda record`` wrote, or the folder of a data
-            set in one of the `Format`s.
+            set in Minari's or LeRobot's format.
         env: Environment of the task that was demonstrated.
 
     Returns:
@@ -56,7 +56,7 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         if demos[key].shape[-1] != size:
             raise ValueError(
                 f"{path} is for another task: its {key} has size "
-                f"{demos[key].shape[-1]}, that of the environment {size}"
+                f"{demos[key].shape[-1]}, that of the environment has size {size}"
             )
     _check_rewards(path, demos, env)
     demos["action"] = demos["action"].clamp(-1.0, 1.0)

@@ -1,6 +1,6 @@
-"""Formats of data sets: which there are, and what a module of a format offers.
+"""Formats of data sets of other libraries, and the interface of their modules.
 
-In all of them each episode has its seed: ``reset(seed=...)`` of
+These formats store the seed of each episode. ``reset(seed=...)`` of
 `torch_panda.gymnasium_envs.GoalEnv` starts the episode again.
 """
 
@@ -16,7 +16,7 @@ from torch_panda.extras import install_command
 
 Format = Literal["minari", "lerobot"]
 
-# A file by which the folder of a data set is recognised.
+# A file that every data set of a format has in its folder.
 _MARKER_FILES: dict[Format, str] = {
     "minari": "data/metadata.json",
     "lerobot": "meta/info.json",
@@ -31,11 +31,11 @@ class Writer(Protocol):
 
         Args:
             episode: Its transitions, (steps,).
-            seed: Seed that started it.
+            seed: Seed of the episode.
         """
 
     def close(self) -> str:
-        """Finish the data set, and return where it is and how to read it."""
+        """Finish the data set, and return a text that says how to read it."""
 
 
 class FormatModule(Protocol):
@@ -61,7 +61,7 @@ class FormatModule(Protocol):
         """
 
     def read(self, path: Path) -> TensorDict:
-        """Read the transitions (n,) of a data set's folder, under our keys."""
+        """Read the transitions (n,) of a data set's folder, with torch_panda's keys."""
 
 
 def load_format(name: Format) -> FormatModule:
@@ -77,7 +77,7 @@ def load_format(name: Format) -> FormatModule:
 
 
 def format_of(path: Path) -> Format | None:
-    """The format of a data set's folder, or None if the folder is no data set."""
+    """Return the format of a data set's folder, or None for another folder."""
     for name, file in _MARKER_FILES.items():
         if (path / file).is_file():
             return name

@@ -1,7 +1,7 @@
 """Generates data sets for offline learning from an id, a kind and a seed.
 
-Data sets are recipes, not downloads: the same arguments give the same numbers on any
-number of environments and threads, and `sha256` shows whether they are the same.
+There is nothing to download. The same arguments give the same numbers, whatever the
+numbers of environments and threads are. `sha256` verifies this.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from torch_panda.tasks import Task
 Kind = Literal["noisy", "play", "random"]
 
 PLAY_STEPS = 1000  # length of an episode of "play"
-HOLD_STEPS = 10  # steps for which "play" stays at a goal that it reached
+HOLD_STEPS = 10  # steps for which "play" stays at a goal after reaching it
 MAX_NOISE = 0.5  # largest standard deviation of the noise of "noisy"
 
 
@@ -46,11 +46,12 @@ def generate(
 
     Args:
         env_id: Id of the task.
-        kind: "noisy": the scripted expert with Gaussian noise on its actions, whose
-            standard deviation is drawn per episode from 0 to `MAX_NOISE`. "play": the
-            expert pursues goal after goal without reset, for `PLAY_STEPS` steps; it
-            moves on when it has stayed at a goal for `HOLD_STEPS` steps, or after the
-            number of steps of the task's episodes. "random": uniform actions.
+        kind: How actions are chosen. "noisy": by the scripted expert, with Gaussian
+            noise whose standard deviation is drawn per episode from 0 to `MAX_NOISE`.
+            "play": by the expert, which pursues one goal after another without reset,
+            for `PLAY_STEPS` steps. It gets the next goal when it has stayed at a goal
+            for `HOLD_STEPS` steps, or after the number of steps of the task's episodes.
+            "random": uniformly.
         transitions: Number of transitions, rounded up to whole episodes.
         seed: Seed of the data set.
         num_envs: Number of environments stepped in parallel.
@@ -62,13 +63,13 @@ def generate(
         Transitions [episodes, steps] with ``observation``, ``achieved_goal``,
         ``desired_goal``, ``action``, ``("collector", "traj_ids")``, and under ``next``
         also ``reward``, ``success``, ``terminated``, ``truncated`` and ``done``. In
-        "play", ``desired_goal`` is the goal that is pursued at the step, under ``next``
-        too.
+        "play", ``desired_goal`` is the goal that the expert pursues in the step, and
+        the same goal is stored under ``next``.
 
     Raises:
-        ValueError: The kind is unknown, there is no expert for the id, the goals of the
-            task cannot be changed during an episode ("play"), or a number is out of
-            range.
+        ValueError: The kind is unknown, there is no expert for the id, a number is out
+            of range, or the kind is "play" and the goals of the task depend on the
+            start of an episode.
     """
     parts = generate_parts(
         env_id,
@@ -122,8 +123,8 @@ def generate_parts(
     ) as env:
         if kind == "play" and type(env.task).sample_start is not Task.sample_start:
             raise ValueError(
-                'kind "play" needs goals that do not depend on how an episode starts, '
-                f'unlike those of {env_id}; use "noisy" or "random"'
+                'kind "play" needs goals that do not depend on the start of an '
+                f'episode, but those of {env_id} do: use "noisy" or "random"'
             )
         for start in range(first, num_episodes, num_envs):
             numbers = torch.arange(start, min(start + num_envs, num_episodes))
@@ -176,7 +177,16 @@ def _spawn(seed: int, number: int) -> tuple[int, np.random.Generator]:
 
 
 class _Episodes:
-    """One episode in every environment, numbered from ``first``."""
+    """One episode in every environment of a batch.
+
+    Args:
+        env: The environments.
+        expert: Scripted expert; None for random actions.
+        kind: How actions are chosen; see `generate`.
+        seed: Seed of the data set.
+        first: Number of the episode in the first environment. The episodes of the next
+            environments have the following numbers.
+    """
 
     def __init__(
         self,
@@ -201,7 +211,7 @@ class _Episodes:
             self._goal = self._state["desired_goal"].clone()
             self._steps_at_goal = torch.zeros(env.batch_size[0], dtype=torch.int64)
             self._steps_since_goal = torch.zeros_like(self._steps_at_goal)
-            self._patience = type(env.task).max_episode_steps
+            self._max_steps_per_goal = type(env.task).max_episode_steps
 
     @torch.no_grad()
     def step(self) -> TensorDictBase:
@@ -219,7 +229,8 @@ class _Episodes:
         after: TensorDictBase = row["next"]  # type: ignore[assignment]
         self._state = after.select(*self._observed)
         if self._kind == "play":
-            self._pursue(row)
+            self._apply_pursued_goals(row)
+            self._change_goals(row)
         return row
 
     def _act(self, row: TensorDictBase) -> Tensor:
@@ -232,32 +243,35 @@ class _Episodes:
             action = (action + self._noise * noise).clamp(-1.0, 1.0)
         return action
 
-    def _pursue(self, row: TensorDictBase) -> None:
-        """Judge the step by the pursued goal, and choose the next goals."""
+    def _apply_pursued_goals(self, row: TensorDictBase) -> None:
+        """Replace goal, reward and success of a step by those of the pursued goals."""
         after: TensorDictBase = row["next"]  # type: ignore[assignment]
         after["desired_goal"] = row["desired_goal"].clone()
         goals = after["achieved_goal"], after["desired_goal"]
         after["reward"] = self._env.compute_reward(*goals)
         after["success"] = self._env.is_success(*goals)
-        success = after["success"].squeeze(-1)
+
+    def _change_goals(self, row: TensorDictBase) -> None:
+        """Draw new goals where the expert has finished with the pursued one."""
+        success = row["next", "success"].squeeze(-1)
         self._steps_at_goal = torch.where(success, self._steps_at_goal + 1, 0)
         self._steps_since_goal += 1
         changes = self._steps_at_goal >= HOLD_STEPS
-        changes |= self._steps_since_goal >= self._patience
+        changes |= self._steps_since_goal >= self._max_steps_per_goal
         for index in changes.nonzero().flatten().tolist():
             goal = self._env.task.sample_start(self._generators[index]).goal
             self._goal[index] = torch.as_tensor(goal, dtype=self._goal.dtype)
         self._steps_at_goal[changes] = 0
         self._steps_since_goal[changes] = 0
 
-    def _draw(self, draw: Callable[[np.random.Generator], Any]) -> Tensor:
-        """Draw from the generator of each episode: (num_envs, ...) float32."""
-        values = np.stack([draw(generator) for generator in self._generators])
+    def _draw(self, sample: Callable[[np.random.Generator], Any]) -> Tensor:
+        """Sample with the generator of each episode, (num_envs, ...) float32."""
+        values = np.stack([sample(generator) for generator in self._generators])
         return torch.from_numpy(values).float()
 
 
 def sha256(data: TensorDictBase) -> str:
-    """The hash of the keys, shapes, types and numbers of a data set.
+    """Compute a hash of the keys, shapes, types and numbers of a data set.
 
     Returns:
         64 hexadecimal digits. They do not depend on the order of the keys.

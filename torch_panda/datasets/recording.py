@@ -29,17 +29,17 @@ class TensorWriter:
         self.episodes: list[TensorDictBase] = []
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
-        """Keep an episode until the file is written; the format has no seeds."""
+        """Keep an episode until the file is written. The file does not hold seeds."""
         self.episodes.append(episode)
 
     def close(self) -> str:
-        """Write the file. Ctrl-C leaves either no file or a complete one."""
+        """Write the file. If Ctrl-C interrupts this, there is no incomplete file."""
         demos = join(self.episodes)
         save(self.path, demos.to_dict())
         return str(self.path)
 
 
-def disturb(
+def add_noise(
     expert: TensorDictModuleBase, env: torch_panda.RobotTaskEnv, noise_eps: float
 ) -> TensorDictModuleBase:
     """Add Gaussian noise to the actions of an expert.
@@ -50,7 +50,7 @@ def disturb(
         noise_eps: Standard deviation of the noise.
 
     Returns:
-        A policy that writes the disturbed ``action``, and the expert's own action under
+        A policy that writes the noisy ``action``, and the expert's own action under
         ``intended``.
     """
     keep = TensorDictModule(torch.clone, ["action"], ["intended"])
@@ -72,7 +72,7 @@ def play(
     Args:
         env: Batched environment.
         expert: Policy that writes ``action``.
-        exploration: Whether the policy may add its noise.
+        exploration: torchrl's exploration type; RANDOM lets the policy add noise.
 
     Returns:
         The episodes, each with its transitions (steps,).
@@ -82,7 +82,7 @@ def play(
 
 
 def join(episodes: list[TensorDictBase]) -> TensorDictBase:
-    """Concatenate episodes; ``("collector", "traj_ids")`` numbers them."""
+    """Concatenate episodes, with their numbers in ``("collector", "traj_ids")``."""
     transitions = TensorDict.cat(episodes)
     lengths = torch.tensor([len(episode) for episode in episodes])
     numbers = torch.arange(len(episodes)).repeat_interleave(lengths)

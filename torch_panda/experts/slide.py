@@ -87,7 +87,7 @@ def strike(
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Strike the puck once with a corner of the fingers so that it stops at the goal."""
+    """Strike the puck once so that it stops at the goal, with a corner of the hand."""
     puck, offset = achieved_goal, (desired_goal - achieved_goal)[..., :2]
     direction = unit(offset)
     distance = (norm(offset) - OVERSHOOT).clamp(min=0.01)
