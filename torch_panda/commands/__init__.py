@@ -1,7 +1,8 @@
-"""The commands of ``python -m torch_panda``, a module each.
+"""The commands of ``python -m torch_panda``. Each command is a module of this folder.
 
-A module has its options, ``Args``, and the function ``main(args)``. It is imported when
-its command runs, because commands need libraries that the environments do not need.
+A command's module is imported only when the command runs, because it may need libraries
+that the environments do not need. Its function ``run`` reads the options from the
+command line.
 """
 
 import sys
@@ -10,16 +11,16 @@ from importlib import import_module
 
 from torch_panda.extras import explain_missing
 
-# Names of commands, and what they do.
+# Descriptions of the commands by name.
 COMMANDS = {
     "train": "train an agent with hindsight experience replay",
     "evaluate": "measure how often a policy succeeds",
     "watch": "record a policy as a video, or show it in a window or browser",
     "record": "record demonstrations of a scripted expert",
     "plot": "draw the success curves of runs",
-    "refine": "let a policy imitate itself on the goals that it achieved",
+    "refine": "let a policy imitate its own episodes with the goals that they achieved",
     "distributed": "train on the machines of a Ray cluster",
-    "bench": "measure steps per second beside other environments",
+    "bench": "compare steps per second with other environments",
     "info": "print versions, environments, threads and renderers",
 }
 
@@ -28,7 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command.
 
     Args:
-        arguments: the command's name and its options; None takes those of the process.
+        arguments: Name and options of the command. None means those of the command
+            line.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     name = arguments[0] if arguments else "--help"
@@ -47,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def describe() -> str:
-    """The usage, with a line for each command."""
+    """Return the usage, with a line for each command."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:{width}}  {text}" for name, text in COMMANDS.items()]
     usage = "usage: python -m torch_panda COMMAND [OPTIONS]"

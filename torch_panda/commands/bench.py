@@ -1,8 +1,8 @@
-"""Benchmark: steps per second of torch_panda beside other vector environments.
+"""Benchmark: steps per second of torch_panda and of other vector environments.
 
 The contenders take turns (A B C, A B C, ...), so that other work on the machine slows
-all of them. Each turn runs in a process of its own, which makes the environments, warms
-up, measures and ends. Only one contender is in memory at any time.
+all of them alike. Each turn runs in a new process, which makes the environments, warms
+up and measures. Only one contender is in memory at any time.
 """
 
 import math
@@ -115,10 +115,10 @@ class Measurement(NamedTuple):
 
     Attributes:
         speed: Steps of all environments together [1/s].
-        cpu_speed: The same per second of processor time of all processes. Other work
-            on the machine hardly changes it. NaN where the system does not tell.
+        cpu_speed: Steps per second of processor time, summed over all processes. Other
+            work on the machine hardly changes it. NaN except on Linux.
         creation: Time to create one environment, without imports [s].
-        memory: Memory of one environment [MB]; NaN where the system does not tell.
+        memory: Memory of one environment [MB]. NaN except on Linux.
     """
 
     speed: float
@@ -173,9 +173,10 @@ def _make_ours(setting: Setting, **options: Any) -> Running:  # noqa: ANN401 (op
 
 
 def _make_bare_bullet(setting: Setting) -> Running:
-    """Our native loop around Bullet's own solver, with nothing between its steps.
+    """Make environments that only run our native loop with Bullet's own solver.
 
-    It repeats an episode of random actions, whose setpoints it computes the first time.
+    The first episode of random actions computes setpoints. The later episodes repeat
+    these setpoints, so nothing but the loop is measured.
     """
     if loop_name() != "native":
         raise RuntimeError("torch_panda was installed without its native loop")
@@ -255,7 +256,7 @@ def _make_parallel(setting: Setting) -> Running:
 
 
 def _newest_fetch_id(env_id: str, ids: Sequence[str]) -> str:
-    """Newest version of the Fetch robot's task of the same name."""
+    """Return the newest version of the Fetch robot's task of the same name."""
     match = re.fullmatch(r"Panda(Reach|Push|Slide|PickAndPlace)(Dense)?-v\d+", env_id)
     if match is None:
         raise ValueError(f"Fetch has no task like {env_id}")
@@ -304,7 +305,7 @@ class Contender:
     variables: Mapping[str, str] = field(default_factory=dict)
 
     def obstacle(self, setting: Setting) -> str | None:
-        """Reason why the contender cannot run here; None if it can."""
+        """Return the reason why the contender cannot run here, or None if it can."""
         missing = [module for module in self.modules if find_spec(module) is None]
         if missing:
             return f"{' and '.join(missing)} is not installed"
@@ -391,7 +392,7 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.environ.update(CONTENDERS[name].variables)
     make = CONTENDERS[name].make
-    # A first environment takes the imports out of creation and memory.
+    # A first environment imports all modules, which should not count.
     first = make(replace(setting, num_envs=1, num_threads=1))
     used_before, start = _memory(), time.perf_counter()
     running = make(setting)
@@ -411,7 +412,7 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
 
 
 def _process_tree(pid: int) -> list[int]:
-    """A process and its descendants; Linux only."""
+    """Return the ids of a process and of its descendants (Linux only)."""
     files = Path(f"/proc/{pid}/task").glob("*/children")
     children = [int(child) for file in files for child in file.read_text().split()]
     return [pid, *(x for child in children for x in _process_tree(child))]
@@ -446,7 +447,7 @@ def _cpu_time() -> float:
 
 
 def available_memory() -> float:
-    """Memory that the system can still give [MB]; infinite where it does not tell."""
+    """Memory that is still available on this machine [MB]; infinite except on Linux."""
     if sys.platform != "linux":
         return math.inf
     text = Path("/proc/meminfo").read_text()
@@ -560,7 +561,7 @@ def _spread(values: Sequence[float], *, digits: int) -> str:
 
 
 def plot(path: Path, results: Results) -> None:
-    """Draw steps per second: a panel for each setting, a bar for each contender.
+    """Draw steps per second: a panel for each setting, and a bar for each contender.
 
     Args:
         path: File to write, in the format that its suffix names.
@@ -651,10 +652,10 @@ def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
 
 
 def check(args: Args) -> None:
-    """Refuse options that cannot be measured.
+    """Check the options.
 
     Raises:
-        ValueError: Names the option and what it accepts.
+        ValueError: An option is out of range, or an id is unknown.
     """
     for env_id in args.ids:
         torch_panda.max_episode_steps(env_id)  # refuses an unknown id

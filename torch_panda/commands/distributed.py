@@ -4,9 +4,9 @@
 
 Each worker steps `num_envs` environments in `cpus_per_worker` threads and sends its
 transitions to the learner. The learner stores the transitions of all workers in one
-replay buffer, takes the gradient steps that are due, and sends the new weights back to
-this worker. Meanwhile the other workers continue, so runs are not reproducible bit for
-bit.
+replay buffer, takes gradient steps, and sends the new weights back to this worker. The
+other workers continue meanwhile, and batches arrive in varying order. So two runs with
+the same seed differ.
 
 Without `--address` the workers run on this machine. To start a cluster of machines that
 all have torch_panda and the same version of Ray:
@@ -74,7 +74,7 @@ class Args(Hyperparameters):
     steps_per_batch: Positive = 50
     """steps of each environment per batch that a worker sends"""
     cpus_per_worker: Positive = 1
-    """CPUs that a worker reserves, which is also its number of threads"""
+    """CPUs that each worker reserves, which is also its number of threads"""
     total_steps: Positive = 10_000
     """environment steps of all workers together"""
     updates_per_step: Weight = 0.5
@@ -142,7 +142,7 @@ class Learner:
                     break
 
     def learn(self, data: TensorDictBase) -> None:
-        """Store the batch of a worker and take the gradient steps that are due."""
+        """Store the batch of a worker, and take the gradient steps that are now due."""
         stored = self.buffer[self.buffer.extend(data.reshape(-1))]
         self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
         due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
@@ -166,10 +166,10 @@ class Learner:
 
 @dataclass
 class UniqueTrajectories:
-    """Numbers the trajectories of a worker uniquely, and drops unneeded entries.
+    """Gives the trajectories of all workers different ids, and drops unneeded entries.
 
-    Each worker counts its trajectories from 0. In one buffer, hindsight would take the
-    episodes of two workers for one episode and mix up their goals.
+    Each worker counts its trajectories from 0. In a buffer of several workers,
+    hindsight would take two trajectories with the same id for one, and mix their goals.
 
     Attributes:
         worker: Index of the worker.
@@ -180,14 +180,14 @@ class UniqueTrajectories:
     num_workers: int
 
     def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        """Give trajectory t of worker w the number t * num_workers + w."""
+        """Give trajectory t of worker w the id t * num_workers + w."""
         data = data.select(*STORED_KEYS)
         number = data[TRAJECTORY_KEY] * self.num_workers + self.worker
         return data.set(TRAJECTORY_KEY, number)
 
 
 def worker_of(data: TensorDictBase, num_workers: int) -> int:
-    """Index of the worker that collected a batch."""
+    """Return the index of the worker that collected a batch."""
     return int(data[TRAJECTORY_KEY].flatten()[0]) % num_workers
 
 
@@ -224,9 +224,9 @@ def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
         args.num_envs,
         args.cpus_per_worker,
     )
-    # torchrl sends weights through a process group at the address of this machine's
-    # name. That is often 127.0.0.1, which other machines cannot reach, so
-    # `send_weights` goes through Ray instead.
+    # torchrl would send weights through a process group at the address that this
+    # machine's name resolves to. This is often 127.0.0.1, which other machines cannot
+    # reach. So `send_weights` uses Ray instead, and torchrl's warning is ignored.
     warnings.filterwarnings("ignore", message="RayCollector iteration started before")
     return RayCollector(
         [partial(make, draw_seed()) for _ in workers],  # type: ignore[arg-type]
@@ -291,7 +291,7 @@ def main(args: Args) -> None:
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)
-        # The place of a run is not a difference between two ways to train.
+        # Plots should not name options that say where a run was computed.
         default = Args(
             env_id=args.env_id,
             address=args.address,

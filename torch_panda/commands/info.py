@@ -1,4 +1,4 @@
-"""Print what is installed, and what it offers."""
+"""Print the installed versions, the ids of environments, and the renderers."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ from torch_panda.info import describe
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Print the description; there are no options."""
+    """Print the information. The command has no options."""
     if arguments:
         raise SystemExit(f"info takes no options, got {' '.join(arguments)}")
     print(describe())

@@ -1,12 +1,12 @@
-"""Refine a policy: let it imitate itself on the goals that it achieved.
+"""Refine a policy: let it imitate its own episodes, with the goals that they achieved.
 
     python -m torch_panda refine runs/PandaSlide-v1-ddpg-relabel-0 --out runs/slide
 
-A policy that misses its goal by a little has shown how to reach the place where it
-ended. So the policy plays episodes, the goal of each episode becomes the goal that was
+An episode that misses its goal shows how to reach the goal that it achieved instead.
+So the policy plays episodes, the desired goal of each episode is replaced by the goal
 achieved at its end, and the policy imitates these episodes. This is goal-conditioned
-supervised learning (arXiv 1912.06088), starting from a policy that reinforcement
-learning has trained. It needs neither rewards nor demonstrations nor noise.
+supervised learning (arXiv 1912.06088), which here starts from a trained policy. It
+needs no rewards, no demonstrations and no exploration noise.
 """
 
 import os
@@ -42,21 +42,22 @@ from torch_panda.learning.policy_files import SavedPolicy
 from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
-LEARNING_RATE = 0.3  # at the start, as a fraction of the learning rate of training
+LEARNING_RATE = 0.3  # first learning rate, as a fraction of that of training
 
 
 @dataclass
 class Args:
-    """Refine a policy on the goals that it achieved."""
+    """Refine a policy by imitation of its own episodes."""
 
     policy: Annotated[Path, tyro.conf.Positional]
     """folder of a run, or its checkpoint.pt"""
     out: Path
-    """folder of the results; it holds the same files as that of `train`"""
+    """folder of the results, with the same files as a run of `train`"""
     env_id: str | None = None
     """another task with the same spaces; None means the task of the policy"""
     steps: Positive = 640_000
-    """environment steps to play, in whole episodes; the last million are imitated"""
+    """environment steps to play, rounded up to whole episodes. The last million steps
+    are imitated"""
     updates: Positive = 60_000
     """gradient steps of imitation, during which the learning rate falls to 0"""
     batch_size: Positive = 1024
@@ -68,11 +69,11 @@ class Args:
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
-    """continue the run in that folder; all other options must be the same"""
+    """continue the run in the folder; all other options must be the same"""
 
 
 class Refinement:
-    """A refinement: the agent, the episodes that it played, and the progress.
+    """A refinement with its agent, its played episodes and its progress.
 
     Args:
         args: The options.
@@ -110,7 +111,7 @@ class Refinement:
             Whether the end was reached.
 
         Raises:
-            ValueError: No episode achieved a goal that the task could ask for.
+            ValueError: No episode ended at a goal that the task could draw.
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if len(progress.curve) > 1:
@@ -125,7 +126,7 @@ class Refinement:
             return False
         if not len(self.buffer):
             raise ValueError(
-                "no episode ended at a goal that the task could ask for, so there is "
+                "no episode ended at a goal that the task could draw, so there is "
                 "nothing to imitate: train the policy for longer first"
             )
         pretrain(
@@ -143,7 +144,7 @@ class Refinement:
         return True
 
     def play(self, stop: object) -> None:
-        """Play episodes, and store those with an achieved goal."""
+        """Play episodes, relabel them, and store those that succeed then."""
         progress, last = self.progress, self.args.steps
         bar = tqdm(desc="playing", initial=progress.steps, total=last, unit="step")
         while progress.steps < last and not stop:
@@ -177,13 +178,13 @@ def relabel(
 
     Args:
         episode: The transitions, (steps,).
-        task: Task whose success function judges the new goal.
-        varies: Which entries of a goal differ between episodes, (goal_dim,) bool. The
-            other entries keep the desired goal: a puck of Slide lies lower than all
-            goals.
+        task: Task, for its function `is_success`.
+        varies: Which entries of drawn goals differ between episodes, (goal_dim,) bool.
+            The other entries are not replaced. For example, a resting puck of Slide is
+            lower than all goals, so the height of the goal is kept.
 
     Returns:
-        A copy of the episode, or None if it does not succeed with the new goal.
+        A copy of the episode, or None if its end does not succeed with the new goal.
     """
     end = episode["next", "achieved_goal"][-1]
     goal = torch.where(varies, end, episode["desired_goal"][0])

@@ -2,9 +2,9 @@
 
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
 
-The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687).
-Those that the paper does not give follow the HER of OpenAI Baselines. `--preset tuned`
-takes the recipe of the task from `torch_panda.learning.recipes`.
+The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687) or,
+where the paper gives none, those of the HER of OpenAI Baselines. `--preset tuned` uses
+the recipe of the task in `torch_panda.learning.recipes`.
 """
 
 from collections.abc import Sequence
@@ -30,23 +30,25 @@ from torch_panda.learning.video import record
 def parse(arguments: Sequence[str] | None = None) -> Args:
     """Read the command line.
 
-    Preset and task determine the defaults of the other options, so they are read first.
+    The command line is parsed twice, because preset and task determine the defaults of
+    the other options.
 
     Raises:
-        ValueError: A module that should be imported does not exist.
+        ValueError: A module of ``--import`` does not exist.
     """
     prog = "python -m torch_panda train"
-    first = tyro.cli(Args, prog=prog, args=arguments)
-    import_modules(read_modules(first.imports))
-    default = default_args(first.preset, first.env_id)
+    first_args = tyro.cli(Args, prog=prog, args=arguments)
+    import_modules(read_modules(first_args.imports))
+    default = default_args(first_args.preset, first_args.env_id)
     return tyro.cli(Args, prog=prog, args=arguments, default=default)
 
 
 def make_run(args: Args, out: Path) -> Run:
-    """Prepare a training, with its demonstrations if there are any.
+    """Prepare a training, and read its demonstrations if the options name any.
 
     Raises:
-        ValueError: The options do not fit each other, the task or the files.
+        ValueError: An option does not fit the task or another option, or a file cannot
+            be read.
     """
     demos = None
     if args.demos is not None:

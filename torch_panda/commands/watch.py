@@ -24,7 +24,7 @@ from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 from torch_panda.learning.video import FPS, play, record
 
-CAMERA = torch_panda.Camera(distance=1.1)  # the first view in a browser
+CAMERA = torch_panda.Camera(distance=1.1)  # view at the start in a browser
 
 
 def show(
@@ -57,11 +57,11 @@ def serve(
     """Play episodes in a browser, in real time.
 
     Args:
-        env: Environments; the page shows any of them.
+        env: Environments. The user of the page chooses which one it shows.
         policies: One policy per episode.
-        host: Address at which the page is served.
-        port: Port of the page; if it is taken, the next free port.
-        allowed_hosts: Names of this machine under which browsers may open the page.
+        host: Network address that serves the page.
+        port: Port of the page. If it is taken, the next free port is used.
+        allowed_hosts: Host names in the page's URL that are accepted.
     """
     with env.open_viewer(
         CAMERA, host=host, port=port, allowed_hosts=allowed_hosts
@@ -77,7 +77,7 @@ def serve(
 
 
 def follow(path: Path) -> Iterator[TensorDictModuleBase]:
-    """Yield the policy of a run; read it again whenever a training has saved it.
+    """Yield the policy of a run, and read it again whenever a training has saved it.
 
     Args:
         path: Folder of the run, or a checkpoint.
@@ -109,14 +109,15 @@ class Args:
     human: bool = False
     """show the episodes in a window of pybullet's GUI instead, in real time"""
     web: bool = False
-    """show the episodes in a browser instead (extra viewer); the policy of a run that
-    is training is read again whenever it is saved"""
+    """show the episodes in a browser instead (needs the extra "viewer"). If the policy
+    is a run that is still training, it is read again whenever the training saves it"""
     host: str = "127.0.0.1"
-    """with --web, address of the page; 0.0.0.0 serves it to other machines too"""
+    """with --web, network address that serves the page; 0.0.0.0 also serves it to other
+    machines"""
     port: Port = 8080
     """with --web, port of the page; if it is taken, the next free port"""
     allowed_hosts: tuple[str, ...] = ()
-    """with --web, names of this machine under which browsers may open the page"""
+    """with --web, host names in the page's URL that are accepted"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 
