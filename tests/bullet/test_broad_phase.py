@@ -33,7 +33,7 @@ def client():
         yield client
 
 
-def add_noise(client, num_steps):
+def disturb(client, num_steps):
     arm, _, *cubes, marker = client.bodies
     client.set_joint(arm, 1, 1.2, 0.5)
     client.set_base(marker, (0.3, 0.1, 0.2))
@@ -45,7 +45,7 @@ def add_noise(client, num_steps):
 def test_bodies_return_to_where_they_were_built(client):
     built = poses(client)
     broad_phase = BroadPhase(client)
-    add_noise(client, 30)
+    disturb(client, 30)
     assert poses(client) != built
     broad_phase.restore()
     assert poses(client) == built
@@ -78,7 +78,7 @@ def test_steps_after_a_restore_do_not_depend_on_earlier_steps(client):
     broad_phase = BroadPhase(client)
     ends = []
     for num_steps in (0, 7, 40, 300):
-        add_noise(client, num_steps)
+        disturb(client, num_steps)
         broad_phase.restore()
         contacts = []
         for _ in range(60):

@@ -31,7 +31,7 @@ from torch_panda.datasets.generation import (
     size,
 )
 from torch_panda.datasets.parts import Parts
-from torch_panda.datasets.recording import TensorWriter, disturb, play
+from torch_panda.datasets.recording import TensorWriter, add_noise, play
 from torch_panda.experts import make_expert
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.files import prepare, save
@@ -185,7 +185,7 @@ def record_demonstrations(args: Args) -> None:
         **make_options(args),
     )
     writer = None if args.out is None else open_writer(args, args.out, env)
-    expert = disturb(expert, env, args.noise_eps)
+    expert = add_noise(expert, env, args.noise_eps)
     success: list[Tensor] = []
     steps = 0
     with env, tqdm(total=episodes, unit="episode", desc=args.env_id) as bar:

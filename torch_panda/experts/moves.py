@@ -78,7 +78,7 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     remaining = distance - dot(velocity, velocity) / (2 * DECELERATION)
     step = (0.5 * remaining).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
-    # Leave a cube within 3 cm alone, because another approach would add_noise it.
+    # Leave a cube within 3 cm alone, because another approach would disturb it.
     done = (remaining < 0.01) | ~pushing & (distance < 0.03)
     action = torch.where(pushing, advance, go_over(ee, behind, 0.06))
     return torch.where(done, 0.0, action)
