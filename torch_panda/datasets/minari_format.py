@@ -104,7 +104,7 @@ def find_folder(out: Path) -> Path:
         parse_dataset_id(dataset_id)
     except (ValueError, TypeError):  # TypeError: without a version
         raise ValueError(
-            f"{dataset_id!r} is no id of a Minari data set: it must end in a "
+            f"{dataset_id!r} is not an id of a Minari data set: it must end in a "
             "version, and a namespace must have at least two characters, as in "
             "panda/push-expert-v0"
         ) from None
