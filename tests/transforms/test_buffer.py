@@ -62,7 +62,7 @@ def test_a_thread_that_prefetches_is_found():
 
 def test_replacing_rows_raises():
     rb = make(Recorder())
-    with pytest.raises(RuntimeError, match=r"replaced.*use extend"):
+    with pytest.raises(RuntimeError, match=r"replacing.*use extend"):
         rb[2:4] = DATA[:2]
 
 

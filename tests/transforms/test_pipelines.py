@@ -218,7 +218,7 @@ def test_max_value_writer_is_refused(cls, options):
 def test_replaced_rows_are_refused():
     rb, envs = buffer(HindsightRelabel(reward_fn)), Envs(2, [4])
     rb.extend(envs.chunk(8).reshape(-1))
-    with pytest.raises(RuntimeError, match="replaced"):
+    with pytest.raises(RuntimeError, match="replacing rows"):
         rb[3:5] = envs.chunk(1).reshape(-1)
 
 
@@ -510,7 +510,7 @@ def test_data_that_exist_already(storage, layout, tmp_path):
         check_batch(batch, prepared, "future")
         assert abs(relabelled(batch).float().mean() - 0.8) < 0.15
     assert (data == before).all()
-    with pytest.raises(RuntimeError, match="before other"):
+    with pytest.raises(RuntimeError, match="before any extend"):
         relabel.prepare(data)
 
 

@@ -164,5 +164,5 @@ def test_parts_are_of_vectors():
         for place in (key, ("next", key)):
             data[place] = data[place][:, :, None].expand(-1, 3, 2).clone()
     rb = make_buffer(HindsightRelabel(compute_reward, goal_parts=(1, 1)))
-    with pytest.raises(ValueError, match="a vector of 2"):
+    with pytest.raises(ValueError, match="the size of the goal vector"):
         rb.extend(data)
