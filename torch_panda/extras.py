@@ -26,6 +26,8 @@ EXTRAS = {
     "viewer": Extra("env.open_viewer() and watch --web", ("viser", "trimesh")),
     "minari": Extra("data sets in Minari's format", ("minari", "h5py"), (3, 11)),
     "lerobot": Extra("data sets in LeRobot's format", ("lerobot",), (3, 12)),
+    "tensorboard": Extra("train --logger tensorboard", ("tensorboard",)),
+    "wandb": Extra("train --logger wandb", ("wandb",)),
     "ray": Extra("training on several machines", ("ray",)),
     "bench": Extra(
         "the other environments of bench",

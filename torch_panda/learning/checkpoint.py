@@ -25,7 +25,7 @@ LOCK = "run.lock"  # file that the process of a run keeps locked
 RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
 SAVE_INTERVAL = 20_000  # environment steps, or imitation updates, between two saves
 # Options that may change when a run is resumed.
-FREE_OPTIONS = {"resume", "out", "video", "imports"}
+FREE_OPTIONS = {"resume", "out", "video", "imports", "logger"}
 
 
 @dataclass

@@ -5,12 +5,14 @@ import io
 from pathlib import Path
 
 import torch
+from torchrl.record.loggers import Logger
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import Progress
 from torch_panda.learning.evaluation import evaluate_in
+from torch_panda.learning.logger import close_logger, log_row
 from torch_panda.learning.plots import plot_curve
 from torch_panda.learning.policy_files import save_policy
 from torch_panda.registry import make
@@ -27,10 +29,20 @@ class Curve:
         agent: Agent whose policy is evaluated.
         out: Folder of curve.csv, curve.png and checkpoint.pt.
         device: Device of the environments' outputs.
+        logger: Also gets each row, under the names of the columns.
     """
 
-    def __init__(self, env_id: str, agent: Agent, out: Path, *, device: str) -> None:
+    def __init__(
+        self,
+        env_id: str,
+        agent: Agent,
+        out: Path,
+        *,
+        device: str,
+        logger: Logger | None = None,
+    ) -> None:
         self.env_id, self.agent, self.out = env_id, agent, out
+        self.logger = logger
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
@@ -56,6 +68,8 @@ class Curve:
             "seconds": round(progress.seconds, 2),
         }
         progress.curve.append({**row, **(losses or {})})
+        if self.logger is not None:
+            log_row(self.logger, progress.curve[-1])
         fields = {key: None for row in progress.curve for key in row}
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, fieldnames=list(fields))
@@ -66,8 +80,10 @@ class Curve:
         save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
 
     def close(self) -> None:
-        """Close the environments."""
+        """Close the environments and the logger."""
         self.env.close()
+        if self.logger is not None:
+            close_logger(self.logger)
 
 
 def reseed(env: RobotTaskEnv) -> None:

@@ -16,6 +16,7 @@ from torch_panda.learning.limits import (
     check_device,
     check_limits,
 )
+from torch_panda.learning.logger import LoggerName, check_logger
 from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.user_modules import Imports
 
@@ -75,6 +76,9 @@ class Args(Hyperparameters):
     """device of the networks and the replay buffer"""
     video: bool = True
     """record a video of 4 episodes at the end"""
+    logger: LoggerName = "none"
+    """also log each evaluation to TensorBoard (folder "tensorboard" of the run) or to
+    Weights & Biases (project "torch_panda"); curve.csv is always written"""
 
 
 def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
@@ -104,6 +108,7 @@ def check(args: Args) -> None:
     if not args.total_steps and not args.pretrain_updates:
         raise ValueError("total_steps must be positive without pretrain_updates, got 0")
     check_device(args.device)
+    check_logger(args.logger)
 
 
 def default_args(preset: str, env_id: str) -> Args:

@@ -9,6 +9,7 @@ for bit. Gradient steps use OMP_NUM_THREADS threads, by default one.
 import os
 import time
 from collections import defaultdict
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -29,6 +30,7 @@ from torch_panda.learning.checkpoint import (
     crossed,
 )
 from torch_panda.learning.curve import Curve, reseed
+from torch_panda.learning.logger import make_logger
 from torch_panda.learning.options import Args
 from torch_panda.learning.pretraining import make_demo_buffer, pretrain
 from torch_panda.learning.starts import StartFrom, states_at_objects
@@ -109,7 +111,13 @@ class Run:
             exploration_type=ExplorationType.RANDOM,  # type: ignore[arg-type]
             auto_register_policy_transforms=True,
         )
-        self.curve = Curve(args.env_id, self.agent, out, device=args.device)
+        self.curve = Curve(
+            args.env_id,
+            self.agent,
+            out,
+            device=args.device,
+            logger=make_logger(args.logger, out, asdict(args)),
+        )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
             out / "resume.pt", args, self.agent, self.buffer, self.progress
