@@ -8,14 +8,19 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
 FOLDERS += ("torch_panda/policies", "examples/results", "torch_panda/gymnasium_envs")
-FOLDERS += ("torch_panda/learning",)
+FOLDERS += ("torch_panda/learning", "torch_panda/datasets")
 GUIDES = [ROOT / folder / "README.md" for folder in FOLDERS]
 MAX_LINES = 250
 
 
 @pytest.mark.parametrize(
     "guide",
-    ["README.md", "torch_panda/README.md", "torch_panda/gymnasium_envs/README.md"],
+    [
+        "README.md",
+        "torch_panda/README.md",
+        "torch_panda/gymnasium_envs/README.md",
+        "torch_panda/datasets/README.md",
+    ],
 )
 def test_snippets(guide):
     """One after the other, as a reader would type them."""

@@ -5,6 +5,9 @@ import torch
 
 import torch_panda
 from tests.datasets.imitation import imitate, record
+from torch_panda import datasets
+from torch_panda.commands import record as record_data
+from torch_panda.datasets import generation
 from torch_panda.datasets.demonstrations import read_demos
 
 lerobot_dataset = pytest.importorskip(
@@ -37,3 +40,20 @@ def test_round_trip_and_a_policy_of_it(tmp_path):
         assert imitate(env, demos) > 0.9
     with pytest.raises(SystemExit, match="already"):
         record("lerobot", folder, "PandaReach-v1", 1)
+
+
+def test_play_keeps_the_goal_of_each_step(tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "PLAY_STEPS", 120)
+    folder, recipe = tmp_path / "reach", {"kind": "play", "transitions": 240, "seed": 3}
+    record_data.main(
+        record_data.Args(
+            "PandaReach-v1", format="lerobot", out=folder, image_size=64, **recipe
+        )
+    )
+    expected = datasets.generate("PandaReach-v1", num_envs=2, **recipe)[:, :-1]
+    with torch_panda.make("PandaReach-v1") as env:
+        demos = read_demos(folder, env)
+    for key in ("observation", "desired_goal", "action"):
+        assert torch.equal(demos[key], expected[key].flatten(0, 1))
+    for key in ("observation", "desired_goal", "reward", "success"):
+        assert torch.equal(demos["next", key], expected["next", key].flatten(0, 1))
