@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
+from pkgutil import resolve_name
 from typing import Any, TypeVar
 
 import gymnasium
@@ -16,17 +17,10 @@ from torch_panda.bullet.shapes import BLUE
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.rendering import Camera
-from torch_panda.robots import Kuka, Panda, Robot, XArm6, XArm6Gripper
+from torch_panda.robots import Panda, Robot
 from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import Task
-from torch_panda.tasks.drawer import Drawer
-from torch_panda.tasks.flip import Flip
-from torch_panda.tasks.peg_insertion import GRASP_WIDTH, PegInsertion
-from torch_panda.tasks.pick_and_place import PickAndPlace
-from torch_panda.tasks.push import Push
-from torch_panda.tasks.reach import Reach
-from torch_panda.tasks.slide import Slide
-from torch_panda.tasks.stack import Stack
+from torch_panda.tasks.peg_insertion import GRASP_WIDTH
 
 Made = TypeVar("Made", Robot, Task)
 Options = Mapping[str, Any]
@@ -118,20 +112,39 @@ BLOCKED = {"block_gripper": True}
 FIRM = {"finger_friction": 5.0}
 SPINNING = {"finger_spinning_friction": 0.001}  # panda-gym 3.0.7; the URDF has 0.1
 
-# To add a task or a robot, add its line here. The page tasks/README.md shows the
-# numbers of both versions side by side, with their sources.
+
+def _robot(path: str) -> type[Robot]:
+    """A class in `torch_panda.robots`, given as ``module:Class``."""
+    robot: type[Robot] = resolve_name(f"torch_panda.robots.{path}")
+    return robot
+
+
+def _task(path: str) -> type[Task]:
+    """A class in `torch_panda.tasks`, given as ``module:Class``."""
+    task: type[Task] = resolve_name(f"torch_panda.tasks.{path}")
+    return task
+
+
+# To add a task or a robot, add its line here; nothing else imports its file. The page
+# tasks/README.md shows the numbers of both versions side by side, with their sources.
 FAMILIES = (
-    Family(Panda, Reach, BLOCKED, v3_task={"table_friction": 0.5}, v3_robot=SPINNING),
     Family(
         Panda,
-        Push,
+        _task("reach:Reach"),
+        BLOCKED,
+        v3_task={"table_friction": 0.5},
+        v3_robot=SPINNING,
+    ),
+    Family(
+        Panda,
+        _task("push:Push"),
         BLOCKED,
         v3_task={"table_friction": 0.5, "object_mass": 1.0},
         v3_robot=SPINNING,
     ),
     Family(
         Panda,
-        Slide,
+        _task("slide:Slide"),
         BLOCKED,
         v3_task={
             "table_friction": 0.5,
@@ -146,14 +159,14 @@ FAMILIES = (
     ),
     Family(
         Panda,
-        PickAndPlace,
+        _task("pick_and_place:PickAndPlace"),
         FIRM,
         v3_task={"table_friction": 0.5, "object_mass": 1.0, "object_friction": 0.5},
         v3_robot={"finger_friction": 1.0, **SPINNING},
     ),
     Family(
         Panda,
-        Stack,
+        _task("stack:Stack"),
         FIRM,
         v3_task={
             "table_friction": 0.5,
@@ -166,13 +179,22 @@ FAMILIES = (
         v3_robot={"finger_friction": 1.0, **SPINNING},
     ),
     # panda-gym 1.1.0 has no Flip, so its -v1 has the fingers of 3.0.7 too.
-    Family(Panda, Flip, SPINNING, v3_task={"table_friction": 0.5}),
-    Family(Panda, Drawer, BLOCKED),
-    Family(Panda, PegInsertion, BLOCKED | FIRM | {"fingers_width": GRASP_WIDTH}),
-    Family(Kuka, Reach, joints=False),
-    Family(XArm6, Reach, joints=False),
-    Family(XArm6Gripper, Reach, BLOCKED, joints=False),
-    Family(XArm6Gripper, PickAndPlace, FIRM, joints=False),
+    Family(Panda, _task("flip:Flip"), SPINNING, v3_task={"table_friction": 0.5}),
+    Family(Panda, _task("drawer:Drawer"), BLOCKED),
+    Family(
+        Panda,
+        _task("peg_insertion:PegInsertion"),
+        BLOCKED | FIRM | {"fingers_width": GRASP_WIDTH},
+    ),
+    Family(_robot("kuka:Kuka"), _task("reach:Reach"), joints=False),
+    Family(_robot("xarm:XArm6"), _task("reach:Reach"), joints=False),
+    Family(_robot("xarm:XArm6Gripper"), _task("reach:Reach"), BLOCKED, joints=False),
+    Family(
+        _robot("xarm:XArm6Gripper"),
+        _task("pick_and_place:PickAndPlace"),
+        FIRM,
+        joints=False,
+    ),
 )
 
 _REGISTRATIONS = {

@@ -1,20 +1,24 @@
 """Sensors by name, and by the keywords of `torch_panda.make`."""
 
 from collections.abc import Sequence
+from pkgutil import resolve_name
 
 from torch_panda.rendering import Camera
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
 from torch_panda.sensors.base import Sensor
 from torch_panda.sensors.cameras import CameraSensor
-from torch_panda.sensors.forces import FingerContact, JointTorque, WristForceTorque
-from torch_panda.sensors.joints import JointState
 
+# To add a sensor, add its line here: its name, and its class as `module:Class`.
+_CLASSES = {
+    "joint_state": "joints:JointState",
+    "wrist_force_torque": "forces:WristForceTorque",
+    "finger_contact": "forces:FingerContact",
+    "joint_torque": "forces:JointTorque",
+}
 SENSORS: dict[str, Sensor] = {
-    "joint_state": JointState(),
-    "wrist_force_torque": WristForceTorque(),
-    "finger_contact": FingerContact(),
-    "joint_torque": JointTorque(),
+    name: resolve_name(f"torch_panda.sensors.{path}")()
+    for name, path in _CLASSES.items()
 }
 """Sensors that ``make(..., sensors=...)`` accepts by name."""
 
