@@ -82,6 +82,16 @@ def test_a_missing_module_is_one_error(folder, command, module, message):
         main([command, *arguments, "--import", module])
 
 
+@pytest.mark.parametrize("name", ["torch", "sys"])
+def test_a_file_does_not_replace_a_loaded_module(folder, name):
+    (folder / f"{name}.py").write_text(MODULE)
+    loaded = sys.modules[name]
+    with pytest.raises(SystemExit, match=f"another module named '{name}' is loaded"):
+        main(["evaluate", "run", "--import", f"{name}.py"])
+    assert sys.modules[name] is loaded
+    assert "Near-v0" not in registry._REGISTRATIONS
+
+
 def test_an_error_inside_the_module_is_shown(folder):
     (folder / "broken.py").write_text("import there_is_no_such_library")
     with pytest.raises(ModuleNotFoundError, match="there_is_no_such_library"):

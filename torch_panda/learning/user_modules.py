@@ -55,7 +55,8 @@ def import_modules(modules: Iterable[UserModule]) -> None:
     An error inside a module is not caught.
 
     Raises:
-        ValueError: There is no module of that name.
+        ValueError: There is no module of that name, or a file would replace a module
+            that is loaded.
     """
     folder = str(Path.cwd())
     if folder not in sys.path:  # a console script has its own folder there instead
@@ -72,7 +73,20 @@ def import_modules(modules: Iterable[UserModule]) -> None:
                     "the name of a module or the path of a .py file"
                 ) from None
         else:
-            module = ModuleType(Path(name).stem)
-            module.__file__ = name
-            sys.modules[module.__name__] = module
-            exec(compile(source, name, "exec"), module.__dict__)
+            _run_file(name, source)
+
+
+def _run_file(file: str, source: str) -> None:
+    """Run a file as a module. The file itself may have been loaded before."""
+    name = Path(file).stem
+    if name in sys.modules:
+        loaded = getattr(sys.modules[name], "__file__", None)
+        if loaded is None or Path(loaded).resolve() != Path(file).resolve():
+            raise ValueError(
+                f"cannot import the file {file}: another module named {name!r} is "
+                f"loaded; rename the file"
+            )
+    module = ModuleType(name)
+    module.__file__ = file
+    sys.modules[name] = module
+    exec(compile(source, file, "exec"), module.__dict__)
