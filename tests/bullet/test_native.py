@@ -15,7 +15,7 @@ from torch_panda.bullet import native
 FOLDER = Path(native.__file__).parent
 SOURCES = ("client.h", "client.c", "environment.c", "loop.c", "reset.c")
 # Hash of the C sources without comments and white space, by version.
-HASHES = {2: "6c4a1ceb2163b398"}
+HASHES = {3: "f0fed283b4b8328e"}
 
 
 def hash_of_sources():

@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import _StepMDP
 
 import torch_panda
 from torch_panda import Panda, Push, RobotTaskEnv, Task
@@ -221,3 +223,68 @@ def test_a_bad_action_changes_nothing(bad):
         state = env.get_state(exact=True)
         assert (state["num_actions"] == 0).all()
         assert (state["step_count"] == 0).all()
+
+
+# ---- the next root of a rollout ------------------------------------------------------
+
+
+def assert_same_next_root(env, td):
+    ours = env._step_mdp(td)
+    theirs = _StepMDP(env, exclude_action=False)(td)
+    assert type(ours) is type(theirs)
+    assert (ours.batch_size, ours.device) == (theirs.batch_size, theirs.device)
+    assert ours.names == theirs.names
+    assert list(ours.keys()) == list(theirs.keys())
+    for key, value in ours.items():
+        if isinstance(value, torch.Tensor):
+            assert value is theirs[key]
+        else:
+            assert (value == theirs[key]).all()
+            assert value is not td[key]
+    return ours
+
+
+def test_the_next_root_is_that_of_torchrl():
+    with make() as env:
+        td = env.reset().set("action", torch.ones(N, 3))
+        td["hidden"] = torch.ones(N, 2)  # of a policy
+        td = env.step(td)
+        root = assert_same_next_root(env, td)
+        assert "hidden" in set(root.keys())
+        assert "reward" not in set(root.keys())
+        td["next", "hidden"] = torch.zeros(N, 2)  # not an observation
+        assert (assert_same_next_root(env, td)["hidden"] == 1).all()
+        td["nested"] = TensorDict({"entry": torch.ones(N)}, [N])
+        assert_same_next_root(env, td)
+        td.names = ["envs"]
+        assert_same_next_root(env, td.exclude("nested"))
+        assert_same_next_root(env, td.exclude("done", ("next", "done")))
+        env.add_truncated_keys()  # clears torchrl's cache
+        assert_same_next_root(env, td)
+
+
+@pytest.mark.parametrize("layout", ["plain", "strided", "missing"])
+def test_ends_are_found_and_marked_as_by_torchrl(layout):
+    with make() as env:
+        td = env.reset()
+        for env_index in (None, 0, N - 1):
+            done = torch.zeros(N, 2, dtype=torch.bool)[:, :1]
+            if layout != "strided":
+                done = done.contiguous()
+            if env_index is not None:
+                done[env_index] = True
+            root = td.exclude("done", "_reset")
+            if layout != "missing":
+                root["done"] = done
+            expected = layout != "missing" and env_index is not None
+            assert env.any_done(root) == expected
+            assert ("_reset" in set(root.keys())) == expected
+            if expected:
+                assert root["_reset"].equal(done)
+
+
+def test_a_step_refuses_a_locked_tensordict():
+    with make() as env:
+        td = env.reset().set("action", torch.ones(N, 3)).lock_()
+        with pytest.raises(RuntimeError, match="locked"):
+            env.step(td)

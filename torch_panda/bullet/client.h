@@ -10,7 +10,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { LOOP_VERSION = 2 }; /* native.py refuses a library of another version */
+enum { LOOP_VERSION = 3 }; /* native.py refuses a library of another version */
 
 typedef void *handle;          /* of a client, a command or a status */
 typedef const double *doubles; /* input */

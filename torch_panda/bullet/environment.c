@@ -10,13 +10,23 @@
 #include <math.h>
 #include <stdint.h>
 
-/* Clip actions to [-1, 1]. Return 0 if one is not finite. */
-int environment_clip(const float *action, float *clipped, int count) {
-    for (int k = 0; k < count; k++) {
+/* Clip actions to [-1, 1] and count a step of all environments. Return 0, and count
+   nothing, if an action is not finite. */
+int environment_begin_step(const float *action, float *clipped, int num_actions,
+                           int64_t *step_count, int num_envs) {
+    for (int k = 0; k < num_actions; k++) {
         if (!isfinite(action[k])) return 0;
         clipped[k] = action[k] < -1 ? -1 : action[k] > 1 ? 1 : action[k];
     }
+    for (int env = 0; env < num_envs; env++) step_count[env]++;
     return 1;
+}
+
+/* Whether one of some flags is true. */
+int environment_any(const uint8_t *flags, size_t count) {
+    for (size_t k = 0; k < count; k++)
+        if (flags[k]) return 1;
+    return 0;
 }
 
 /* Distance between the fingers; see Robot.fingers_width. */

@@ -20,6 +20,7 @@ from ctypes import (
     c_float,
     c_int,
     c_int64,
+    c_size_t,
     c_void_p,
 )
 from pathlib import Path
@@ -29,7 +30,7 @@ from torch_panda.bullet import capi
 
 # Version of the C sources, as ``loop_version`` in client.h: the library must have been
 # compiled from sources of this version.
-VERSION = 2
+VERSION = 3
 
 # "native": threads of C. "ctypes": threads of Python that call Bullet through ctypes.
 LoopName = Literal["native", "ctypes"]
@@ -271,8 +272,16 @@ class Library:
         self.euler_angles.restype = None
         self.euler_angles.argtypes = (POINTER(c_double), POINTER(c_double))
         quick = ctypes.PyDLL(path)
-        self.environment_clip = quick.environment_clip
-        self.environment_clip.argtypes = (c_void_p, c_void_p, c_int)
+        self.environment_begin_step = quick.environment_begin_step
+        self.environment_begin_step.argtypes = (
+            c_void_p,
+            c_void_p,
+            c_int,
+            c_void_p,
+            c_int,
+        )
+        self.environment_any = quick.environment_any
+        self.environment_any.argtypes = (c_void_p, c_size_t)
         self.environment_setpoints = quick.environment_setpoints
         self.environment_setpoints.restype = None
         self.environment_setpoints.argtypes = (

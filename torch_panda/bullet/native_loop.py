@@ -74,6 +74,8 @@ class NativeLoop:
         )
         self._control = native.Control()
         self._motor_control: MotorControl | None = None  # the source of _control
+        self._setpoint: Doubles | None = None  # the last one
+        self._setpoint_address = 0
         self._loop: int | None = None
         self._process = os.getpid()
         for env, client in enumerate(clients):
@@ -108,10 +110,12 @@ class NativeLoop:
         if control is not self._motor_control:
             self._control = self._convert(control)
             self._motor_control = control
+        if setpoint is not self._setpoint:
+            self._setpoint, self._setpoint_address = setpoint, setpoint.ctypes.data
         chosen = range(len(self._clients)) if envs is None else envs
         queue = (c_int * len(chosen))(*chosen)
         if not self._library.step(
-            self._loop, self._control, setpoint.ctypes.data, queue, len(queue)
+            self._loop, self._control, self._setpoint_address, queue, len(queue)
         ):
             return []
         self._raise_first_error(chosen)

@@ -45,6 +45,7 @@ class CompiledObserver:
         assert native.LIBRARY is not None
         self._task, self._library = task, native.LIBRARY
         self._state = simulation.state.rows
+        self._state_address = self._state.data_ptr()
         n, row_size = self._state.shape
         self._description = native.Observation(
             row_size=row_size,
@@ -123,7 +124,7 @@ class CompiledObserver:
         description.distance_threshold = task.distance_threshold
         is_complete = self._library.environment_observe(
             description,
-            self._state.data_ptr(),
+            self._state_address,
             len(goal),
             goal.data_ptr(),
             step_count.data_ptr(),

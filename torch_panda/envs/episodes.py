@@ -111,7 +111,7 @@ class Episodes:
         self._control = robot.controller
         self.batch_shape = () if num_envs is None else (n,)
         self._action_shape = torch.Size((*self.batch_shape, robot.action_dim))
-        self._template_action = torch.zeros(
+        self._action_template = torch.zeros(
             n, robot.action_dim, dtype=torch.float32, device="cpu"
         )
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
@@ -246,9 +246,8 @@ class Episodes:
         """
         with self._guard:
             self._check_was_reset()
-            action = self._read_action(action)
+            action = self._begin_step(action, step_mask)
             envs = None if step_mask is None else indices(step_mask)
-            self._starts.step_count += 1 if step_mask is None else step_mask
             self._history.record(action, step_mask)
             if diverged := self._advance(action, envs):
                 self._recover(diverged)
@@ -323,7 +322,7 @@ class Episodes:
     def _place(self, envs: list[int]) -> None:
         """Move the bodies to the starts of episodes that the state tensors hold."""
         self._starts.place_markers(envs)
-        self._history.begin(envs, self._starts.state())
+        self._history.begin(envs)
         if self._goal_observer is not None:
             self._goal_observer.update(envs, self._starts.goal)
         self._starts.place(envs)
@@ -337,27 +336,38 @@ class Episodes:
             observed["desired_goal"] = self._goal_observer.desired.clone()
         return observed
 
-    def _read_action(self, action: Tensor | None) -> Tensor:
-        """Check and clip an action; return it as (n, action_dim) float32."""
-        shape = self._action_shape
+    def _begin_step(self, action: Tensor | None, step_mask: Tensor | None) -> Tensor:
+        """Check and clip an action, and count a step.
+
+        Returns:
+            The action, (n, action_dim) float32, in a new tensor.
+        """
+        step_count = self._starts.step_count
         # For float32 actions on the CPU, C code is faster than torch. It returns 0 if a
         # number is not finite. Then `check_action` raises the error.
         if (
             native.LIBRARY is not None
             and self.simulation.is_native
+            and step_mask is None
             and isinstance(action, Tensor)
-            and action.shape == shape
+            and action.shape == self._action_shape
             and action.dtype == torch.float32
             and action.is_cpu
             and action.is_contiguous()
         ):
             # Faster than `torch.empty` with a shape and a dtype.
-            clipped = torch.empty_like(self._template_action)
-            if native.LIBRARY.environment_clip(
-                action.data_ptr(), clipped.data_ptr(), clipped.numel()
-            ):
+            clipped = torch.empty_like(self._action_template)
+            is_finite = native.LIBRARY.environment_begin_step(
+                action.data_ptr(),
+                clipped.data_ptr(),
+                clipped.numel(),
+                step_count.data_ptr(),
+                self.num_envs,
+            )
+            if is_finite:
                 return clipped
-        action = check_action(action, tuple(shape))
+        action = check_action(action, tuple(self._action_shape))
+        step_count += 1 if step_mask is None else step_mask
         # Clip before the conversion: a large float64 is infinite in float32.
         return action.clamp(-1.0, 1.0).float()
 

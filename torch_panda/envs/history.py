@@ -29,12 +29,17 @@ class History:
     """Starts of the present episodes of n environments, and the actions since.
 
     Args:
-        state: The tensors of the state, (n, ...) by key.
+        state: The tensors of the state, (n, ...) by key. They hold the starts of
+            episodes whenever `begin` is called.
         action_dim: Number of action entries.
     """
 
     def __init__(self, state: dict[str, Tensor], action_dim: int) -> None:
         self._start = {key: value.clone() for key, value in state.items()}
+        # Pairs of arrays: indexing a tensor takes three times as long.
+        self._start_arrays = [
+            (self._start[key].numpy(), value.numpy()) for key, value in state.items()
+        ]
         self._action_dim = action_dim
         # Actions (n, action_dim), and a mask (n, 1) of the environments that took them;
         # None means all.
@@ -42,16 +47,11 @@ class History:
         # Index in _steps of the first step of each environment's episode.
         self._first_steps = [0] * len(next(iter(state.values())))
 
-    def begin(self, envs: Sequence[int], state: dict[str, Tensor]) -> None:
-        """Record the starts of new episodes.
-
-        Args:
-            envs: Environments whose episodes start.
-            state: The tensors of the state, (n, ...) by key.
-        """
-        for key, start in self._start.items():
-            # Index numpy arrays, because indexing tensors takes three times as long.
-            start.numpy()[envs] = state[key].numpy()[envs]
+    def begin(self, envs: Sequence[int]) -> None:
+        """Record the starts of the episodes that begin in these environments."""
+        for start, present in self._start_arrays:
+            for env in envs:
+                start[env] = present[env]
         for env in envs:
             self._first_steps[env] = len(self._steps)
         if (unused := min(self._first_steps)) > _CHUNK:

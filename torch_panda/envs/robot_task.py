@@ -11,13 +11,16 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from torchrl.envs.common import _cache_value
+from torchrl.envs.utils import _update_during_reset
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
-from torch_panda.bullet import PhysicsName, PhysicsParams, solver
+from torch_panda.bullet import PhysicsName, PhysicsParams, native, solver
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
 from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
+from torch_panda.envs.next_root import NextRoot
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
@@ -32,6 +35,8 @@ from torch_panda.tasks.base import RewardFunction
 
 if TYPE_CHECKING:  # needs an extra
     from torch_panda.rendering.web_viewer import WebViewer
+
+_CPU = torch.device("cpu")
 
 
 class RobotTaskEnv(EnvBase):
@@ -279,12 +284,42 @@ class RobotTaskEnv(EnvBase):
         Returns:
             The same tensordict, with ``next``.
         """
-        keys = tensordict.keys()
-        is_plain = tensordict.batch_size == self.batch_size
-        if not is_plain or "_step" in keys or "next" in keys:
+        if (
+            type(tensordict) is not TensorDict
+            or tensordict.batch_size != self.batch_size
+            or tensordict._get_str("_step", None) is not None
+            or tensordict._get_str("next", None) is not None
+        ):
             return super().step(tensordict)
-        # The result is complete already, so skip the checks of torchrl's own step.
-        return tensordict.set("next", self._step(tensordict))
+        # The result is complete already, so skip the checks of torchrl's own step, and
+        # those of `TensorDict.set`, which take as long as the rest of this function.
+        return tensordict._set_str(
+            "next", self._step(tensordict), inplace=False, validated=True
+        )
+
+    def any_done(self, tensordict: TensorDictBase) -> bool:
+        """Whether an episode has ended, as in torchrl.
+
+        Args:
+            tensordict: Holds ``done``. If an episode has ended, ``_reset`` is added.
+        """
+        done = tensordict._get_str("done", None)
+        if (
+            native.LIBRARY is not None
+            and self.episodes.simulation.is_native
+            and isinstance(done, Tensor)
+            and done.is_cpu
+            and done.is_contiguous()
+            and done.dtype == torch.bool
+            and not native.LIBRARY.environment_any(done.data_ptr(), done.numel())
+        ):
+            return False
+        return bool(super().any_done(tensordict))
+
+    @property
+    @_cache_value
+    def _step_mdp(self) -> NextRoot:
+        return NextRoot(self)
 
     def rollout(
         self,
@@ -503,8 +538,9 @@ class RobotTaskEnv(EnvBase):
     # ---- called by torchrl ---------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict.get("action", None)
-        if isinstance(action, Tensor) and action.device.type != self.device.type:
+        action = tensordict._get_str("action", None)
+        is_on_cpu = isinstance(action, Tensor) and action.is_cpu
+        if isinstance(action, Tensor) and is_on_cpu != (self.device == _CPU):
             raise ValueError(
                 f"the action must be on device {self.device}, got {action.device}"
             )
@@ -538,6 +574,18 @@ class RobotTaskEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)
 
+    def _reset_proc_data(
+        self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        """Write a start into the caller's tensordict, as in torchrl.
+
+        torchrl's own method also adds missing ends and checks that no episode has ended
+        at its start. Neither can happen here, and both take as long as the rest.
+        """
+        if tensordict is None or tensordict._get_str("done", None) is None:
+            return super()._reset_proc_data(tensordict, tensordict_reset)
+        return _update_during_reset(tensordict_reset, tensordict, self.reset_keys)
+
     def _create_done_specs(self) -> None:
         """Do nothing, because the done specs are complete.
 
@@ -560,7 +608,7 @@ class RobotTaskEnv(EnvBase):
             values.pop("observation", None)
         if self.num_envs is None:
             values = {key: value.squeeze(0) for key, value in values.items()}
-        if self.device.type != "cpu":
+        if self.device != _CPU:
             values = {key: value.to(self.device) for key, value in values.items()}
         # torchrl also makes its tensordicts by this private function. The public
         # constructor would take ten times as long, because of its checks.

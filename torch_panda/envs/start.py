@@ -1,8 +1,11 @@
 """Draws the starts of episodes and holds the tensors of the state."""
 
 import math
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -12,6 +15,7 @@ from torch_panda.checks import QUATERNION_TOLERANCE, check_rotations
 from torch_panda.envs.randomization import DomainRandomizer
 from torch_panda.envs.seeds import EpisodeSeeds
 from torch_panda.robots import Robot
+from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Task
 
 
@@ -41,6 +45,7 @@ class EpisodeStarts:
         self._robot, self._task, self._simulation = robot, task, simulation
         self._randomizer = randomizer
         self._seeds = seeds
+        self._marker_poses = simulation.marker_pose.numpy()
         n = simulation.num_envs
         self.goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
         self.step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
@@ -62,6 +67,14 @@ class EpisodeStarts:
             state["object_joint_velocity"] = simulation.object_joint_velocity
         return state
 
+    @cached_property
+    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The tensors of `state` as arrays of the same memory.
+
+        Indexing a tensor takes three times as long.
+        """
+        return {key: value.numpy() for key, value in self.state().items()}
+
     def draw(self, env: int) -> None:
         """Write the start of an environment's next episode into the state tensors.
 
@@ -70,8 +83,7 @@ class EpisodeStarts:
                 finite, or quaternions that are not unit quaternions.
         """
         start = self._task.sample_start(self._seeds.next_generator(env))
-        # Index numpy arrays, because indexing tensors takes three times as long.
-        row = {key: value.numpy()[env] for key, value in self.state().items()}
+        row = {key: array[env] for key, array in self._arrays.items()}
         row["step_count"][:] = 0
         _fill(row["desired_goal"], start.goal, self._draw_function("sample_goal"))
         row["joint_position"][:] = self._robot.neutral_joint_position
@@ -116,8 +128,16 @@ class EpisodeStarts:
 
     def place_markers(self, envs: list[int]) -> None:
         """Write the poses of the markers into their tensor; see `marker_pose`."""
-        if self._simulation.scene.markers:
+        if not self._simulation.scene.markers:
+            return
+        if type(self._task).marker_pose is not Task.marker_pose:
             self._simulation.marker_pose[envs] = self.marker_pose(self.goal[envs], envs)
+            return
+        # The same poses from arrays, in a fifth of the time.
+        poses, goals = self._marker_poses, self._arrays["desired_goal"]
+        for env in envs:
+            poses[env, :, :3] = goals[env].reshape(-1, 3)
+            poses[env, :, 3:] = NO_ROTATION
 
     def place(self, envs: list[int]) -> None:
         """Reset the simulation to the state tensors."""

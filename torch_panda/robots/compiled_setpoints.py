@@ -42,6 +42,8 @@ class CompiledSetpoints:
             num_fingers = robot.gripper.num_joints
         size = num_displaced + len(resting) + num_fingers
         self._setpoint = np.empty((simulation.num_envs, size))
+        self._state_address = self._state.data_ptr()
+        self._setpoint_address = self._setpoint.ctypes.data
 
     @staticmethod
     def applies(robot: Robot, simulation: VectorSimulation) -> bool:
@@ -67,10 +69,10 @@ class CompiledSetpoints:
         self._actuation.scale = self._robot.action_scale
         self._library.environment_setpoints(
             self._actuation,
-            self._state.data_ptr(),
+            self._state_address,
             len(self._setpoint),
             action.contiguous().data_ptr(),
-            self._setpoint.ctypes.data,
+            self._setpoint_address,
         )
         return self._setpoint
 
