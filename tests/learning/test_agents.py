@@ -120,10 +120,32 @@ def test_targets_are_possible_returns(env, algo):
                 nn.init.zeros_(critic[-1].weight)
                 nn.init.constant_(critic[-1].bias, value)
         terminated = batch["next", "terminated"]
-        target = torch.where(terminated, batch["next", "reward"], end)
+        # An episode that ends without success is worth the least possible return.
+        at_end = 2.0 * batch["next", "reward"]
+        target = torch.where(terminated, at_end, end)
         expected = len(agent.critics) * (value - target).square().mean()
         losses = copy.deepcopy(agent).update(batch.clone())
         torch.testing.assert_close(losses["critic_loss"], expected)
+
+
+@pytest.mark.parametrize("algo", list(AGENTS))
+def test_failing_early_does_not_save_rewards(env, algo):
+    """A terminated row without success counts as if the episode went on forever."""
+    agent = make(env, algo, gamma=0.75)
+    seen = []
+    backward = agent.backward
+
+    def remember(state, next_state, rows, num_demos):
+        seen.append(rows)
+        return backward(state, next_state, rows, num_demos)
+
+    agent.backward = remember
+    batch = make_transitions(env, 64)
+    terminated, reward = batch["next", "terminated"], batch["next", "reward"]
+    failed = terminated & (reward == -1)
+    assert failed.any() & (terminated & ~failed).any()
+    agent.update(batch)
+    assert torch.equal(seen[0].reward, torch.where(failed, -4.0, reward))
 
 
 class PushForOne(torch_panda.Push):

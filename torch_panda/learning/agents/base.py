@@ -1,5 +1,6 @@
 """Base class of the agents: the parts that DDPG, TD3, SAC and TQC share."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -62,6 +63,7 @@ class Agent(nn.Module, ABC):
         self.augmentation = Augmentation(spaces.geometry, hp.augmentation)
         self.state_size = len(self.normalizer.mean)
         self.gamma = hp.gamma or 1 - 1 / spaces.max_episode_steps
+        self.min_return = min_return(self.gamma) if spaces.has_sparse_reward else None
         self.updates = 0
 
     def assemble(
@@ -180,6 +182,12 @@ class Agent(nn.Module, ABC):
     def _prepare(self, rows: Transitions) -> Transitions:
         """Augment a batch, and convert its actions to those of the networks."""
         rows = self.augmentation(rows)
+        if self.min_return is not None and self.min_return > -math.inf:
+            # A failure that ends an episode is as bad as never reaching the goal.
+            # Otherwise an agent would fail on purpose, to save the rewards of -1.
+            failed = rows.terminated & (rows.reward < 0)
+            reward = torch.where(failed, self.min_return, rows.reward)
+            rows = rows._replace(reward=reward)
         if self.hp.fine_fingers:
             rows = rows._replace(action=to_fine(rows.action))
         return rows
@@ -188,6 +196,11 @@ class Agent(nn.Module, ABC):
         """Use factor * LEARNING_RATE as learning rate of the next gradient steps."""
         for group in self.optimizer.param_groups:
             group["lr"] = factor * LEARNING_RATE
+
+
+def min_return(gamma: float) -> float:
+    """Lower bound of the discounted return if all rewards are -1 or 0."""
+    return -1 / (1 - gamma) if gamma < 1 else -math.inf
 
 
 def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:

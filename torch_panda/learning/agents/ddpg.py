@@ -5,7 +5,6 @@ sixth longer.
 """
 
 import copy
-import math
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -44,7 +43,6 @@ class DDPG(Agent):
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.min_return = min_return(self.gamma) if spaces.has_sparse_reward else None
 
         action_spec = spaces.action_spec(spaces.num_envs)
         noise = AdditiveGaussianModule(
@@ -123,8 +121,3 @@ class DDPG(Agent):
         """Move the target networks towards the online networks, by the fraction TAU."""
         with torch.no_grad():
             torch._foreach_lerp_(self.target, self.online, TAU)
-
-
-def min_return(gamma: float) -> float:
-    """Lower bound of the discounted return if all rewards are -1 or 0."""
-    return -1 / (1 - gamma) if gamma < 1 else -math.inf
