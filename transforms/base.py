@@ -32,13 +32,18 @@ from torch_panda.transforms.strategies import (
 
 SERIAL_KEY = "hindsight_serial"  # serial numbers of stored transitions
 _NORMALISERS = (envs.ObservationNorm, envs.VecNorm, envs.VecNormV2)
+ENVIRONMENT_ERROR = (
+    "hindsight is for replay buffers, not for environments: pass the transform to the "
+    "buffer"
+)
 
 
 class BufferTransform(envs.Transform):
     """A transform of a replay buffer that gives transitions other goals.
 
     It remembers the goals of the transitions that the buffer stores, and it checks the
-    first batches for entries that would contradict another goal (see `data_checks`).
+    first batches for entries that were computed from the desired goal, because these
+    would be wrong beside another goal (see `data_checks`).
     Subclasses decide when they draw goals: when a batch is sampled
     (`SampleTimeTransform`) or when an episode ends (`HindsightAugment`).
 
@@ -71,7 +76,8 @@ class BufferTransform(envs.Transform):
         ValueError: an argument has a value that is not accepted.
     """
 
-    # Tells torchrl that processes must not share this transform.
+    # The memory exists in one process only. Because of this attribute, torchrl calls
+    # `share_memory_`, which raises, if processes share the buffer.
     requires_shared_write_state = True
     goal_parts: tuple[int, ...] | None = None
     _shown: tuple[str, ...]  # names of the attributes in the repr
@@ -204,7 +210,7 @@ class BufferTransform(envs.Transform):
 
         Args:
             batch: Transitions, [*environments, time].
-            stored: Number of earlier transitions that the buffer still holds.
+            stored: Number of transitions in the buffer before this batch is written.
         """
         if not self._has_checked_setup:
             self._check_setup(batch)
@@ -217,7 +223,9 @@ class BufferTransform(envs.Transform):
             rewriter.next_goal_key,
             DONE,
         )
-        if batch.ndim > 1:  # put time first: storages fill up in order of time
+        if batch.ndim > 1:
+            # Put time first, because storages are filled in order of time. Serial
+            # numbers then rise in the order in which rows are overwritten.
             flat = batch.select(self.trajectory_key, *keys, strict=False)
             flat = flat.movedim(-1, 0).reshape(-1)
         root_goal, achieved, desired, next_desired, done = (
@@ -254,7 +262,7 @@ class BufferTransform(envs.Transform):
         owner = self._memory.buffer
         if owner is not None and owner() is not buffer:
             if owner() is not None:
-                gc.collect()  # a buffer and its storage refer to each other
+                gc.collect()  # frees it if only a reference cycle still holds it
             if owner() is not None:
                 raise RuntimeError(
                     f"this {type(self).__name__} already belongs to another replay "
@@ -302,7 +310,9 @@ class BufferTransform(envs.Transform):
             raise ValueError("hindsight cannot hold goals of bfloat16: use float32")
 
     def _get_ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
-        """Returns trajectory ids, or without ids the numbers of the environments, (n,).
+        """Returns the trajectory id of each row, (n,).
+
+        Rows without ids get the number of their environment.
 
         Args:
             flat: Transitions in order of time, (n,).
@@ -361,13 +371,14 @@ class BufferTransform(envs.Transform):
 
     def set_container(self, container: envs.Transform | envs.EnvBase) -> None:
         """Joins the transforms of a buffer, and refuses to join an environment's."""
+        # Only the transforms of an environment have a parent.
         if isinstance(container, envs.EnvBase) or container.parent is not None:
-            self._call(None)
+            raise ValueError(ENVIRONMENT_ERROR)
         super().set_container(container)
         self.empty_cache()
 
     def _call(self, next_tensordict: TensorDictBase | None) -> TensorDictBase:
-        raise ValueError("hindsight is for replay buffers, not for environments")
+        raise ValueError(ENVIRONMENT_ERROR)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the memory and the generator, for `state_dict` and `dumps`."""

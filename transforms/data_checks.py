@@ -18,8 +18,8 @@ MAX_BATCH_ROWS = 128  # rows of one batch that are checked
 MAX_POOL_ROWS = 512  # rows of earlier batches that are kept for the next check
 MIN_CHECKS = 10  # checks before `DataCheck` may finish
 MAX_TOTAL_ROWS = 100_000  # `DataCheck` finishes after this number of rows
-# A column may equal the goal by chance. A copy must therefore agree in at least so many
-# numbers of different goals.
+# An entry may equal one goal by chance. It counts as a copy only if it equals several
+# different goals, which have at least this many numbers together.
 MIN_GOAL_NUMBERS = 6
 
 MULTI_STEP_ERROR = (
@@ -47,10 +47,11 @@ def check_goals_agree(batch: TensorDictBase, rewriter: Rewriter) -> None:
         raise ValueError(
             f"{rewriter.goal_key!r} and {rewriter.next_goal_key!r} differ in "
             f"{len(rows)} of {batch.numel()} rows, first {_format(goals[row])} and "
-            f"{_format(next_goals[row])}: 'next' is probably not the end of the "
-            "episode, because the environment has reset itself (torchrl's "
-            "GymEnv(num_envs=...) does); use ParallelEnv or SerialEnv of single "
-            "environments, or write the goal of the step under 'next'"
+            f"{_format(next_goals[row])}: 'next' probably holds the first observation "
+            "of the next episode, not the last one of this episode, because the "
+            "environment has reset itself (torchrl's GymEnv(num_envs=...) does); use "
+            "ParallelEnv or SerialEnv of single environments, or write the goal of the "
+            "step under 'next'"
         )
 
 
@@ -117,7 +118,7 @@ class DataCheck:
 
     def _select(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns a copy of some rows and of the entries that the checks read."""
-        keys = self._rewriter
+        rewriter = self._rewriter
         rows = batch.reshape(-1)
         rows = rows[:: -(-len(rows) // MAX_BATCH_ROWS)]
         suspects = [
@@ -127,21 +128,27 @@ class DataCheck:
             and entry.ndim < 4  # images are too large to check
             and entry.dtype != torch.bool
         ]
-        goal_keys = keys.goal_key, keys.achieved_goal_key, keys.next_achieved_key
-        selected = {*suspects, *goal_keys, keys.reward_key}
+        goal_keys = (
+            rewriter.goal_key,
+            rewriter.achieved_goal_key,
+            rewriter.next_achieved_key,
+        )
+        selected = {*suspects, *goal_keys, rewriter.reward_key}
         return rows.select(*selected, strict=False).to_tensordict()
 
     def _get_suspects(self, rows: TensorDictBase) -> dict[NestedKey, Tensor]:
         """Returns the entries that may have been computed from the desired goal."""
-        keys = self._rewriter
-        others = rows.exclude("next", keys.goal_key, keys.achieved_goal_key)
+        rewriter = self._rewriter
+        others = rows.exclude("next", rewriter.goal_key, rewriter.achieved_goal_key)
         return {key: entry for key, entry in others.items(True, True)}
 
     def _get_goals(self, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Returns achieved and desired goals, (n, goal_dim) each."""
-        keys = self._rewriter
-        achieved = rows.get(keys.achieved_goal_key, rows.get(keys.next_achieved_key))
-        return achieved.flatten(1), rows.get(keys.goal_key).flatten(1)
+        rewriter = self._rewriter
+        achieved = rows.get(
+            rewriter.achieved_goal_key, rows.get(rewriter.next_achieved_key)
+        )
+        return achieved.flatten(1), rows.get(rewriter.goal_key).flatten(1)
 
     def _check_copies(self, rows: TensorDictBase) -> None:
         """Refuses entries that contain the desired goal in successive columns.
@@ -176,15 +183,17 @@ class DataCheck:
     def _check_affine(self, rows: TensorDictBase) -> bool:
         """Refuses entries that are affine functions of achieved and desired goal.
 
-        An affine function has 2 * goal_dim + 1 coefficients per column, so it fits any
-        column if there are not more different goals than that. With enough goals, a
+        An affine function has 2 * goal_dim + 1 coefficients per column. If there are
+        no more desired goals than that, it fits every column that is constant in each
+        episode. With enough goals, a
         column is refused if an affine function fits it, with three exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.
         - The column belongs to a scaled copy of one of the base environment's entries,
-          such as a normalised observation. Some columns of an observation are constant
-          in each episode, like the goal. A function may fit these by chance.
+          such as a normalised observation. The reason is that some columns of an
+          observation are constant in each episode, as the desired goal is, so that an
+          affine function may fit them by chance.
 
         Returns:
             Whether the rows had enough different goals for this check.
@@ -221,7 +230,9 @@ class DataCheck:
                 )
                 if self.shapes is not None:
                     raise ValueError(message)
-                hint = "; or make the transform with from_env, if the task observes it"
+                hint = (
+                    "; or make the transform with from_env, if the task has this entry"
+                )
                 self._warn(f"it seems that {message}{hint}", f"computed {key}")
                 break
         return True
@@ -236,10 +247,10 @@ class DataCheck:
         Raises:
             ValueError: the rewards were scaled or shifted.
         """
-        keys = self._rewriter
-        stored, goals = rows.get(keys.reward_key), rows.get(keys.goal_key)
-        achieved = rows.get(keys.next_achieved_key)
-        expected = call_goal_function(keys.reward_fn, achieved, goals, stored)
+        rewriter = self._rewriter
+        stored, goals = rows.get(rewriter.reward_key), rows.get(rewriter.goal_key)
+        achieved = rows.get(rewriter.next_achieved_key)
+        expected = call_goal_function(rewriter.reward_fn, achieved, goals, stored)
         stored, expected = stored.flatten().double(), expected.flatten().double()
         low, high = expected.min(), expected.max()
         # Test rows with rare rewards, such as the first successes, separately.
@@ -266,15 +277,16 @@ class DataCheck:
         constant = float(at_low) - factor * float(low)
         if factor and not differs(factor, constant):
             raise ValueError(
-                f"the rewards are reward_fn's times {factor:.4g} plus {constant:.4g} "
-                "(RewardScaling?): scale in the buffer, after this transform"
+                f"the stored rewards equal {factor:.4g} * reward_fn + {constant:.4g}, "
+                "perhaps because of RewardScaling: scale rewards in the buffer, after "
+                "this transform"
             )
         row = int(find_wrong_rows(1.0, 0.0).nonzero()[0])
         self._warn(
             "reward_fn gives other rewards than the data have: "
             f"{float(expected[row]):.4g} instead of {float(stored[row]):.4g} for "
             f"achieved_goal {_format(achieved[row])} and desired_goal "
-            f"{_format(goals[row])} (goals that the environment normalised?)",
+            f"{_format(goals[row])}; perhaps the environment normalises the goals",
             "rewards",
         )
 

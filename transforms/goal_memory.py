@@ -29,7 +29,7 @@ _TRAJECTORY = np.dtype(
         ("first", np.int32),  # oldest step that is still remembered
         ("end", np.int32),  # newest step + 1
         ("offset", np.int32),  # the goals of step s are in row `offset + s`
-        ("limit", np.int32),  # the block has room for the steps below this one
+        ("limit", np.int32),  # the block has room for steps below this number
         ("block", np.int32),  # first row of the block
     ]
 )
@@ -97,7 +97,7 @@ class GoalMemory:
             root_goals: Achieved goals before the transitions, if the data have them.
             goals: Achieved goals after the transitions and, if "desired" is among the
                 strategies, their desired goals.
-            stored: Number of earlier transitions that the buffer still holds.
+            stored: Number of transitions in the buffer before these are written.
 
         Returns:
             Serial numbers of the transitions, (n,).
@@ -162,7 +162,8 @@ class GoalMemory:
         first, end, offset, limit, _ = self._trajectories[number].tolist()
         goals = self._goals[offset + first : offset + limit].copy()
         self._free_block(number)
-        # Sizes are powers of two, so that freed blocks fit other trajectories.
+        # Reserve an eighth more than is needed now, so that the block is not full again
+        # at once. Sizes are powers of two, so that freed blocks fit other trajectories.
         size = 1 << max(_MIN_BLOCK - 1, 9 * (end - first) // 8).bit_length()
         free_blocks = self._free_blocks.setdefault(size, [])
         if not free_blocks:
@@ -177,7 +178,7 @@ class GoalMemory:
         """Frees the block of a trajectory, if it has one."""
         _, _, offset, limit, block = self._trajectories[number].tolist()
         if limit:
-            size = offset + limit - block
+            size = offset + limit - block  # `offset + limit` is the row after the block
             self._free_blocks[size].append(block)
 
     def _make_room(self, n: int, stored: int) -> None:
@@ -241,7 +242,7 @@ class GoalMemory:
         """
         goals = np.empty((len(serials), *self._goals.shape[2:]), self._goals.dtype)
         for strategy, rows in mixture.split(len(serials), generator):
-            # The transitions that the goals come from: first their trajectories...
+            # Choose trajectories: each row's own, or those of random transitions.
             sources = serials[rows]
             uses_all_trajectories = strategy in (RANDOM, DESIRED)
             if uses_all_trajectories:
@@ -249,7 +250,7 @@ class GoalMemory:
                 sources = draw_integers(self.oldest, end, generator)
             numbers, steps = self.find(sources)
             trajectories = self._trajectories.take(numbers)
-            # ...then their steps.
+            # Choose steps in these trajectories. Random transitions have theirs.
             if not uses_all_trajectories:
                 first, end = trajectories["first"], trajectories["end"]
                 steps = choose_steps(

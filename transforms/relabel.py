@@ -38,8 +38,9 @@ class HindsightRelabel(SampleTimeTransform):
             relabelled on its own, with probability `her_ratio` (Lanier et al. 2019,
             arXiv 1906.03710).
         **options: `unit` and `capacity` (see `SampleTimeTransform`), and arguments of
-            `BufferTransform`. With a `SliceSampler`, pass it `truncated_key=None`.
-            Otherwise it overwrites "terminated" and "done" of relabelled rows.
+            `BufferTransform`. If the buffer has a `SliceSampler`, make the sampler
+            with `truncated_key=None`. Otherwise it overwrites "terminated" and "done"
+            of relabelled rows.
 
     Raises:
         TypeError: an argument is unknown.
@@ -86,6 +87,7 @@ class HindsightRelabel(SampleTimeTransform):
         Args:
             serials: Serial numbers of the rows, (n,).
             last_serials: Serial number of the last row of each unit, (num_units,).
+                Future goals of a unit are achieved in this row or later.
             units: Unit of each row, (n,). None if each row is a unit.
 
         Returns:
@@ -103,7 +105,9 @@ class HindsightRelabel(SampleTimeTransform):
         if units is None:
             return chosen_units, goals
         rows = is_chosen[units].nonzero()[0]
-        goal_index = is_chosen.cumsum() - 1  # of each chosen unit
+        goal_index = (
+            is_chosen.cumsum() - 1
+        )  # goals[goal_index[i]] is for the chosen unit i
         return rows, goals[goal_index[units[rows]]]
 
     def _write(

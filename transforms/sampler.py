@@ -97,13 +97,14 @@ class GoalSampler(SampleTimeTransform):
         last_serials, units = self._find_units(serials)
         oldest = self._memory.oldest
         drawn = {}
+        # Another thread may have overwritten rows since they were sampled. `clip` draws
+        # any goals for these rows, which are replaced below.
         for key, mixture in self._mixtures.items():
             goals = self._memory.draw(
                 last_serials.clip(oldest), mixture, self._generator
             )
             drawn[key] = goals if units is None else goals[units]
-        # The memory has forgotten rows that another thread has overwritten since they
-        # were sampled. Give them the goal that they achieved.
+        # Give the overwritten rows the goals that they achieved.
         is_forgotten = serials < oldest
         if is_forgotten.any():
             achieved = batch.get(self._rewriter.next_achieved_key)
@@ -115,6 +116,7 @@ class GoalSampler(SampleTimeTransform):
     def _write(
         self, batch: TensorDictBase, drawn: dict[NestedKey, Goals], *, inplace: bool
     ) -> TensorDictBase:
+        # A batch that may be changed in place has one dimension already.
         flat = batch if inplace else batch.reshape(-1).to_tensordict()
         stored_goals = flat.get(self._rewriter.goal_key)
         goals = {

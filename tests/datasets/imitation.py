@@ -6,7 +6,7 @@ import torch
 
 from torch_panda.commands import record as record_demos
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.evaluation import evaluate_in
+from torch_panda.learning.evaluation import evaluate_episodes
 from torch_panda.learning.pretraining import make_demo_buffer
 
 
@@ -24,8 +24,8 @@ def imitate(env, demos):
     agent = make_agent(env, Hyperparameters())
     agent.normalizer.update(demos["observation"], demos["desired_goal"])
     buffer = make_demo_buffer(demos)
-    untrained = evaluate_in(env, agent.policy, 16).success_rate
+    untrained = evaluate_episodes(env, agent.policy, 16).success_rate
     assert untrained < 0.5
     for _ in range(600):
         agent.imitate(buffer.sample(128))
-    return evaluate_in(env, agent.policy, 16).success_rate
+    return evaluate_episodes(env, agent.policy, 16).success_rate

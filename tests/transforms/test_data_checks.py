@@ -321,7 +321,7 @@ def test_rewards_of_several_steps_are_refused(hindsight, n_steps):
 def test_scaled_rewards_are_refused(hindsight, env_id, scaling):
     """Also those of which only successes tell, which are few at Reach."""
     env = TransformedEnv(make(env_id, 8), RewardScaling(*scaling))
-    with pytest.raises(ValueError, match=r"reward_fn's times.*RewardScaling.*after"):
+    with pytest.raises(ValueError, match=r"\* reward_fn.*RewardScaling.*after"):
         store(env, hindsight.from_env(env), 50, 30)
 
 

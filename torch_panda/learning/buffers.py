@@ -46,7 +46,8 @@ def make_buffer(
 
     Args:
         env: Environment whose transitions will be stored.
-        capacity: Number of transitions before relabelling, at most `BUFFER_SIZE`.
+        capacity: Number of transitions without their relabelled copies, at most
+            `BUFFER_SIZE`.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
             the goal is relabelled. "augment" stores K relabelled copies of each
@@ -61,6 +62,7 @@ def make_buffer(
     capacity = min(capacity, BUFFER_SIZE)
     weights = {"future": 1 - desired_ratio, "desired": desired_ratio}
     strategy = {name: weight for name, weight in weights.items() if weight}
+    # `success_fn` is None below, because success is not stored (see `STORED_KEYS`).
     transform: HindsightRelabel | HindsightAugment | None = None
     if her == "augment":
         capacity *= K + 1

@@ -11,7 +11,7 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import Progress
-from torch_panda.learning.evaluation import evaluate_in
+from torch_panda.learning.evaluation import evaluate_episodes
 from torch_panda.learning.logger import close_logger, log_row
 from torch_panda.learning.plots import plot_curve
 from torch_panda.learning.policy_files import save_policy
@@ -58,7 +58,7 @@ class Curve:
             OSError: A file cannot be written.
         """
         reseed(self.env)
-        result = evaluate_in(self.env, self.agent.policy, EPISODES)
+        result = evaluate_episodes(self.env, self.agent.policy, EPISODES)
         row = {
             "step": progress.steps,
             "success": float(result.success.float().mean()),

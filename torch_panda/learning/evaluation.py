@@ -33,9 +33,9 @@ class Evaluation:
         at_start: Whether each episode starts with its goal reached, (n,) bool.
         returns: Sum of the rewards of each episode, (n,).
         lengths: Number of steps of each episode, (n,).
-        tasks: Results of each fixed task by its name, empty for random episodes. All
-            tasks have the same number of episodes, so the other attributes are means
-            over the tasks.
+        tasks: Results of each fixed task by its name, empty for random episodes. The
+            other attributes hold the episodes of all tasks. Each task has the same
+            number of them.
     """
 
     success: Tensor
@@ -62,7 +62,10 @@ class Evaluation:
 
     @property
     def mean_length(self) -> float:
-        """Mean number of steps. Episodes of ``-v3`` end with their first success."""
+        """Mean number of steps of an episode.
+
+        Episodes of ids with ``-v3`` end with the first success.
+        """
         return float(self.lengths.double().mean())
 
     def __repr__(self) -> str:
@@ -120,11 +123,11 @@ def evaluate(
     with make(env_id, num_envs=num_envs, seed=seed, **options) as env:
         if tasks == "fixed":
             states = evaluation_tasks(env_id)
-            return evaluate_fixed_in(env, policy, episodes, states, seed=seed)
-        return evaluate_in(env, policy, episodes)
+            return evaluate_fixed_starts(env, policy, episodes, states, seed=seed)
+        return evaluate_episodes(env, policy, episodes)
 
 
-def evaluate_in(
+def evaluate_episodes(
     env: RobotTaskEnv, policy: TensorDictModuleBase, episodes: int
 ) -> Evaluation:
     """Evaluate a policy over the next episodes of a batch of environments."""
@@ -134,7 +137,7 @@ def evaluate_in(
     return _join(parts, range(episodes))
 
 
-def evaluate_fixed_in(
+def evaluate_fixed_starts(
     env: RobotTaskEnv,
     policy: TensorDictModuleBase,
     episodes: int,

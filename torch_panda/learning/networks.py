@@ -7,7 +7,7 @@ from torch_panda.learning.hyperparameters import Network
 
 # Units of each hidden layer.
 HIDDEN_SIZE = 256  # as in the panda-gym paper
-WIDE_SIZE = 448  # the largest size with which the file of a policy is below 2 MB
+WIDE_SIZE = 448  # the file of a policy stays below 2 MB, to ship it
 
 
 def make_mlp(inputs: int, outputs: int, network: Network) -> MLP:

@@ -20,8 +20,8 @@ from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Flip, Push, Slide, Stack
 
 SCRIPT_STEPS = 45  # steps in which the scripted hand reaches its position
-# Distance at which a hand with a blocked gripper stops beside an object, between the
-# centres [m]. The fingers, at most 2.3 cm long and wide, do not touch it then.
+# A hand with a blocked gripper stops beside an object. Range of the distance between
+# their centres [m]. The fingers, at most 2.3 cm long and wide, do not touch it then.
 GAP = (0.055, 0.08)
 # Height of an object that is held up above the others [m].
 LIFTED = (0.12, 0.2)
@@ -73,10 +73,10 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 f"PickAndPlace, Slide, Stack and Flip, got {env_id}: pass "
                 "--start-at-object 0"
             )
-        # For each situation, the index at which the position of the hand's object
-        # starts in an observation.
         _, *objects = geometry.positions
         last = objects[-1]
+        # For each situation, the object to which the hand moves, as the first column of
+        # the object's position in an observation.
         targets = [*objects, last, last] if len(objects) > 1 else objects
         situation = (torch.arange(number) % len(targets)).unsqueeze(1)
         target_columns = torch.tensor(targets)[situation] + torch.arange(3)
@@ -91,7 +91,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
             hand, width = observation[:, :3], observation[:, 6:7]
             target = observation.gather(1, target_columns)
             if has_blocked_gripper:
-                action = go_over(hand, target + beside, 0.1, limit=0.6)
+                # A slow hand does not push the object.
+                action = go_over(hand, target + beside, clearance=0.1, limit=0.6)
                 arrived = norm(target + beside - hand) < 0.01
             else:
                 height = torch.where(first_to_goal, lift, target[:, 2:])

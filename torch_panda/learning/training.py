@@ -37,7 +37,8 @@ from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
-# Longest episode [steps] if some episodes start in the middle of the task.
+# Longest episode [steps] of a run in which some episodes start in the middle of the
+# task: these need fewer steps, and all environments of a run have the same limit.
 MAX_STEPS_FROM_MIDDLE = 50
 # Fraction of the episodes without motion of an object that --preset tuned stores.
 KEEP_UNMOVED = 0.1
@@ -164,7 +165,7 @@ class Run:
         episodes = iter(self.collector)
         while not stopped:
             started, before = time.perf_counter(), progress.steps
-            reseed(self.env)
+            reseed(self.env)  # so that a resumed run has the same episodes
             data = next(episodes)
             progress.steps += data.numel()
             self.store(data)
