@@ -110,17 +110,21 @@ def check_instance(name: str, value: object, expected: type) -> None:
 
 
 def check_device(device: torch.device | str | int | None) -> torch.device:
-    """Return a device on which tensors can be allocated; None means the CPU.
+    """Return a device that torch can use; None means the CPU.
 
     Raises:
-        RuntimeError: torch does not know the device or cannot use it.
+        ValueError: torch does not know the device, or cannot use it.
     """
-    device = torch.device("cpu" if device is None else device)
     try:
-        torch.empty(0, device=device)
-    except AssertionError as error:  # torch was built without support for the device
-        raise RuntimeError(f"device {device} does not work: {error}") from None
-    return device
+        usable = torch.device("cpu" if device is None else device)
+        torch.zeros(1, device=usable).item()
+    except (RuntimeError, AssertionError, ImportError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"device must be one that torch can use here, such as cpu, got "
+            f"{device!r}: {reason}"
+        ) from None
+    return usable
 
 
 def check_memory(num_envs: int, bytes_per_env: float) -> None:

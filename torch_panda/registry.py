@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pkgutil import resolve_name
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import gymnasium
 import torch
@@ -26,8 +26,7 @@ Made = TypeVar("Made", Robot, Task)
 Options = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Registration:
+class Registration(NamedTuple):
     """How to make the robot and the task of an id.
 
     Attributes:

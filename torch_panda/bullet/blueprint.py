@@ -4,7 +4,7 @@ Two clients hold the same scene if their blueprints are equal. Renderers build t
 copy of a scene from its blueprint.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch_panda.bullet.shapes import Shape, Visual
 
@@ -12,8 +12,7 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True)
-class LoadURDF:
+class LoadURDF(NamedTuple):
     """Loads a URDF.
 
     Attributes:
@@ -31,8 +30,7 @@ class LoadURDF:
     fixed_base: bool
 
 
-@dataclass(frozen=True)
-class CreateBody:
+class CreateBody(NamedTuple):
     """Creates a body of one shape.
 
     Attributes:
@@ -52,8 +50,7 @@ class CreateBody:
     is_marker: bool
 
 
-@dataclass(frozen=True)
-class SetBase:
+class SetBase(NamedTuple):
     """Moves a body: position [m] and quaternion xyzw, world frame."""
 
     body: int
@@ -61,8 +58,7 @@ class SetBase:
     orientation: Quaternion
 
 
-@dataclass(frozen=True)
-class SetJoints:
+class SetJoints(NamedTuple):
     """Moves joints of a body to positions [rad] or [m]."""
 
     body: int
@@ -70,8 +66,7 @@ class SetJoints:
     positions: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class SetCollisionFilter:
+class SetCollisionFilter(NamedTuple):
     """Sets the collision group and mask of a link (-1 is the base)."""
 
     body: int
@@ -80,8 +75,7 @@ class SetCollisionFilter:
     mask: int
 
 
-@dataclass(frozen=True)
-class SetPhysics:
+class SetPhysics(NamedTuple):
     """Changes physical properties of a link or joint, which renderers ignore.
 
     Attributes:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from typing_extensions import Self
 
-from torch_panda.bullet import building, capi, library, native, solver
+from torch_panda.bullet import building, capi, library, native
 from torch_panda.bullet.blueprint import (
     Blueprint,
     Command,
@@ -86,6 +86,9 @@ class PhysicsClient:
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
+        # Imported here: `import torch_panda` needs no solver.
+        from torch_panda.bullet import solver
+
         solver.activate()
         self.connection = connect()
         self.native = native.Client(self.connection.handle, 0)

@@ -1,10 +1,9 @@
 """Body ids of a scene."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """Ids of the bodies that a simulation moves and reads, the same in every client.
 
     Attributes:

@@ -16,7 +16,7 @@ from torchrl.envs.utils import _update_during_reset
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
-from torch_panda.bullet import PhysicsName, PhysicsParams, native, solver
+from torch_panda.bullet import PhysicsName, PhysicsParams, native
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
 from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
@@ -106,7 +106,7 @@ class RobotTaskEnv(EnvBase):
     Raises:
         ValueError: An argument is out of range.
         TypeError: An argument has a wrong type.
-        RuntimeError: torch does not know the device, or EGL does not work.
+        RuntimeError: EGL does not work.
 
     Attributes:
         episodes: The same environments as plain torch, without torchrl's interface.
@@ -231,6 +231,8 @@ class RobotTaskEnv(EnvBase):
             if value is not defaults.get(name) and value != defaults.get(name)
         ]
         call = f"{type(self).__name__}({', '.join(arguments)})"
+        from torch_panda.bullet import solver  # already imported by the clients
+
         return f"{call} [solver: {solver.activate().name}]"
 
     # ---- start and act -------------------------------------------------------------

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Annotated, Any, get_args, get_type_hints
 
-import torch
-
 
 @dataclass(frozen=True)
 class Limit:
@@ -58,19 +56,3 @@ def find_limits(hint: Any) -> Iterator[Limit]:  # noqa: ANN401 (any type)
             yield part
         else:
             yield from find_limits(part)
-
-
-def check_device(name: str) -> None:
-    """Check that torch can use a device.
-
-    Raises:
-        ValueError: It cannot.
-    """
-    try:
-        torch.zeros(1, device=name).item()
-    except (RuntimeError, AssertionError, ImportError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            "device must be one that torch can use here, such as cpu, "
-            f"got {name!r}: {reason}"
-        ) from None

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from torch_panda.checks import check_device
 from torch_panda.learning.agents import Hyperparameters
 from torch_panda.learning.buffers import Hindsight
 from torch_panda.learning.limits import (
@@ -13,7 +14,6 @@ from torch_panda.learning.limits import (
     Ratio,
     Seed,
     Weight,
-    check_device,
     check_limits,
 )
 from torch_panda.learning.logger import LoggerName, check_logger

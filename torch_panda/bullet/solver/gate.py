@@ -28,8 +28,7 @@ import platform
 import sys
 import threading
 from ctypes import c_void_p
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from torch_panda.bullet import library
 from torch_panda.bullet.solver.elf import read_symbols
@@ -75,8 +74,7 @@ _REPLACED = (
 _EXPORTED = "b3ConnectPhysicsDirect"
 
 
-@dataclass(frozen=True)
-class SolverStatus:
+class SolverStatus(NamedTuple):
     """The solver that steps the clients of this process.
 
     Attributes:
