@@ -1,8 +1,10 @@
-"""Keyword arguments: errors that list the accepted names, and reprs with the values."""
+"""Arguments: classes by name, errors that list the accepted names, and reprs."""
 
 import difflib
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
+from importlib import import_module
+from typing import Any
 
 from typing_extensions import Self
 
@@ -28,6 +30,12 @@ class Configured:
             if attribute in vars(self)
         ]
         return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def load_class(package: str, path: str) -> Any:  # noqa: ANN401 (any class)
+    """Import a class of a package, given as ``module:Class``."""
+    module, name = path.split(":")
+    return getattr(import_module(f"{package}.{module}"), name)
 
 
 def check_call(

@@ -3,16 +3,15 @@
 import difflib
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
-from pkgutil import resolve_name
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import gymnasium
 import torch
 
-from torch_panda.arguments import check_call, check_names
+from torch_panda.arguments import check_call, check_names, load_class
 from torch_panda.bullet.shapes import BLUE
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
@@ -59,8 +58,7 @@ class Registration(NamedTuple):
         return _call(self.task, f"task_options of {self.env_id}", options)
 
 
-@dataclass(frozen=True)
-class Family:
+class Family(NamedTuple):
     """The ids of one robot at one task: ``{robot}{task}{,Joints}{,Dense}-v{1,3}``.
 
     The names in the ids are those of the classes. The defaults of a task are those of
@@ -78,9 +76,9 @@ class Family:
 
     robot: type[Robot]
     task: type[Task]
-    robot_options: Options = field(default_factory=dict)
+    robot_options: Options = MappingProxyType({})
     v3_task: Options | None = None
-    v3_robot: Options = field(default_factory=dict)
+    v3_robot: Options = MappingProxyType({})
     joints: bool = True
 
     def registrations(self) -> Iterator[Registration]:
@@ -114,13 +112,13 @@ SPINNING = {"finger_spinning_friction": 0.001}  # panda-gym 3.0.7; the URDF has 
 
 def _robot(path: str) -> type[Robot]:
     """A class in `torch_panda.robots`, given as ``module:Class``."""
-    robot: type[Robot] = resolve_name(f"torch_panda.robots.{path}")
+    robot: type[Robot] = load_class("torch_panda.robots", path)
     return robot
 
 
 def _task(path: str) -> type[Task]:
     """A class in `torch_panda.tasks`, given as ``module:Class``."""
-    task: type[Task] = resolve_name(f"torch_panda.tasks.{path}")
+    task: type[Task] = load_class("torch_panda.tasks", path)
     return task
 
 

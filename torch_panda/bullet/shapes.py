@@ -1,6 +1,5 @@
 """Shapes of bodies, and how renderers draw them."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,8 +37,7 @@ class Sphere(NamedTuple):
 Shape = Box | Cylinder | Sphere
 
 
-@dataclass(frozen=True)
-class Visual:
+class Visual(NamedTuple):
     """How renderers draw a body.
 
     Attributes:

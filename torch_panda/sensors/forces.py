@@ -6,7 +6,6 @@ the step. After a reset all of them are zero, because no time has passed.
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -57,7 +56,6 @@ class ForceSensor(Sensor):
         return _ForceReading(self, simulation, robot)
 
 
-@dataclass(frozen=True)
 class WristForceTorque(ForceSensor):
     """Force [N] and torque [N m] that the arm exerts on the hand: (6,).
 
@@ -86,7 +84,6 @@ class WristForceTorque(ForceSensor):
         return client.state(scene.robot).wrenches[robot.wrist_joint]
 
 
-@dataclass(frozen=True)
 class FingerContact(ForceSensor):
     """Contact force on each finger: (n_fingers, 3), world frame [N].
 
@@ -113,7 +110,6 @@ class FingerContact(ForceSensor):
         return forces
 
 
-@dataclass(frozen=True)
 class JointTorque(ForceSensor):
     """Torque [N m] of the motor of each movable joint, or force [N] of a sliding one.
 

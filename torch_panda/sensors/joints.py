@@ -1,7 +1,6 @@
 """The sensor "joint_state": positions and velocities of the robot's joints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,7 +11,6 @@ from torch_panda.robots import Robot
 from torch_panda.sensors.base import Entry, Reading, Sensor
 
 
-@dataclass(frozen=True)
 class JointState(Sensor):
     """Positions and velocities of all movable joints of the robot.
 

@@ -1,8 +1,8 @@
 """Sensors by name, and by the keywords of `torch_panda.make`."""
 
 from collections.abc import Sequence
-from pkgutil import resolve_name
 
+from torch_panda.arguments import load_class
 from torch_panda.rendering import Camera
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -17,8 +17,7 @@ _CLASSES = {
     "joint_torque": "forces:JointTorque",
 }
 SENSORS: dict[str, Sensor] = {
-    name: resolve_name(f"torch_panda.sensors.{path}")()
-    for name, path in _CLASSES.items()
+    name: load_class("torch_panda.sensors", path)() for name, path in _CLASSES.items()
 }
 """Sensors that ``make(..., sensors=...)`` accepts by name."""
 
