@@ -183,10 +183,11 @@ class DataCheck:
     def _check_affine(self, rows: TensorDictBase) -> bool:
         """Refuses entries that are affine functions of achieved and desired goal.
 
-        An affine function has 2 * goal_dim + 1 coefficients per column. If there are
-        no more desired goals than that, it fits every column that is constant in each
-        episode. With enough goals, a
-        column is refused if an affine function fits it, with three exceptions:
+        The desired goal is constant in each episode. An affine function has 2 *
+        goal_dim + 1 coefficients per column. If there are no more different desired
+        goals than that, it can fit any column that is constant in each episode, so the
+        check waits for more goals. Then it refuses a column if an affine function fits
+        it, with three exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.

@@ -250,7 +250,8 @@ class GoalMemory:
                 sources = draw_integers(self.oldest, end, generator)
             numbers, steps = self.find(sources)
             trajectories = self._trajectories.take(numbers)
-            # Choose steps in these trajectories. Random transitions have theirs.
+            # Choose steps in these trajectories. For random transitions, `find` has
+            # already returned the steps.
             if not uses_all_trajectories:
                 first, end = trajectories["first"], trajectories["end"]
                 steps = choose_steps(

@@ -97,8 +97,9 @@ class GoalSampler(SampleTimeTransform):
         last_serials, units = self._find_units(serials)
         oldest = self._memory.oldest
         drawn = {}
-        # Another thread may have overwritten rows since they were sampled. `clip` draws
-        # any goals for these rows, which are replaced below.
+        # Another thread may have overwritten rows since they were sampled. `clip` keeps
+        # their serial numbers valid, so they get arbitrary goals, which are replaced
+        # below.
         for key, mixture in self._mixtures.items():
             goals = self._memory.draw(
                 last_serials.clip(oldest), mixture, self._generator

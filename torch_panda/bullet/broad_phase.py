@@ -28,8 +28,9 @@ from torch_panda.rotations import rotate_vector
 
 # Position to which `restore` moves all bodies before it inserts their links into the
 # tree of AABBs again, one by one [m]. Bullet inserts an AABB beside the closest AABBs
-# of the tree. From this position to the scene is so far that the closest AABBs always
-# are those of links already inserted, never of links that are still here.
+# of the tree. This position is so far from the scene that the AABBs closest to a newly
+# inserted one are always those of links already inserted, and never those of links
+# that are still at this position.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
 # `restore` restores the lowest 8 bits of the number of detections. A detection reads
 # one bit of it per level of the tree, and the trees of the shipped tasks have up to 11
@@ -79,7 +80,8 @@ class BroadPhase:
         for body in bodies:
             client.set_base(body, _FAR_AWAY)
         self._away = client.save()
-        self._first_pair = client.bodies[:2]
+        # Two bodies whose bases `restore` makes the only overlapping pair.
+        self._overlapping = client.bodies[:2]
         client.native.broad_phase = pointer(self._describe())
         self.restore()
 
@@ -98,10 +100,10 @@ class BroadPhase:
             client.set_collision_filter(body, link, *_NO_CONTACTS)
         # Bring the cursor over the list of pairs to its start. A detection moves the
         # cursor on, modulo the number of pairs. With exactly one pair the result is 0.
-        for body in self._first_pair:
+        for body in self._overlapping:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
-        for body in self._first_pair:
+        for body in self._overlapping:
             client.set_collision_filter(body, -1, *_NO_CONTACTS)
         # Advance the number of detections to the next value whose lowest bits are those
         # after building. While nothing overlaps, a detection takes about 1 us.
@@ -121,8 +123,8 @@ class BroadPhase:
             self._away,
             self._built,
             len(links),
-            len(self._first_pair),
-            self._first_pair,
+            len(self._overlapping),
+            self._overlapping,
             (native.Link * len(links))(*links),
         )
 

@@ -507,9 +507,10 @@ class PhysicsClient:
         return int(capi.status_snapshot(status))
 
     def load(self, snapshot: int) -> None:
-        """Restore a snapshot that was taken while there were no contacts.
+        """Restore a snapshot.
 
-        Restoring contacts would run a collision detection.
+        The snapshot must have been taken while there were no contacts. Otherwise Bullet
+        would run a collision detection to restore them.
 
         Unlike `set_base`, this does not update the bodies' AABBs in Bullet's broad
         phase. The next collision detection updates them.

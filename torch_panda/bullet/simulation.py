@@ -205,7 +205,8 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # After a second Ctrl-C, threads of an earlier step may still run.
+                # A first Ctrl-C waits for the threads of the step, but a second one
+                # does not. So threads of an earlier step may still run.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -213,7 +214,8 @@ class VectorSimulation:
             client = self._clients[env]
             control(client, self.scene.robot, setpoint[env])
             if isinstance(control, MotorControl):
-                # Torques last for one time step, so `advance` may apply them again.
+                # A torque acts in one time step only, so `advance` applies the torques
+                # before each time step.
                 control.advance(
                     client, self.scene.robot, setpoint[env], self.n_substeps
                 )

@@ -72,12 +72,12 @@ class EpisodeObserver:
             max_episode_steps=max_episode_steps,
             terminate_on_success=terminate_on_success,
         )
-        self._readings = [
+        self._attached_sensors = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
-        observers: list[Observer] = [*self._readings, extra]
+        observers: list[Observer] = [*self._attached_sensors, extra]
         # Keys that sensors and tasks may not observe, because a reset would take
         # observations with these keys for a state. The sensor "joint_state" may use
         # two of them; see `is_state`.
@@ -91,13 +91,13 @@ class EpisodeObserver:
 
     def after_reset(self, envs: Sequence[int]) -> None:
         """Tell the sensors that episodes have started in these environments."""
-        for reading in self._readings:
-            reading.after_reset(envs)
+        for sensor in self._attached_sensors:
+            sensor.after_reset(envs)
 
     def after_step(self, envs: Sequence[int]) -> None:
         """Tell the sensors that time has passed in these environments."""
-        for reading in self._readings:
-            reading.after_step(envs)
+        for sensor in self._attached_sensors:
+            sensor.after_step(envs)
 
     def observe(
         self, goal: Tensor, step_count: Tensor, action: Tensor | None = None

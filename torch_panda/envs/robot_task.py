@@ -562,10 +562,11 @@ class RobotTaskEnv(EnvBase):
         return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     @property
-    def _supports_set_state(self) -> StateSupport:  # type: ignore[override]  # torchrl says bool
+    def _supports_set_state(self) -> StateSupport:  # type: ignore[override]  # bool
         """Tells torchrl that a reset may start from a state.
 
-        The value is true, or raises an error; see `StateSupport`.
+        torchrl tests the truth of the returned object. This test raises an error if the
+        state would not reach the environment; see `StateSupport`.
         """
         return StateSupport(frozenset(self.episodes.entries))
 
@@ -581,8 +582,9 @@ class RobotTaskEnv(EnvBase):
     ) -> TensorDictBase:
         """Write a start into the caller's tensordict, as in torchrl.
 
-        torchrl's own method also adds missing ends and checks that no episode has ended
-        at its start. Neither can happen here, and both take as long as the rest.
+        torchrl's own method also adds missing ``done`` entries and checks that no
+        episode is done at its start. These entries are never missing here, and no start
+        is done. The extra work would take as long as the rest of the method.
         """
         if tensordict is None or tensordict._get_str("done", None) is None:
             return super()._reset_proc_data(tensordict, tensordict_reset)

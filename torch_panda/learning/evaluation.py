@@ -167,7 +167,7 @@ def evaluate_fixed_starts(
     starts = TensorDict.stack(list(states.values())).to(env.device)
     parts: list[Evaluation] = []
     for first in range(0, episodes, num_envs):
-        # The last batch repeats episodes that `_join` leaves out.
+        # Repeats of the first episodes fill up the last batch. `_join` drops them.
         numbers = torch.arange(first, first + num_envs) % episodes
         start = env.reset(starts[numbers % len(states)], set_state=True)
         randomized = _RandomStart(policy, actions[numbers])

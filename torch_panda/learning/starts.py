@@ -73,15 +73,16 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 f"PickAndPlace, Slide, Stack and Flip, got {env_id}: pass "
                 "--start-at-object 0"
             )
-        _, *objects = geometry.positions
-        last = objects[-1]
-        # For each situation, the object to which the hand moves, as the first column of
-        # the object's position in an observation.
-        targets = [*objects, last, last] if len(objects) > 1 else objects
+        # The columns at which positions start in an observation: that of the hand, then
+        # those of the objects.
+        _, *columns = geometry.positions
+        last = columns[-1]
+        # For each situation, the column of the object to which the hand moves.
+        targets = [*columns, last, last] if len(columns) > 1 else columns
         situation = (torch.arange(number) % len(targets)).unsqueeze(1)
         target_columns = torch.tensor(targets)[situation] + torch.arange(3)
-        first_to_goal = situation >= len(objects)
-        waits = situation > len(objects)
+        first_to_goal = situation >= len(columns)
+        waits = situation > len(columns)
         angle, gap, lift = uniform(0, 2 * pi), uniform(*GAP), uniform(*LIFTED)
         beside = gap * torch.cat((angle.cos(), angle.sin(), 0 * angle), -1)
         has_blocked_gripper = env.action_spec_unbatched.shape[-1] == 3

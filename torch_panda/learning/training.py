@@ -40,7 +40,7 @@ DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 # Longest episode [steps] of a run in which some episodes start in the middle of the
 # task: these need fewer steps, and all environments of a run have the same limit.
 MAX_STEPS_FROM_MIDDLE = 50
-# Fraction of the episodes without motion of an object that --preset tuned stores.
+# Of the episodes in which no object moves, --preset tuned stores this fraction.
 KEEP_UNMOVED = 0.1
 
 
@@ -108,7 +108,7 @@ class Run:
             frames_per_batch=steps_per_iteration,
             total_frames=-1,
             reset_at_each_iter=True,
-            # torchrl makes the members of this enum strings.
+            # In torchrl, the members of this enum are strings.
             exploration_type=ExplorationType.RANDOM,  # type: ignore[arg-type]
             auto_register_policy_transforms=True,
         )
