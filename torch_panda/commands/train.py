@@ -1,55 +1,98 @@
 """Train DDPG, TD3, SAC or TQC with hindsight experience replay on any task.
 
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
+    python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
 
 The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687) or,
 where the paper gives none, those of the HER of OpenAI Baselines. `--preset tuned` uses
 the recipe of the task in `torch_panda.learning.recipes`.
+
+With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
 """
 
+import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from tensordict import TensorDictBase
+from tqdm import tqdm
 
 import torch_panda
-from torch_panda.datasets import read_demos
+from torch_panda.datasets import generate, read_demos, sha256
+from torch_panda.learning import files
+from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.checkpoint import (
     StopSignal,
     check_folder,
     lock_folder,
     write_options,
 )
+from torch_panda.learning.offline import OFFLINE_AGENTS
+from torch_panda.learning.offline.options import (
+    KINDS,
+    OfflineArgs,
+    check_offline,
+    make_args_class,
+)
+from torch_panda.learning.offline.training import OfflineRun
 from torch_panda.learning.options import Args, check, default_args
 from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.training import Run
 from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.learning.video import record
 
+PROG = "python -m torch_panda train"
+DATA_FILE = "data.pt"  # file of a run's folder with the data that it generated
 
-def parse(arguments: Sequence[str] | None = None) -> Args:
+
+@dataclass
+class Mode:
+    """The options that determine which other options there are."""
+
+    offline: bool = False
+    algo: str = ""
+
+
+def parse(arguments: Sequence[str] | None = None) -> Args | OfflineArgs:
     """Read the command line.
 
-    The command line is parsed twice, because preset and task determine the defaults of
-    the other options.
+    The algorithm, or preset and task, determine the other options and their defaults,
+    so they are read first.
 
     Raises:
-        ValueError: A module of ``--import`` does not exist.
+        ValueError: A module of ``--import`` does not exist, or ``--offline`` and the
+            algorithm do not fit together.
     """
-    prog = "python -m torch_panda train"
-    first_args = tyro.cli(Args, prog=prog, args=arguments)
-    import_modules(read_modules(first_args.imports))
-    default = default_args(first_args.preset, first_args.env_id)
-    return tyro.cli(Args, prog=prog, args=arguments, default=default)
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    modes = [x for x in arguments if x not in ("-h", "--help")]
+    mode, _ = tyro.cli(Mode, args=modes, return_unknown_args=True)
+    if mode.offline:
+        cls = make_args_class(mode.algo or OfflineArgs.algo)
+        arguments = [x for x in arguments if x != "--offline"]
+        offline_args = tyro.cli(cls, prog=f"{PROG} --offline", args=arguments)
+        import_modules(read_modules(offline_args.imports))
+        return offline_args
+    if mode.algo in OFFLINE_AGENTS:
+        raise ValueError(f"{mode.algo} learns offline: add --offline")
+    first = tyro.cli(Args, prog=PROG, args=arguments)
+    import_modules(read_modules(first.imports))
+    default = default_args(first.preset, first.env_id)
+    return tyro.cli(Args, prog=PROG, args=arguments, default=default)
 
 
-def make_run(args: Args, out: Path) -> Run:
-    """Prepare a training, and read its demonstrations if the options name any.
+def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
+    """Prepare a training, and read its demonstrations or data if the options name any.
 
     Raises:
         ValueError: An option does not fit the task or another option, or a file cannot
             be read.
+        OSError: Generated data cannot be written.
     """
+    if isinstance(args, OfflineArgs):
+        data = read_data(args, out)
+        return OfflineRun(args, out, data, sha256(data))
     demos = None
     if args.demos is not None:
         with torch_panda.make(args.env_id) as env:
@@ -57,21 +100,68 @@ def make_run(args: Args, out: Path) -> Run:
     return Run(args, out, demos)
 
 
-def main(args: Args) -> None:
+def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
+    """Read the transitions (n,) to learn from, or generate them into the run's folder.
+
+    Raises:
+        ValueError: There are no such data, or they do not fit the task.
+        OSError: Generated data cannot be written.
+    """
+    path = Path(args.data)
+    if args.data in KINDS:
+        path = out / DATA_FILE
+        if not args.resume:
+            with lock_folder(out):
+                files.save(path, generate_data(args).to_dict())
+    with torch_panda.make(args.env_id) as env:
+        return read_demos(path, env)
+
+
+def generate_data(args: OfflineArgs) -> TensorDictBase:
+    """Generate a data set, with a progress bar: transitions (n,)."""
+    with tqdm(total=args.transitions, unit="transition", unit_scale=True) as bar:
+        bar.set_description(f"{args.env_id} {args.data}")
+        data = generate(
+            args.env_id,
+            kind=args.data,  # type: ignore[arg-type]  # one of KINDS
+            transitions=args.transitions,
+            seed=args.seed,
+            num_envs=args.num_envs,
+            progress=bar.update,
+        )
+    return data.select(*STORED_KEYS).reshape(-1)
+
+
+def default_folder(args: Args | OfflineArgs) -> Path:
+    """Folder of the results if the options name none."""
+    variant = args.her if isinstance(args, Args) else Path(args.data).stem
+    return Path("runs") / f"{args.env_id}-{args.algo}-{variant}-{args.seed}"
+
+
+def main(args: Args | OfflineArgs) -> None:
     """Train, and print where the results are."""
-    out = args.out or Path("runs") / f"{args.env_id}-{args.algo}-{args.her}-{args.seed}"
+    out = args.out or default_folder(args)
+    default: Args | OfflineArgs
     try:
-        check(args)
+        if isinstance(args, OfflineArgs):
+            check_offline(args)
+            preset, default = {"preset": "offline"}, type(args)(env_id=args.env_id)
+        else:
+            check(args)
+            preset, default = {}, default_args(args.preset, args.env_id)
         check_folder(out, resume=args.resume)
         run = make_run(args, out)
-        if args.preset == "tuned" and not find_recipe(args.env_id):
+        is_tuned = isinstance(args, Args) and args.preset == "tuned"
+        if is_tuned and not find_recipe(args.env_id):
             print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
         stop = StopSignal()
         with lock_folder(out):
-            write_options(out, args, default_args(args.preset, args.env_id))
+            write_options(out, args, default, **preset)
             finished = run.train(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
+    except KeyboardInterrupt:  # before the first step
+        raise SystemExit("interrupted: start the run again") from None
     stop.release()
     run.close()
     if finished and args.video:

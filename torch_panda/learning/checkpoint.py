@@ -8,16 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from filelock import FileLock, Timeout
-from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
 from torch_panda.learning import files
-from torch_panda.learning.agents import Agent
-from torch_panda.learning.policy_files import save_policy
+from torch_panda.learning.policy_files import AnyAgent, save_policy
 from torch_panda.learning.recipes import find_changes
 
 LOCK = "run.lock"  # file that the process of a run keeps locked
@@ -37,17 +35,29 @@ class Progress:
         pretrained: Gradient steps of imitation so far.
         seconds: Time spent on stepping and learning, without evaluations.
         curve: One row for each evaluation.
+        loss_sums: Sums of the losses since the last evaluation, of offline learning.
     """
 
     steps: int = 0
     pretrained: int = 0
     seconds: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
+    loss_sums: dict[str, float] = field(default_factory=dict)
 
     @property
     def success(self) -> str:
         """The last success rate as text, such as "95%"."""
         return f"{self.curve[-1]['success']:.0%}" if self.curve else "unknown"
+
+
+class Stored(Protocol):
+    """A replay buffer, or a data set that is compared with that of the saved run."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state to save."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> Any:  # noqa: ANN401 (unused)
+        """Restore a state, or raise ValueError if it belongs to other data."""
 
 
 @dataclass
@@ -58,14 +68,14 @@ class Checkpoint:
         path: File of the state.
         args: Options of the run, a dataclass.
         agent: Agent with its optimizer.
-        buffer: Replay buffer with the transitions of the run.
+        buffer: Transitions of the run.
         progress: Progress of the run.
     """
 
     path: Path
     args: Any
-    agent: Agent
-    buffer: TensorDictReplayBuffer
+    agent: AnyAgent
+    buffer: Stored
     progress: Progress
 
     def save(self) -> None:

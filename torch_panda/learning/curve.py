@@ -9,12 +9,15 @@ from torchrl.record.loggers import Logger
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
-from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import Progress
-from torch_panda.learning.evaluation import evaluate_episodes
+from torch_panda.learning.evaluation import (
+    evaluate_episodes,
+    evaluate_fixed_starts,
+)
+from torch_panda.learning.evaluation_tasks import evaluation_tasks
 from torch_panda.learning.logger import close_logger, log_row
 from torch_panda.learning.plots import plot_curve
-from torch_panda.learning.policy_files import save_policy
+from torch_panda.learning.policy_files import AnyAgent, save_policy
 from torch_panda.registry import make
 
 EPISODES = 80  # episodes of each evaluation
@@ -30,19 +33,24 @@ class Curve:
         out: Folder of curve.csv, curve.png and checkpoint.pt.
         device: Device of the environments' outputs.
         logger: Also gets each row, under the names of the columns.
+        offline: Whether the agent learns offline. Its steps are gradient steps, and
+            its policy is also evaluated from the five fixed tasks.
     """
 
     def __init__(
         self,
         env_id: str,
-        agent: Agent,
+        agent: AnyAgent,
         out: Path,
         *,
         device: str,
         logger: Logger | None = None,
+        offline: bool = False,
     ) -> None:
         self.env_id, self.agent, self.out = env_id, agent, out
         self.logger = logger
+        self.steps = "gradient steps" if offline else "environment steps"
+        self.tasks = evaluation_tasks(env_id) if offline else {}
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
@@ -67,6 +75,13 @@ class Curve:
             "updates": self.agent.updates,
             "seconds": round(progress.seconds, 2),
         }
+        if self.tasks:
+            seed = int(torch.randint(2**62, ()))
+            fixed = evaluate_fixed_starts(
+                self.env, self.agent.policy, EPISODES, self.tasks, seed=seed
+            )
+            row["fixed_success"] = fixed.success_rate
+            row |= {name: task.success_rate for name, task in fixed.tasks.items()}
         progress.curve.append({**row, **(losses or {})})
         if self.logger is not None:
             log_row(self.logger, progress.curve[-1])
@@ -76,7 +91,8 @@ class Curve:
         writer.writeheader()
         writer.writerows(progress.curve)
         files.save_text(self.out / "curve.csv", text.getvalue())
-        plot_curve(progress.curve, self.env_id, self.out / "curve.png")
+        path = self.out / "curve.png"
+        plot_curve(progress.curve, self.env_id, path, steps=self.steps)
         save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
 
     def close(self) -> None:

@@ -30,13 +30,21 @@ class Normalizer(nn.Module):
         super().__init__()
         geometry = spaces.geometry
         size = spaces.observation_size + spaces.goal_size
+        state_columns = [*range(spaces.observation_size)]
+        self.goal_columns = slice(spaces.observation_size, size)
         if geometry is not None:
             num_parts = ("none", "coarse", "fine").index(relative_inputs)
-            size += len(geometry.points) * num_parts
             if num_parts and geometry.orientation is not None:
-                size += (
-                    9 + 24
-                )  # the matrix and the similarities of `Geometry.rotations`
+                # The matrix and the similarities of `Geometry.rotations`.
+                size += 9 + 24
+            for _ in range(num_parts):
+                state_columns += [
+                    size + column
+                    for column, point in enumerate(geometry.points)
+                    if point < spaces.observation_size
+                ]
+                size += len(geometry.points)
+        self.state_columns = state_columns
         self.geometry, self.relative_inputs = geometry, relative_inputs
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
@@ -58,6 +66,24 @@ class Normalizer(nn.Module):
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Standardise observations and goals, (..., size) each."""
         normalized = (self._inputs(observation, goal) - self.mean) / self.std
+        return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+
+    def state(self, observation: Tensor) -> Tensor:
+        """Standardise observations (..., size) with the inputs that need no goal.
+
+        Returns:
+            ``(..., len(self.state_columns))``.
+        """
+        size = self.goal_columns.stop - self.goal_columns.start
+        goal = observation.new_zeros((*observation.shape[:-1], size))
+        return self(observation, goal)[..., self.state_columns]
+
+    def goal(self, goal: Tensor) -> Tensor:
+        """Standardise goals (..., size). Orientations stay as they are."""
+        if self.geometry is not None and self.geometry.orientation is not None:
+            return goal
+        columns = self.goal_columns
+        normalized = (goal - self.mean[columns]) / self.std[columns]
         return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:

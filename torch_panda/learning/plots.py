@@ -25,6 +25,7 @@ Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
 LINES = 4  # largest number of lines in a panel
 COLUMNS = 3  # largest number of panels side by side
+OFFLINE = ", offline"  # ending of a panel's title whose steps are gradient steps
 LABEL_WIDTH = 56  # characters after which a label is wrapped
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
@@ -36,12 +37,12 @@ Runs = dict[str, dict[str, Lines]]
 """Lines by algorithm, by task."""
 
 
-def plot_curve(curve: Curve, title: str, path: Path) -> None:
-    """Draw one run's success over environment steps."""
+def plot_curve(curve: Curve, title: str, path: Path, *, steps: str) -> None:
+    """Draw one run's success over steps; ``steps`` names their kind."""
     figure = Figure(figsize=(5, 3.5), layout="constrained")
     axes = figure.subplots()
     axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
-    _label(axes, title, "success")
+    _label(axes, title, "success", steps)
     save(figure, path)
 
 
@@ -79,7 +80,9 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
         axes.remove()
     for axes, (title, lines) in zip(grid.flat, panels, strict=False):
         draw_panel(axes, lines, metric, looks)
-        _label(axes, title, metric)
+        # Offline tasks have panels of their own, see `read_runs`.
+        kind = "gradient" if OFFLINE in title else "environment"
+        _label(axes, title, metric, f"{kind} steps")
     save(figure, path)
 
 
@@ -163,6 +166,8 @@ def read_runs(folders: list[Path]) -> Runs:
         try:
             args = json.loads((path.parent / "args.json").read_text())
             task, algo = str(args["env_id"]), str(args["algo"]).upper()
+            if args["preset"] == "offline":
+                task += OFFLINE
             changed = args.get("changed", {})
             line = str(args.get("label") or line_label(str(args["preset"]), changed))
             with path.open() as file:
@@ -200,9 +205,9 @@ def line_label(preset: str, changed: dict[str, object]) -> str:
     return ", ".join(parts)
 
 
-def _label(axes: Axes, title: str, metric: Metric) -> None:
+def _label(axes: Axes, title: str, metric: Metric, steps: str) -> None:
     names = {"success": "success rate", "ever_success": "success rate at any step"}
-    axes.set(xlabel="environment steps", ylabel=names.get(metric, metric), title=title)
+    axes.set(xlabel=steps, ylabel=names.get(metric, metric), title=title)
     if metric in names:
         axes.set_ylim(-0.05, 1.05)
     axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 0))

@@ -15,8 +15,13 @@ from typing_extensions import Self
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
 from torch_panda.learning.agents import AGENTS, Agent, Hyperparameters
+from torch_panda.learning.offline import OFFLINE_AGENTS
+from torch_panda.learning.offline.base import OfflineAgent, OfflineHyperparameters
 from torch_panda.learning.spaces import Spaces, read_spaces
 from torch_panda.policies import shipped_policies
+
+AnyAgent = Agent | OfflineAgent
+AnyHyperparameters = Hyperparameters | OfflineHyperparameters
 
 
 class Policy(TensorDictModuleBase):
@@ -76,7 +81,7 @@ class SavedPolicy:
 
     path: Path
     env_id: str
-    hp: Hyperparameters
+    hp: AnyHyperparameters
     spaces: Spaces
     weights: Mapping[str, Tensor]
 
@@ -107,7 +112,7 @@ class SavedPolicy:
             ) from None
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
-    def make_agent(self, env: RobotTaskEnv | None = None) -> Agent:
+    def make_agent(self, env: RobotTaskEnv | None = None) -> AnyAgent:
         """Make an agent with this policy, and with untrained critics.
 
         Args:
@@ -129,7 +134,7 @@ class SavedPolicy:
                 )
             spaces = replace(spaces, num_envs=env.batch_size.numel())
         with torch.device("cpu"):
-            agent = AGENTS[self.hp.algo](spaces, self.hp)
+            agent = _make_agent(spaces, self.hp)
         try:
             agent.policy.load_state_dict(self.weights)
         except RuntimeError:
@@ -140,30 +145,40 @@ class SavedPolicy:
         return agent
 
 
-def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparameters:
+def _make_agent(spaces: Spaces, hp: AnyHyperparameters) -> AnyAgent:
+    if isinstance(hp, Hyperparameters):
+        return AGENTS[hp.algo](spaces, hp)
+    return OFFLINE_AGENTS[hp.algo](spaces, hp)
+
+
+def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> AnyHyperparameters:
     """Make the hyperparameters that a file holds.
 
     Raises:
         ValueError: This version of torch_panda does not know one of their names or
             values.
     """
-    accepted = {field.name for field in fields(Hyperparameters)}
+    offline_agent = OFFLINE_AGENTS.get(values.get("algo", ""))
+    cls: type[AnyHyperparameters] = Hyperparameters
+    if offline_agent is not None:
+        cls = offline_agent.Hyperparameters
+    accepted = {field.name for field in fields(cls)}
     if unknown := values.keys() - accepted:
         raise ValueError(
             f"{path} was saved by another version of torch_panda, with options that "
             f"this version does not have: {', '.join(sorted(unknown))}"
         )
-    for name, hint in get_type_hints(Hyperparameters).items():
+    for name, hint in get_type_hints(cls).items():
         choices = get_args(hint) if get_origin(hint) is Literal else ()
         if choices and name in values and values[name] not in choices:
             raise ValueError(
                 f"{path} was saved by another version of torch_panda: {name} must be "
                 f"one of {choices}, got {values[name]!r}"
             )
-    return Hyperparameters(**values)
+    return cls(**values)
 
 
-def save_policy(path: Path, agent: Agent, env_id: str) -> None:
+def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
     """Write a policy into a file that `load_policy` reads.
 
     Args:
@@ -171,9 +186,10 @@ def save_policy(path: Path, agent: Agent, env_id: str) -> None:
         agent: The agent with the policy.
         env_id: Id of the environment that it was trained on.
     """
-    hp = {
-        field.name: getattr(agent.hp, field.name) for field in fields(Hyperparameters)
-    }
+    offline = isinstance(agent, OfflineAgent)
+    cls = agent.Hyperparameters if offline else Hyperparameters
+    # The hyperparameters may be the options of a run, which has more of them.
+    hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}
     content = {
         "env_id": env_id,
         "hyperparameters": hp,

@@ -1,0 +1,165 @@
+"""``train --offline`` writes its files, stops, resumes and explains errors."""
+
+import csv
+import json
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+import torch_panda
+from torch_panda.commands import evaluate, plot, refine, train
+from torch_panda.commands.train import parse
+from torch_panda.learning.offline import OFFLINE_AGENTS
+from torch_panda.learning.offline.options import make_args_class
+
+pytestmark = pytest.mark.usefixtures("quick")
+
+SMALL = {"hidden_size": 32, "batch_size": 64, "num_envs": 4, "video": False}
+
+
+class After:
+    """A stop signal: true from the n-th question on."""
+
+    def __init__(self, number):
+        self.left = number
+
+    def __bool__(self):
+        self.left -= 1
+        return self.left < 0
+
+
+def make_args(out, algo="gcbc", **options):
+    options = {**SMALL, "transitions": 400, "total_steps": 6, **options}
+    return make_args_class(algo)(out=out, eval_interval=4, **options)
+
+
+def read_curve(folder):
+    with (folder / "curve.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def state(run):
+    curve = [{**row, "seconds": 0} for row in run.progress.curve]
+    return {key: x.clone() for key, x in run.agent.state_dict().items()}, curve
+
+
+def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
+    out = tmp_path / "run"
+    train.main(make_args(out, video=True))
+    assert "after 6 steps; see" in capsys.readouterr().out
+    rows = read_curve(out)
+    assert [row["step"] for row in rows] == ["0", "4", "6"]
+    assert float(rows[-1]["actor_loss"]) > 0
+    assert 0 <= float(rows[-1]["fixed_success"]) <= 1
+    assert set(torch_panda.evaluation_tasks("PandaReach-v1")) <= set(rows[0])
+    assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "video.mp4").exists()
+    args = json.loads((out / "args.json").read_text())
+    assert (args["preset"], args["algo"]) == ("offline", "gcbc")
+
+    policy = torch_panda.load_policy(out)
+    result = torch_panda.evaluate(policy, "PandaReach-v1", episodes=2)
+    assert len(result.success) == 2
+    evaluate.main(evaluate.Args(run=str(out), episodes=4))
+    assert "PandaReach-v1, 4 episodes" in capsys.readouterr().out
+    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "all.png"))
+    assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SystemExit, match="was learned offline by gcbc, but refine"):
+        refine.main(refine.Args(policy=out, out=tmp_path / "refined"))
+
+
+@pytest.mark.parametrize("algo", OFFLINE_AGENTS)
+def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo):
+    args = make_args(tmp_path / "whole", algo)
+    whole = train.make_run(args, args.out)
+    assert whole.train()
+    whole.close()
+
+    args = make_args(tmp_path / "stopped", algo)
+    stopped = train.make_run(args, args.out)
+    assert not stopped.train(After(3))
+    stopped.close()
+    assert stopped.progress.steps == 3
+    resumed = train.make_run(replace(args, resume=True), args.out)
+    assert resumed.progress.steps == 3
+    assert resumed.train()
+    resumed.close()
+    weights, curve = state(whole)
+    resumed_weights, resumed_curve = state(resumed)
+    torch.testing.assert_close(resumed_weights, weights, rtol=0, atol=0)
+    assert resumed_curve == curve
+    assert [row["step"] for row in curve] == [0, 4, 6]
+
+
+@pytest.mark.parametrize("algo", OFFLINE_AGENTS)
+def test_the_saved_policy_acts_as_the_agent(tmp_path, algo):
+    args = make_args(tmp_path, algo, total_steps=2)
+    run = train.make_run(args, args.out)
+    run.train()
+    run.close()
+    with torch_panda.make("PandaReach-v1", num_envs=4, seed=0) as env:
+        td = env.reset()
+    random_state = torch.get_rng_state()
+    policy = torch_panda.load_policy(tmp_path)
+    assert torch.equal(random_state, torch.get_rng_state())
+    with torch.no_grad():
+        expected = run.agent.policy(td.clone())["action"]
+    assert torch.equal(policy(td.clone())["action"], expected)
+
+
+def test_data_of_a_file(tmp_path):
+    """Data that a run generated, and resuming with other data."""
+    first = make_args(tmp_path / "first", total_steps=2)
+    train.main(first)
+    data = tmp_path / "first" / "data.pt"
+    args = make_args(tmp_path / "second", data=str(data), total_steps=2)
+    train.main(args)
+    runs = [tmp_path / name / "checkpoint.pt" for name in ("first", "second")]
+    ours, theirs = (torch.load(path)["policy"] for path in runs)
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    content = torch.load(data)
+    content["action"] *= 0.5
+    torch.save(content, data)
+    with pytest.raises(SystemExit, match="cannot resume with other data"):
+        train.main(replace(args, resume=True))
+
+
+def test_the_options_are_those_of_the_algorithm(capsys):
+    arguments = [
+        "--offline",
+        "--algo",
+        "hiql",
+        "--subgoal-steps",
+        "7",
+        "--data",
+        "play",
+    ]
+    args = parse(arguments)
+    expected = make_args_class("hiql")(subgoal_steps=7, data="play")
+    assert args == expected
+    with pytest.raises(SystemExit):
+        parse(["--offline", "--algo", "hiql", "--help"])
+    text = capsys.readouterr().out
+    names = [field.name.replace("_", "-") for field in fields(expected)]
+    names[names.index("imports")] = "import"
+    assert [name for name in names if f"--{name}" not in text] == []
+    assert "number k of steps from a state to its waypoint" in " ".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--offline --algo ddpg", "--offline learns by gcbc, .* got --algo ddpg"),
+        ("--algo hiql", "^hiql learns offline: add --offline$"),
+        ("--offline --data nofile.pt", "data must be one of noisy, play, random"),
+        ("--offline --expectile 1.5", "expectile must be from 0 to 1"),
+        ("--offline --env-id PandaFly-v1", "unknown environment id"),
+        ("--offline --resume", "there is no run to resume"),
+    ],
+)
+def test_bad_options_are_one_line(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message) as stop:
+        train.run(arguments.split())
+    assert "\n" not in str(stop.value)

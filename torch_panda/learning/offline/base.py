@@ -1,0 +1,303 @@
+"""Base class of the agents that learn offline, and the losses that several share.
+
+The protocol of an agent: `fit` takes the statistics of the data, `update` takes one
+gradient step on a batch of `OfflineData`, and `policy` acts. Agents differ in their
+``goals``, which are strategies of `torch_panda.transforms.GoalSampler`, and in their
+`losses`, which name the equations of their paper.
+
+In the papers a goal is a state g. Here a goal is the part of a state that the task
+cares about, such as the position of a cube, because the policy gets ``desired_goal``.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from torch_panda.learning.hyperparameters import RelativeInputs
+from torch_panda.learning.limits import Discount, Positive, Ratio
+from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.offline.data import OfflineData
+from torch_panda.learning.spaces import Spaces
+from torch_panda.transforms.strategies import StrategyOption
+
+MAX_WEIGHT = 100.0  # largest weight of a row in advantage-weighted regression
+# OGBench's mixture of goals of value functions (arXiv 2410.20092, appendix D).
+VALUE_GOALS = {"current": 0.2, "geometric": 0.5, "random": 0.3}
+
+
+@dataclass
+class OfflineHyperparameters:
+    """Hyperparameters that all offline agents share.
+
+    Learning rate, discount and target rate are OGBench's (arXiv 2410.20092). OGBench
+    has 512 units and batches of 1,024; half the units and a quarter of the rows take an
+    eighth of the time, which suits a CPU.
+    """
+
+    discount: Discount = 0.99
+    """discount factor of values, and of goals of the strategy "geometric\""""
+    learning_rate: Ratio = 3e-4
+    """learning rate of Adam"""
+    tau: Ratio = 0.005
+    """fraction that target networks move towards their networks in each step"""
+    hidden_size: Positive = 256
+    """units of each of the three hidden layers, with GELU and LayerNorm"""
+    batch_size: Positive = 256
+    """transitions per gradient step"""
+    relative_inputs: RelativeInputs = "fine"
+    """further inputs of the networks: offsets of objects from the hand and of goals
+    from objects ("coarse"); these and their values clipped at 3 cm, so that millimetres
+    count ("fine")"""
+
+
+class Batch(NamedTuple):
+    """Sampled transitions (s, a, s') with goals, named as in the papers.
+
+    Attributes:
+        s: Observations before the step, (n, observation size).
+        a: Actions, (n, action size).
+        s_next: Observations after the step, (n, observation size).
+        achieved: Goals achieved by ``s_next``, (n, goal size).
+        r: Rewards for the value goals: 0 if ``s_next`` reaches it and -1 if not, (n,).
+        mask: 0 where ``s_next`` reaches the value goal, so that the return ends. Else
+            1, (n,).
+        g: Goals of values, (n, goal size).
+        g_actor: Goals of policies, (n, goal size).
+    """
+
+    s: Tensor
+    a: Tensor
+    s_next: Tensor
+    achieved: Tensor
+    r: Tensor
+    mask: Tensor
+    g: Tensor
+    g_actor: Tensor
+
+    @classmethod
+    def from_tensordict(cls, batch: TensorDictBase) -> "Batch":
+        """Read the rows of a buffer with a `GoalSampler`."""
+        after = batch.get("next")
+        reached = after.get("terminated").squeeze(-1)
+        return cls(
+            s=batch.get("observation"),
+            a=batch.get("action"),
+            s_next=after.get("observation"),
+            achieved=after.get("achieved_goal"),
+            r=after.get("reward").squeeze(-1),
+            mask=1.0 - reached.float(),
+            g=batch.get("value_goal"),
+            g_actor=batch.get("actor_goal"),
+        )
+
+
+class OfflineAgent(nn.Module, ABC):
+    """A policy that learns from a data set.
+
+    Args:
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters, of the class `Hyperparameters` of the agent.
+
+    Attributes:
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
+        normalizer: Standardises observations and goals.
+        policy: Module from ``observation`` and ``desired_goal`` to ``action`` in
+            [-1, 1], deterministic.
+        optimizer: Optimizer of all networks that learn.
+        updates: Number of gradient steps so far.
+        goals: Strategies by which `GoalSampler` draws goals for values and policies.
+    """
+
+    Hyperparameters: ClassVar[type[OfflineHyperparameters]]
+    goals: ClassVar[Mapping[str, StrategyOption]] = {
+        "value_goal": VALUE_GOALS,
+        "actor_goal": "future",
+    }
+    policy: TensorDictModuleBase
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, spaces: Spaces, hp: OfflineHyperparameters) -> None:
+        super().__init__()
+        self.spaces, self.hp = spaces, hp
+        # Without a layout there are no offsets to add.
+        relative_inputs = hp.relative_inputs if spaces.geometry else "none"
+        self.normalizer = Normalizer(spaces, relative_inputs)
+        self.updates = 0
+
+    def assemble(self, actor: nn.Module) -> None:
+        """Assemble policy and optimizer at the end of a constructor.
+
+        Args:
+            actor: Module from observation and goal to the mean action.
+        """
+        module = DeterministicPolicy(actor)
+        self.policy = TensorDictModule(
+            module, ["observation", "desired_goal"], ["action"]
+        )
+        trained = [p for p in self.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(trained, lr=self.hp.learning_rate, fused=True)
+
+    def fit(self, observation: Tensor, goal: Tensor) -> None:
+        """Take the statistics of observations and goals of the data, (n, size) each."""
+        self.normalizer.update(observation, goal)
+
+    def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
+        """Add further entries of the data to a sampled batch; here none."""
+        return batch
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Take one gradient step on a batch with the goals of ``goals``.
+
+        Returns:
+            The losses, scalars without gradients.
+        """
+        self.optimizer.zero_grad()
+        losses = self.losses(batch)
+        torch.stack(list(losses.values())).sum().backward()
+        self.optimizer.step()
+        self.updates += 1
+        self.move_targets()
+        return {key: loss.detach() for key, loss in losses.items()}
+
+    @abstractmethod
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of all networks, scalars. A loss changes only its own network."""
+
+    def move_targets(self) -> None:
+        """Move the target networks towards their networks, by ``tau``; here none."""
+
+
+class DeterministicPolicy(nn.Module):
+    """The mean action of an actor, clipped to [-1, 1].
+
+    Args:
+        actor: Module from observation and goal, (..., size) each, to (..., action
+            size).
+    """
+
+    def __init__(self, actor: nn.Module) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """The action, (..., action size)."""
+        return self.actor(observation, goal).clamp(-1.0, 1.0)
+
+
+class Actor(nn.Module):
+    """The mean of a Gaussian policy pi(a | s, g) with unit variance.
+
+    Args:
+        normalizer: Standardises observations and goals.
+        action_size: Size of an action.
+        hidden_size: Units of each hidden layer.
+    """
+
+    def __init__(
+        self, normalizer: Normalizer, action_size: int, hidden_size: int
+    ) -> None:
+        super().__init__()
+        self.normalizer = normalizer
+        self.net = make_gelu_mlp(len(normalizer.mean), action_size, hidden_size)
+
+    def forward(self, s: Tensor, g: Tensor) -> Tensor:
+        """The mean action, (..., action size)."""
+        return self.net(self.normalizer(s, g))
+
+
+class Ensemble(nn.ModuleList):
+    """Two value functions V(x) or Q(x) of the same inputs.
+
+    Args:
+        inputs: Size of an input.
+        hidden_size: Units of each hidden layer.
+    """
+
+    def __init__(self, inputs: int, hidden_size: int) -> None:
+        super().__init__(make_gelu_mlp(inputs, 1, hidden_size) for _ in range(2))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The two values, (2, n)."""
+        return torch.stack([net(*inputs).squeeze(-1) for net in self])
+
+
+def make_gelu_mlp(inputs: int, outputs: int, hidden_size: int) -> MLP:
+    """Make a network with three hidden layers that concatenates its inputs."""
+    return MLP(
+        in_features=inputs,
+        out_features=outputs,
+        num_cells=[hidden_size] * 3,
+        activation_class=nn.GELU,
+        norm_class=nn.LayerNorm,
+        norm_kwargs=[{"normalized_shape": hidden_size}] * 3,
+    )
+
+
+def log_prob(mean: Tensor, x: Tensor) -> Tensor:
+    """Log density of a Gaussian with unit variance, without its constant, (n,)."""
+    return -0.5 * (x - mean).square().sum(-1)
+
+
+def expectile_loss(diff: Tensor, advantage: Tensor, expectile: float) -> Tensor:
+    """Squared differences, weighted by the sign of the advantage (2110.06169, eq. 5).
+
+    In the paper the advantage is the difference itself.
+
+    Args:
+        diff: Target minus prediction, (..., n).
+        advantage: Advantage of each row, (n,).
+        expectile: Weight tau of rows with a positive advantage; others have 1 - tau.
+
+    Returns:
+        The weighted squares, (..., n).
+    """
+    weight = torch.where(advantage < 0, 1 - expectile, expectile)
+    return weight * diff.square()
+
+
+def weighted_regression(log_probs: Tensor, advantage: Tensor, alpha: float) -> Tensor:
+    """Advantage-weighted regression, a scalar (2110.06169, eq. 7).
+
+    Args:
+        log_probs: Log probabilities of the actions of the data, (n,).
+        advantage: Advantages of these actions, (n,).
+        alpha: Inverse temperature. 0 imitates all actions alike.
+    """
+    weight = (alpha * advantage.detach()).exp().clamp(max=MAX_WEIGHT)
+    return -(weight * log_probs).mean()
+
+
+def ascend_and_imitate(q: Tensor, log_probs: Tensor, alpha: float) -> Tensor:
+    """DDPG+BC: ascend Q, and imitate the data with weight alpha (2106.06860, eq. 5).
+
+    Args:
+        q: Values of the policy's actions, (n,). They are divided by their mean
+            magnitude, so that alpha does not depend on the scale of rewards.
+        log_probs: Log probabilities of the actions of the data, (n,).
+        alpha: Weight of the imitation.
+    """
+    scale = q.detach().abs().mean() + 1e-6
+    return -q.mean() / scale - alpha * log_probs.mean()
+
+
+@contextmanager
+def frozen(*modules: nn.Module) -> Iterator[None]:
+    """Let gradients flow through modules, but not into their parameters."""
+    parameters = [p for module in modules for p in module.parameters()]
+    required = [p.requires_grad for p in parameters]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter, requires_grad in zip(parameters, required, strict=True):
+            parameter.requires_grad_(requires_grad)

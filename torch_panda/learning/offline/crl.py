@@ -1,0 +1,111 @@
+"""Contrastive reinforcement learning, CRL (arXiv 2206.07568).
+
+The critic f(s, a, g) = phi(s, a)^T psi(g) tells goals that follow (s, a), drawn with
+probability proportional to discount**k for k steps later, from goals of other rows. Its
+optimum is the log ratio of the discounted probability of reaching g to the marginal
+one, which ranks actions like Q does. The policy ascends f and imitates the data.
+"""
+
+from dataclasses import dataclass
+from math import sqrt
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional
+
+from torch_panda.learning.limits import Positive, Weight
+from torch_panda.learning.offline.base import (
+    Actor,
+    Batch,
+    OfflineAgent,
+    OfflineHyperparameters,
+    ascend_and_imitate,
+    frozen,
+    log_prob,
+    make_gelu_mlp,
+)
+from torch_panda.learning.spaces import Spaces
+
+ContrastiveLoss = Literal["binary", "infonce"]
+
+
+@dataclass
+class CRLHyperparameters(OfflineHyperparameters):
+    """Hyperparameters of CRL, by default OGBench's."""
+
+    algo: Literal["crl"] = "crl"
+    """algorithm"""
+    contrastive_loss: ContrastiveLoss = "binary"
+    """classify each pair of (s, a) and goal ("binary", the paper's), or classify which
+    of the batch's goals belongs to (s, a) and which (s, a) to the goal ("infonce")"""
+    alpha: Weight = 0.1
+    """weight of the imitation in the policy's loss"""
+    latent_size: Positive = 128
+    """size of phi and psi"""
+
+
+class CRL(OfflineAgent):
+    """A contrastive critic f(s, a, g), and a policy pi(a | s, g) that ascends it."""
+
+    Hyperparameters: ClassVar = CRLHyperparameters
+    goals: ClassVar = {"value_goal": "geometric", "actor_goal": "future"}
+    hp: CRLHyperparameters
+
+    def __init__(self, spaces: Spaces, hp: CRLHyperparameters) -> None:
+        super().__init__(spaces, hp)
+        state_size, goal_size = len(self.normalizer.state_columns), spaces.goal_size
+        inputs = state_size + spaces.action_size
+        self.phi, self.psi = (
+            nn.ModuleList(
+                make_gelu_mlp(size, hp.latent_size, hp.hidden_size) for _ in range(2)
+            )
+            for size in (inputs, goal_size)
+        )
+        self.actor = Actor(self.normalizer, spaces.action_size, hp.hidden_size)
+        self.assemble(self.actor)
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of critic and policy."""
+        b = Batch.from_tensordict(batch)
+        phi, psi = self.encode(b.s, b.a, b.g)
+        # Row i of the logits has (s, a) of row i, column j the goal of row j.
+        logits = phi @ psi.mT / sqrt(self.hp.latent_size)  # (2, n, n)
+        return {
+            "critic_loss": contrastive_loss(logits, self.hp.contrastive_loss),
+            "actor_loss": self.actor_loss(b),
+        }
+
+    def encode(self, s: Tensor, a: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+        """phi(s, a) and psi(g) of both critics, (2, n, latent_size) each."""
+        x, y = self.normalizer.state(s), self.normalizer.goal(g)
+        phi = torch.stack([net(x, a) for net in self.phi])
+        psi = torch.stack([net(y) for net in self.psi])
+        return phi, psi
+
+    def actor_loss(self, b: Batch) -> Tensor:
+        """Ascend f(s, pi(s, g), g) (section 4.3), and imitate as OGBench does."""
+        mean = self.actor(b.s, b.g_actor)
+        with frozen(self.phi, self.psi):
+            phi, psi = self.encode(b.s, mean.clamp(-1.0, 1.0), b.g_actor)
+            f = (phi * psi).sum(-1).amin(0) / sqrt(self.hp.latent_size)
+        return ascend_and_imitate(f, log_prob(mean, b.a), self.hp.alpha)
+
+
+def contrastive_loss(logits: Tensor, kind: ContrastiveLoss) -> Tensor:
+    """Tell the pairs on the diagonal from the others.
+
+    Args:
+        logits: f of every (s, a) with every goal of a batch, (..., n, n).
+        kind: "binary" for the NCE loss of section 4.2, "infonce" for the mean of the
+            cross entropies of rows and columns.
+    """
+    n = logits.shape[-1]
+    if kind == "binary":
+        labels = torch.eye(n, device=logits.device).expand_as(logits)
+        return functional.binary_cross_entropy_with_logits(logits, labels)
+    of_rows, of_columns = (
+        -logits.log_softmax(dim).diagonal(dim1=-2, dim2=-1).mean() for dim in (-1, -2)
+    )
+    return (of_rows + of_columns) / 2

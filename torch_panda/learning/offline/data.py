@@ -1,0 +1,100 @@
+"""A data set in memory, whose sampled transitions get goals."""
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
+
+from torch_panda.envs import RobotTaskEnv
+from torch_panda.transforms import GoalSampler
+from torch_panda.transforms.strategies import StrategyOption
+
+
+class OfflineData:
+    """The transitions of whole episodes, and a buffer that samples them.
+
+    Rewards do not depend on those of the data: a transition has the reward 0 if it
+    reaches its value goal and -1 if not, and reaching the goal ends the return.
+    Everything is drawn from torch's global random generator, which runs save.
+
+    Args:
+        data: Transitions (n,) in the order of time, with ``observation``, ``action``,
+            ``desired_goal``, ``("collector", "traj_ids")``, and under ``next``
+            ``observation``, ``achieved_goal``, ``desired_goal``, ``reward``,
+            ``terminated`` and ``done``. An episode may not be split.
+        env: Environment of the task.
+        goals: Strategies of the goals; the first one is that of the values.
+        discount: Discount of the strategy "geometric".
+        data_hash: Hash of the data, which a resumed run compares.
+
+    Attributes:
+        rows: The transitions, (n,).
+        last: Index of the last transition of each transition's episode, (n,).
+    """
+
+    def __init__(
+        self,
+        data: TensorDictBase,
+        env: RobotTaskEnv,
+        goals: Mapping[str, StrategyOption],
+        discount: float,
+        data_hash: str = "",
+    ) -> None:
+        self.data_hash = data_hash
+
+        def reward(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
+            return env.is_success(achieved_goal, desired_goal).float() - 1.0
+
+        ids = data["collector", "traj_ids"]
+        ends = torch.ones_like(ids, dtype=torch.bool)
+        ends[:-1] = ids[1:] != ids[:-1]
+        data = data.exclude(("collector", "traj_ids")).set(
+            ("collector", "traj_ids"), ends.cumsum(0) - ends.long()
+        )
+        self.last = ends.nonzero().squeeze(-1)[data["collector", "traj_ids"]]
+        data["next", "done"] = ends.unsqueeze(-1)
+        data["next", "terminated"] = torch.zeros_like(data["next", "done"])
+        data["next", "reward"] = reward(
+            data["next", "achieved_goal"], data["desired_goal"]
+        )
+        transform = GoalSampler(
+            goals,
+            reward_fn=reward,
+            terminated_fn=env.is_success,
+            discount=discount,
+        )
+        rows = transform.prepare(data)
+        self.rows: TensorDictBase = rows
+        self._buffer = TensorDictReplayBuffer(
+            storage=TensorStorage(self.rows, device=env.device), transform=transform
+        )
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def sample(self, batch_size: int) -> TensorDictBase:
+        """Draw transitions and their goals.
+
+        Returns:
+            Transitions (batch_size,) with a goal under each key of the strategies, and
+            ``index``, their rows of the data.
+        """
+        return self._buffer.sample(batch_size)  # type: ignore[no-any-return]
+
+    def state_dict(self) -> dict[str, str]:
+        """The hash of the data, in place of the data themselves."""
+        return {"hash": self.data_hash}
+
+    def load_state_dict(self, state: dict[str, str]) -> None:
+        """Compare the data with those of a saved run.
+
+        Raises:
+            ValueError: They differ.
+        """
+        if state["hash"] != self.data_hash:
+            raise ValueError(
+                "cannot resume with other data: the run learned from data with the "
+                f"hash {state['hash']}, these have {self.data_hash}"
+            )

@@ -1,0 +1,98 @@
+"""Goal-conditioned implicit Q-learning, GCIQL (IQL: arXiv 2110.06169).
+
+V(s, g) is an expectile of Q(s, a, g) over the actions of the data, and Q regresses to
+r + discount * V(s', g), so that no value of an action outside the data is needed. As in
+OGBench (arXiv 2410.20092) the policy ascends Q and imitates the data, DDPG+BC.
+"""
+
+import copy
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_panda.learning.limits import Ratio, Weight
+from torch_panda.learning.offline.base import (
+    Actor,
+    Batch,
+    Ensemble,
+    OfflineAgent,
+    OfflineHyperparameters,
+    ascend_and_imitate,
+    expectile_loss,
+    frozen,
+    log_prob,
+    make_gelu_mlp,
+)
+from torch_panda.learning.spaces import Spaces
+
+
+@dataclass
+class GCIQLHyperparameters(OfflineHyperparameters):
+    """Hyperparameters of GCIQL, by default OGBench's."""
+
+    algo: Literal["gciql"] = "gciql"
+    """algorithm"""
+    expectile: Ratio = 0.9
+    """expectile tau of the values"""
+    alpha: Weight = 0.3
+    """weight of the imitation in the policy's loss"""
+
+
+class GCIQL(OfflineAgent):
+    """Values V(s, g) and Q(s, a, g), and a policy pi(a | s, g) that ascends Q."""
+
+    Hyperparameters: ClassVar = GCIQLHyperparameters
+    hp: GCIQLHyperparameters
+
+    def __init__(self, spaces: Spaces, hp: GCIQLHyperparameters) -> None:
+        super().__init__(spaces, hp)
+        inputs, action_size = len(self.normalizer.mean), spaces.action_size
+        self.value = make_gelu_mlp(inputs, 1, hp.hidden_size)
+        self.critic = Ensemble(inputs + action_size, hp.hidden_size)
+        self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
+        self.actor = Actor(self.normalizer, action_size, hp.hidden_size)
+        self.assemble(self.actor)
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of V, Q and policy."""
+        b = Batch.from_tensordict(batch)
+        return {
+            "value_loss": self.value_loss(b),
+            "critic_loss": self.critic_loss(b),
+            "actor_loss": self.actor_loss(b),
+        }
+
+    def value_loss(self, b: Batch) -> Tensor:
+        """Expectile regression of V to the smaller target Q (eq. 5)."""
+        x = self.normalizer(b.s, b.g)
+        with torch.no_grad():
+            q = self.target_critic(x, b.a).amin(0)
+        diff = q - self.value(x).squeeze(-1)
+        return expectile_loss(diff, diff, self.hp.expectile).mean()
+
+    def critic_loss(self, b: Batch) -> Tensor:
+        """Squared error of Q with respect to r + discount * V(s', g) (eq. 6)."""
+        with torch.no_grad():
+            v_next = self.value(self.normalizer(b.s_next, b.g)).squeeze(-1)
+            target = b.r + self.hp.discount * b.mask * v_next
+        q = self.critic(self.normalizer(b.s, b.g), b.a)
+        return (q - target).square().sum(0).mean()
+
+    def actor_loss(self, b: Batch) -> Tensor:
+        """DDPG+BC, instead of the paper's weighted imitation (eq. 7)."""
+        mean = self.actor(b.s, b.g_actor)
+        with frozen(self.critic):
+            x = self.normalizer(b.s, b.g_actor)
+            q = self.critic(x, mean.clamp(-1.0, 1.0)).amin(0)
+        return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.alpha)
+
+    def move_targets(self) -> None:
+        """Move the target critics towards the critics."""
+        with torch.no_grad():
+            target, online = (
+                list(net.parameters()) for net in (self.target_critic, self.critic)
+            )
+            torch._foreach_lerp_(target, online, self.hp.tau)

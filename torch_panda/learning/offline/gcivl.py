@@ -1,0 +1,83 @@
+"""Goal-conditioned implicit V-learning, GCIVL (arXiv 2307.11949, section 3).
+
+IQL (arXiv 2110.06169) without Q: an expectile of r + discount * V(s', g) over the
+actions of the data approximates the maximum over them, as transitions are nearly
+deterministic. The policy imitates actions in proportion to exp(alpha * advantage).
+"""
+
+import copy
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torch_panda.learning.limits import Ratio, Weight
+from torch_panda.learning.offline.base import (
+    Actor,
+    Batch,
+    Ensemble,
+    OfflineAgent,
+    OfflineHyperparameters,
+    expectile_loss,
+    log_prob,
+    weighted_regression,
+)
+from torch_panda.learning.spaces import Spaces
+
+
+@dataclass
+class GCIVLHyperparameters(OfflineHyperparameters):
+    """Hyperparameters of GCIVL, by default OGBench's."""
+
+    algo: Literal["gcivl"] = "gcivl"
+    """algorithm"""
+    expectile: Ratio = 0.9
+    """expectile tau of the values"""
+    alpha: Weight = 10.0
+    """inverse temperature of the weights of imitated actions"""
+
+
+class GCIVL(OfflineAgent):
+    """Values V(s, g), and a policy pi(a | s, g) that imitates good actions."""
+
+    Hyperparameters: ClassVar = GCIVLHyperparameters
+    hp: GCIVLHyperparameters
+
+    def __init__(self, spaces: Spaces, hp: GCIVLHyperparameters) -> None:
+        super().__init__(spaces, hp)
+        self.value = Ensemble(len(self.normalizer.mean), hp.hidden_size)
+        self.target_value = copy.deepcopy(self.value).requires_grad_(False)
+        self.actor = Actor(self.normalizer, spaces.action_size, hp.hidden_size)
+        self.assemble(self.actor)
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of value and policy."""
+        b = Batch.from_tensordict(batch)
+        return {"value_loss": self.value_loss(b), "actor_loss": self.actor_loss(b)}
+
+    def value_loss(self, b: Batch) -> Tensor:
+        """Expectile regression of V to its target (2307.11949, eq. 4)."""
+        x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
+        with torch.no_grad():
+            q = b.r + self.hp.discount * b.mask * self.target_value(x_next)  # (2, n)
+            advantage = q.amin(0) - self.target_value(x).mean(0)
+        diff = q - self.value(x)
+        return expectile_loss(diff, advantage, self.hp.expectile).sum(0).mean()
+
+    def actor_loss(self, b: Batch) -> Tensor:
+        """Weighted imitation with A = V(s', g) - V(s, g) (2307.11949, eq. 5)."""
+        with torch.no_grad():
+            v = self.value(self.normalizer(b.s, b.g_actor)).mean(0)
+            v_next = self.value(self.normalizer(b.s_next, b.g_actor)).mean(0)
+        log_probs = log_prob(self.actor(b.s, b.g_actor), b.a)
+        return weighted_regression(log_probs, v_next - v, self.hp.alpha)
+
+    def move_targets(self) -> None:
+        """Move the target values towards the values."""
+        with torch.no_grad():
+            target, online = (
+                list(net.parameters()) for net in (self.target_value, self.value)
+            )
+            torch._foreach_lerp_(target, online, self.hp.tau)

@@ -1,0 +1,205 @@
+"""Hierarchical implicit Q-learning, HIQL (arXiv 2307.11949).
+
+The high-level policy names a waypoint that should be reached k steps later, as a
+representation z = phi(s, w), and the low-level policy acts towards it. Both imitate the
+data in proportion to exp(alpha * advantage), with the action-free values of GCIVL.
+
+The paper's goals are states, so one value function judges waypoints and goals. Here a
+goal is a part of a state, and a waypoint w is a whole observation, because the goals
+achieved while the hand approaches an object are all the same. So there are two value
+functions: V(s, phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
+"""
+
+import copy
+from dataclasses import dataclass
+from math import sqrt
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from torch_panda.learning.limits import Positive, Ratio, Weight
+from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.offline.base import (
+    VALUE_GOALS,
+    Actor,
+    Batch,
+    Ensemble,
+    OfflineAgent,
+    OfflineHyperparameters,
+    expectile_loss,
+    log_prob,
+    make_gelu_mlp,
+    weighted_regression,
+)
+from torch_panda.learning.offline.data import OfflineData
+from torch_panda.learning.spaces import Spaces
+
+
+@dataclass
+class HIQLHyperparameters(OfflineHyperparameters):
+    """Hyperparameters of HIQL, by default OGBench's for its cube tasks."""
+
+    algo: Literal["hiql"] = "hiql"
+    """algorithm"""
+    expectile: Ratio = 0.7
+    """expectile tau of the values"""
+    high_alpha: Weight = 3.0
+    """inverse temperature of the weights of imitated waypoints"""
+    low_alpha: Weight = 3.0
+    """inverse temperature of the weights of imitated actions"""
+    subgoal_steps: Positive = 10
+    """number k of steps from a state to its waypoint"""
+    rep_dim: Positive = 10
+    """size of the representation of a waypoint"""
+
+
+class HIQL(OfflineAgent):
+    """Values of waypoints and goals, and a policy of each level."""
+
+    Hyperparameters: ClassVar = HIQLHyperparameters
+    goals: ClassVar = {"value_goal": VALUE_GOALS}  # `extend` draws the policy's goals
+    hp: HIQLHyperparameters
+
+    def __init__(self, spaces: Spaces, hp: HIQLHyperparameters) -> None:
+        super().__init__(spaces, hp)
+        inputs, hidden_size = len(self.normalizer.mean), hp.hidden_size
+        state_size = len(self.normalizer.state_columns)
+        # phi([s; w]), with values and target values of waypoints.
+        self.phi = make_gelu_mlp(2 * state_size, hp.rep_dim, hidden_size)
+        self.waypoint_value = Ensemble(state_size + hp.rep_dim, hidden_size)
+        self.goal_value = Ensemble(inputs, hidden_size)
+        self.online = nn.ModuleList([self.phi, self.waypoint_value, self.goal_value])
+        self.target = copy.deepcopy(self.online).requires_grad_(False)
+        # pi^h(z | s, g) and pi^l(a | s, z).
+        self.high_actor = Actor(self.normalizer, hp.rep_dim, hidden_size)
+        self.low_actor = make_gelu_mlp(
+            state_size + hp.rep_dim, spaces.action_size, hidden_size
+        )
+        self.assemble(
+            HierarchicalActor(self.normalizer, self.high_actor, self.low_actor)
+        )
+
+    def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
+        """Draw waypoints and goals of both policies, and waypoints of the values.
+
+        Row t of the data leads to the state s_t+1, so the state k steps after s_t is
+        s' of row t + k - 1. No waypoint lies beyond its goal or the end of its episode.
+        """
+        t = batch["index"]
+        last = data.last[t]
+        # The high level's goal: a later state of the episode, uniformly.
+        goal_row = t + (torch.rand(t.shape) * (last - t + 1)).long()
+        waypoint_row = t + self.hp.subgoal_steps - 1
+        # Of the values: this, a discounted later or a random state, as for goals.
+        u = torch.rand(t.shape, dtype=torch.float64)
+        ratio = 1 - self.hp.discount ** (last - t + 1).double()
+        steps = torch.log1p(-u * ratio) / torch.tensor(self.hp.discount).double().log()
+        geometric = torch.minimum(t + steps.long(), last)
+        random = torch.randint(len(data), t.shape)
+        weights = torch.tensor([*VALUE_GOALS.values()])
+        choice = torch.multinomial(weights, len(t), replacement=True)
+        value_row = torch.stack([t, geometric, random]).gather(0, choice[None])[0]
+
+        after = data.rows["next"]
+        batch["actor_goal"] = after["achieved_goal"][goal_row]
+        batch["high_waypoint"] = after["observation"][waypoint_row.minimum(goal_row)]
+        batch["low_waypoint"] = after["observation"][waypoint_row.minimum(last)]
+        batch["value_waypoint"] = after["observation"][value_row]
+        batch["is_at_waypoint"] = value_row == t
+        return batch
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of both values and both policies."""
+        b = Batch.from_tensordict(batch)
+        s, s_next = self.normalizer.state(b.s), self.normalizer.state(b.s_next)
+        w, is_at_w = batch["value_waypoint"], batch["is_at_waypoint"]
+        high_w, low_w = batch["high_waypoint"], batch["low_waypoint"]
+        return {
+            "goal_value_loss": self.goal_value_loss(b),
+            "waypoint_value_loss": self.waypoint_value_loss(s, s_next, w, is_at_w),
+            "high_actor_loss": self.high_actor_loss(b, s, high_w),
+            "low_actor_loss": self.low_actor_loss(b.a, s, s_next, low_w),
+        }
+
+    def represent(self, phi: nn.Module, s: Tensor, w: Tensor) -> Tensor:
+        """phi([s; w]) with the length sqrt(rep_dim), (n, rep_dim)."""
+        return with_unit_variance(phi(s, self.normalizer.state(w)))
+
+    def goal_value_loss(self, b: Batch) -> Tensor:
+        """Action-free expectile regression of V(s, g) (eq. 4)."""
+        value, target = self.goal_value, self.target[2]
+        x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
+        with torch.no_grad():
+            q = b.r + self.hp.discount * b.mask * target(x_next)  # (2, n)
+            advantage = q.amin(0) - target(x).mean(0)
+        loss = expectile_loss(q - value(x), advantage, self.hp.expectile)
+        return loss.sum(0).mean()
+
+    def waypoint_value_loss(
+        self, s: Tensor, s_next: Tensor, w: Tensor, is_at_w: Tensor
+    ) -> Tensor:
+        """The same for V(s, phi(s, w)), which trains phi (section 5.2)."""
+        phi, value, _ = self.target
+        with torch.no_grad():
+            v_next = value(s_next, self.represent(phi, s_next, w))
+            # -1 per step, until s' is the waypoint: then 0, and the return ends.
+            q = ~is_at_w * (self.hp.discount * v_next - 1)
+            advantage = q.amin(0) - value(s, self.represent(phi, s, w)).mean(0)
+        v = self.waypoint_value(s, self.represent(self.phi, s, w))
+        return expectile_loss(q - v, advantage, self.hp.expectile).sum(0).mean()
+
+    def high_actor_loss(self, b: Batch, s: Tensor, w: Tensor) -> Tensor:
+        """Weighted imitation of waypoints, A = V(s_t+k, g) - V(s_t, g) (eq. 6)."""
+        with torch.no_grad():
+            v = self.goal_value(self.normalizer(b.s, b.g_actor)).mean(0)
+            v_later = self.goal_value(self.normalizer(w, b.g_actor)).mean(0)
+            z = self.represent(self.phi, s, w)
+        log_probs = log_prob(self.high_actor(b.s, b.g_actor), z)
+        return weighted_regression(log_probs, v_later - v, self.hp.high_alpha)
+
+    def low_actor_loss(self, a: Tensor, s: Tensor, s_next: Tensor, w: Tensor) -> Tensor:
+        """Weighted imitation of actions, A = V(s_t+1, w) - V(s_t, w) (eq. 7)."""
+        with torch.no_grad():
+            z = self.represent(self.phi, s, w)
+            v = self.waypoint_value(s, z).mean(0)
+            z_next = self.represent(self.phi, s_next, w)
+            v_next = self.waypoint_value(s_next, z_next).mean(0)
+        log_probs = log_prob(self.low_actor(s, z), a)
+        return weighted_regression(log_probs, v_next - v, self.hp.low_alpha)
+
+    def move_targets(self) -> None:
+        """Move the targets of phi and of both values towards them."""
+        with torch.no_grad():
+            target, online = (
+                list(nets.parameters()) for nets in (self.target, self.online)
+            )
+            torch._foreach_lerp_(target, online, self.hp.tau)
+
+
+class HierarchicalActor(nn.Module):
+    """Acts towards the waypoint that the high level names.
+
+    Args:
+        normalizer: Standardises observations.
+        high_actor: Module from observation and goal to a waypoint's representation.
+        low_actor: Network from standardised observation and representation to action.
+    """
+
+    def __init__(
+        self, normalizer: Normalizer, high_actor: Actor, low_actor: nn.Module
+    ) -> None:
+        super().__init__()
+        self.normalizer = normalizer
+        self.high_actor, self.low_actor = high_actor, low_actor
+
+    def forward(self, s: Tensor, g: Tensor) -> Tensor:
+        """The mean action, (..., action size)."""
+        z = with_unit_variance(self.high_actor(s, g))
+        return self.low_actor(self.normalizer.state(s), z)
+
+
+def with_unit_variance(z: Tensor) -> Tensor:
+    """Scale vectors (..., n) to the length sqrt(n)."""
+    return z * (sqrt(z.shape[-1]) / z.norm(dim=-1, keepdim=True).clamp(min=1e-6))

@@ -1,0 +1,83 @@
+"""Options of ``train --offline``, and checks that they fit together."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from torch_panda.checks import check_device
+from torch_panda.learning.limits import Positive, Seed, check_limits
+from torch_panda.learning.logger import LoggerName, check_logger
+from torch_panda.learning.offline import OFFLINE_AGENTS, OfflineHyperparameters
+from torch_panda.learning.user_modules import Imports
+
+KINDS = ("noisy", "play", "random")  # of `torch_panda.datasets.generate`
+
+
+@dataclass
+class OfflineArgs(OfflineHyperparameters):
+    """What to learn from which data, how long, and where to write."""
+
+    algo: str = "gcivl"
+    """algorithm"""
+    env_id: str = "PandaReach-v1"
+    """id of the environment, shipped or registered by --import"""
+    data: str = "noisy"
+    """data to learn from: "noisy", "play" or "random" generates a data set, see
+    `torch_panda.datasets.generate`, and keeps it in data.pt of the run's folder. Else
+    a file of `record`, a data.pt of another run, or the folder of a data set"""
+    transitions: Positive = 1_000_000
+    """transitions to generate"""
+    total_steps: Positive = 100_000
+    """gradient steps"""
+    num_envs: Positive = 16
+    """number of environments stepped in parallel while data are generated"""
+    seed: Seed = 0
+    """seed of the generated data, the networks and the sampling"""
+    eval_interval: Positive = 10_000
+    """gradient steps between evaluations"""
+    out: Path | None = None
+    """folder of the results; None means runs/<env-id>-<algo>-<data>-<seed>"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
+    resume: bool = False
+    """continue the run in that folder, with the same other options"""
+    logger: LoggerName = "none"
+    """also log each evaluation to TensorBoard (folder "tensorboard" of the run) or to
+    Weights & Biases (project "torch_panda")"""
+    device: str = "cpu"
+    """device of the networks and the data"""
+    video: bool = True
+    """record a video of 4 episodes at the end"""
+
+
+@cache
+def make_args_class(algo: str) -> type[OfflineArgs]:
+    """The options of an algorithm, with its hyperparameters.
+
+    Raises:
+        ValueError: There is no such algorithm.
+    """
+    if algo not in OFFLINE_AGENTS:
+        raise ValueError(
+            f"--offline learns by {', '.join(OFFLINE_AGENTS)}, got --algo {algo}: "
+            "choose one of them, or leave out --offline"
+        )
+    cls = OFFLINE_AGENTS[algo].Hyperparameters
+    # The algorithm's class comes first, so that its defaults hold.
+    return dataclass(type("OfflineArgs", (cls, OfflineArgs), {}))
+
+
+def check_offline(args: OfflineArgs) -> None:
+    """Check options before data are generated.
+
+    Raises:
+        ValueError: An option is out of its limits, or the data do not exist.
+    """
+    check_limits(args)
+    check_device(args.device)
+    check_logger(args.logger)
+    if args.data not in KINDS and not Path(args.data).exists():
+        raise ValueError(
+            f"data must be one of {', '.join(KINDS)}, or a file or folder, got "
+            f"{args.data!r}"
+        )

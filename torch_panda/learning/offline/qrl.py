@@ -1,0 +1,144 @@
+"""Quasimetric reinforcement learning, QRL (arXiv 2304.01203).
+
+The cost of going from a state to a goal is a quasimetric: it satisfies the triangle
+inequality, but need not be symmetric. QRL learns the largest quasimetric d in which
+every observed step costs at most 1. That is the optimal cost, because paths of steps
+bound d from above. d is an interval quasimetric embedding, IQE (arXiv 2211.15120). The
+policy descends d through a learned model of the dynamics, and imitates the data.
+
+The paper's goals are states. Here a goal is a part of a state, so goals have an encoder
+of their own, and a step from each state to the goal that it achieves costs 0.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional
+
+from torch_panda.learning.limits import Positive, Weight
+from torch_panda.learning.offline.base import (
+    Actor,
+    Batch,
+    OfflineAgent,
+    OfflineHyperparameters,
+    ascend_and_imitate,
+    frozen,
+    log_prob,
+    make_gelu_mlp,
+)
+from torch_panda.learning.spaces import Spaces
+
+INTERVALS = 8  # of each component of the quasimetric
+EPSILON = 0.25  # accepted root mean square of costs above 1 (appendix)
+LAMBDA_LEARNING_RATE = 0.01  # of the multiplier (appendix)
+# Distances beyond the offset are hardly pushed further. It should exceed most costs,
+# which are below the 50 steps of an episode here; beta is the slope's sharpness.
+OFFSET, BETA = 50.0, 0.1
+
+
+@dataclass
+class QRLHyperparameters(OfflineHyperparameters):
+    """Hyperparameters of QRL, by default OGBench's for its noisy cube tasks."""
+
+    algo: Literal["qrl"] = "qrl"
+    """algorithm"""
+    alpha: Weight = 0.03
+    """weight of the imitation in the policy's loss"""
+    num_components: Positive = 32
+    """number of components of the quasimetric"""
+
+
+class QRL(OfflineAgent):
+    """A quasimetric d(s, g), a model of latent dynamics, and a policy pi(a | s, g)."""
+
+    Hyperparameters: ClassVar = QRLHyperparameters
+    goals: ClassVar = {"value_goal": "random", "actor_goal": "future"}
+    hp: QRLHyperparameters
+
+    def __init__(self, spaces: Spaces, hp: QRLHyperparameters) -> None:
+        super().__init__(spaces, hp)
+        state_size, action_size = len(self.normalizer.state_columns), spaces.action_size
+        latent_size = INTERVALS * hp.num_components
+        self.state_encoder = make_gelu_mlp(state_size, latent_size, hp.hidden_size)
+        self.goal_encoder = make_gelu_mlp(spaces.goal_size, latent_size, hp.hidden_size)
+        self.quasimetric = IQE()
+        self.dynamics = make_gelu_mlp(
+            latent_size + action_size, latent_size, hp.hidden_size
+        )
+        self.actor = Actor(self.normalizer, action_size, hp.hidden_size)
+        self.assemble(self.actor)
+        self.log_lambda = nn.Parameter(torch.zeros(()))
+        self.optimizer.add_param_group(
+            {"params": [self.log_lambda], "lr": LAMBDA_LEARNING_RATE}
+        )
+
+    def encode_state(self, s: Tensor) -> Tensor:
+        """Latent of observations, (n, latent size)."""
+        z: Tensor = self.state_encoder(self.normalizer.state(s))
+        return z
+
+    def encode_goal(self, g: Tensor) -> Tensor:
+        """Latent of goals, (n, latent size)."""
+        z: Tensor = self.goal_encoder(self.normalizer.goal(g))
+        return z
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of quasimetric, multiplier, dynamics and policy."""
+        b = Batch.from_tensordict(batch)
+        z, z_next = self.encode_state(b.s), self.encode_state(b.s_next)
+        far = self.quasimetric(z, self.encode_goal(b.g))
+        # Section 3.2: push states and random goals apart, far pairs less.
+        push = functional.softplus(OFFSET - far, beta=BETA).mean()
+        # Eq. 10: steps cost at most 1. Reaching the achieved goal costs 0.
+        too_far = (self.quasimetric(z, z_next) - 1).relu().square().mean()
+        achieved = self.quasimetric(z_next, self.encode_goal(b.achieved))
+        violation = too_far + achieved.square().mean()
+        multiplier = self.log_lambda.exp()
+        return {
+            "value_loss": push + multiplier.detach() * violation,
+            "multiplier_loss": multiplier * (EPSILON**2 - violation.detach()),
+            "dynamics_loss": self.dynamics_loss(z, b.a, z_next),
+            "actor_loss": self.actor_loss(b),
+        }
+
+    def dynamics_loss(self, z: Tensor, a: Tensor, z_next: Tensor) -> Tensor:
+        """Distance of z + T(z, a) from z', both ways (section 3.3)."""
+        predicted = z + self.dynamics(z, a)
+        distance = self.quasimetric(predicted, z_next)
+        return (distance + self.quasimetric(z_next, predicted)).mean() / 2
+
+    def actor_loss(self, b: Batch) -> Tensor:
+        """Descend d(z + T(z, pi(s, g)), g) (section 3.3), and imitate as OGBench."""
+        mean = self.actor(b.s, b.g_actor)
+        with torch.no_grad():
+            z, goal = self.encode_state(b.s), self.encode_goal(b.g_actor)
+        with frozen(self.dynamics, self.quasimetric):
+            predicted = z + self.dynamics(z, mean.clamp(-1.0, 1.0))
+            q = -self.quasimetric(predicted, goal)
+        return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.alpha)
+
+
+class IQE(nn.Module):
+    """Interval quasimetric embedding (arXiv 2211.15120, sections 3 and 4).
+
+    A component of d(x, y) is the length of the union of the intervals [x_j, max(x_j,
+    y_j)]. Maximum and mean over the components are mixed with a learned ratio.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mixture = nn.Parameter(torch.zeros(()))
+
+    def forward(self, x: Tensor, y: Tensor) -> Tensor:
+        """Distances from x to y, (..., components * INTERVALS) each: (...)."""
+        x, y = (values.unflatten(-1, (-1, INTERVALS)) for values in (x, y))
+        # From the lowest start on, an interval adds its part beyond the ends so far.
+        start, order = x.sort(dim=-1)
+        end = torch.maximum(x, y).gather(-1, order)
+        covered = torch.cat((start[..., :1], end.cummax(-1).values[..., :-1]), -1)
+        components = (end - torch.maximum(start, covered)).relu().sum(-1)
+        ratio = self.mixture.sigmoid()
+        return ratio * components.amax(-1) + (1 - ratio) * components.mean(-1)
