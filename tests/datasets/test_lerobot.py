@@ -55,5 +55,5 @@ def test_play_keeps_the_goal_of_each_step(tmp_path, monkeypatch):
         demos = read_demos(folder, env)
     for key in ("observation", "desired_goal", "action"):
         assert torch.equal(demos[key], expected[key].flatten(0, 1))
-    for key in ("observation", "desired_goal", "reward", "success"):
+    for key in ("observation", "desired_goal", "reward"):
         assert torch.equal(demos["next", key], expected["next", key].flatten(0, 1))
