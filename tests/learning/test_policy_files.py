@@ -139,6 +139,8 @@ def test_loading_and_evaluating_need_no_extra():
 def test_ids_without_a_policy_name_those_with_one():
     with pytest.raises(ValueError, match=r"no policy 'PandaPush-v3': .* PandaPush-v1"):
         torch_panda.load_policy("PandaPush-v3")
+    with pytest.raises(TypeError, match=r"takes the folder of a run.* got None"):
+        torch_panda.load_policy(None)
 
 
 def test_a_folder_without_a_policy(tmp_path):
