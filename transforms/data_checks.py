@@ -19,7 +19,7 @@ MAX_POOL_ROWS = 512  # rows of earlier batches that are kept for the next check
 MIN_CHECKS = 10  # checks before `DataCheck` may finish
 MAX_TOTAL_ROWS = 100_000  # `DataCheck` finishes after this number of rows
 # An entry may equal one goal by chance. It counts as a copy only if it equals several
-# different goals, which have at least this many numbers together.
+# different goals, and the number of these goals times goal_dim is at least this.
 MIN_GOAL_NUMBERS = 6
 
 MULTI_STEP_ERROR = (
@@ -56,7 +56,7 @@ def check_goals_agree(batch: TensorDictBase, rewriter: Rewriter) -> None:
 
 
 class DataCheck:
-    """Checks the first batches for entries and rewards that contradict other goals.
+    """Checks the first batches for entries that relabelling would make wrong.
 
     Three checks need rows with several different goals:
 
@@ -95,7 +95,7 @@ class DataCheck:
         """Checks transitions, of any batch shape.
 
         Raises:
-            ValueError: an entry or the rewards contradict other goals.
+            ValueError: an entry or the rewards would be wrong after relabelling.
         """
         if self._is_finished:
             return
@@ -184,10 +184,10 @@ class DataCheck:
         """Refuses entries that are affine functions of achieved and desired goal.
 
         The desired goal is constant in each episode. An affine function has 2 *
-        goal_dim + 1 coefficients per column. If there are no more different desired
-        goals than that, it can fit any column that is constant in each episode, so the
-        check waits for more goals. Then it refuses a column if an affine function fits
-        it, with three exceptions:
+        goal_dim + 1 coefficients per column. With at most 2 * goal_dim + 1
+        distinct desired goals, it can fit any column that is constant in each episode,
+        so the check waits for more goals. Then it refuses a column if an affine
+        function fits it, with three exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.

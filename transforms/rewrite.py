@@ -1,4 +1,4 @@
-"""Writes other goals into transitions, with the rewards and ends of these goals."""
+"""Writes other goals into transitions, and recomputes rewards and ends for them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ class Rewriter:
     def evaluate(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor
     ) -> dict[NestedKey, Tensor]:
-        """Computes the entries of some rows that depend on the goal, for other goals.
+        """Computes what the entries that depend on the goal are with other goals.
 
         Args:
             batch: Transitions, (m,).

@@ -94,6 +94,7 @@ class GoalSampler(SampleTimeTransform):
 
     def _draw(self, serials: Integers, batch: TensorDictBase) -> dict[NestedKey, Goals]:
         """Draws a goal for each row and key, (n, *goal)."""
+        # A unit is a row or a slice. It gets one goal, which is drawn for its last row.
         last_serials, units = self._find_units(serials)
         oldest = self._memory.oldest
         drawn = {}

@@ -80,7 +80,7 @@ class BroadPhase:
         for body in bodies:
             client.set_base(body, _FAR_AWAY)
         self._away = client.save()
-        # Two bodies whose bases `restore` makes the only overlapping pair.
+        # Two bodies. For one detection, `restore` lets only their bases overlap.
         self._overlapping = client.bodies[:2]
         client.native.broad_phase = pointer(self._describe())
         self.restore()

@@ -62,6 +62,8 @@ class NativeLoop:
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
+        # The field `expected` holds the status that Bullet should have answered, 0 if
+        # nothing failed, or a marker: DIVERGED or CLIENT_CLOSED.
         self._failures = (native.Failure * n)()
         # A ctypes struct keeps alive the objects that it points to, except tensors.
         self._batch = native.Batch(

@@ -205,8 +205,8 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # A first Ctrl-C waits for the threads of the step, but a second one
-                # does not. So threads of an earlier step may still run.
+                # A step with another control ran in Python threads. If a second Ctrl-C
+                # interrupted it, they may still run.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 

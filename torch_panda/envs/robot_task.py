@@ -90,9 +90,9 @@ class RobotTaskEnv(EnvBase):
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: What happens when a step leaves an environment in a state that
             is not finite. The environment always starts its next episode. "raise" then
-            raises `BulletError`. With "reset", the result of the step is the first
-            observation of that episode and the reward for it; ``success`` is False and
-            ``truncated`` is True.
+            raises `BulletError`. With "reset", the step returns the first
+            observation of that episode, and the reward computed from this observation;
+            ``success`` is False and ``truncated`` is True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
@@ -321,6 +321,7 @@ class RobotTaskEnv(EnvBase):
     @property
     @_cache_value
     def _step_mdp(self) -> NextRoot:
+        """Moves the entries under ``next`` to the root, faster than torchrl's."""
         return NextRoot(self)
 
     def rollout(

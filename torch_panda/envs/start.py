@@ -85,16 +85,16 @@ class EpisodeStarts:
         start = self._task.sample_start(self._seeds.next_generator(env))
         row = {key: array[env] for key, array in self._arrays.items()}
         row["step_count"][:] = 0
-        _fill(row["desired_goal"], start.goal, self._draw_function("sample_goal"))
+        _fill(row["desired_goal"], start.goal, self._error_name("sample_goal"))
         row["joint_position"][:] = self._robot.neutral_joint_position
         row["joint_velocity"][:] = 0.0
         if len(row["object_pose"]):
-            function = self._draw_function("sample_objects")
-            _fill(row["object_pose"], start.object_pose, function)
+            name = self._error_name("sample_objects")
+            _fill(row["object_pose"], start.object_pose, name)
             for *_, x, y, z, w in row["object_pose"].tolist():
                 if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
                     raise ValueError(
-                        f"{function} must return unit quaternions, got {[x, y, z, w]}"
+                        f"{name} must return unit quaternions, got {[x, y, z, w]}"
                     )
             row["object_velocity"][:] = 0.0
         if "object_joint_position" in row:
@@ -102,7 +102,7 @@ class EpisodeStarts:
             drawn = np.asarray(start.object_joint_position)
             # A single number is the position of every joint.
             drawn = np.broadcast_to(drawn, joints.shape) if drawn.size == 1 else drawn
-            _fill(joints, drawn, self._draw_function("sample_object_joints"))
+            _fill(joints, drawn, self._error_name("sample_object_joints"))
             row["object_joint_velocity"][:] = 0.0
         if self._randomizer.is_active:
             self._randomizer.draw(env, self._seeds.physics_seed(env))
@@ -146,7 +146,7 @@ class EpisodeStarts:
             envs, randomizer.apply if randomizer.changes_physics else None
         )
 
-    def _draw_function(self, name: str) -> str:
+    def _error_name(self, name: str) -> str:
         """Name of the task's function that draws an entry, for errors.
 
         It is ``sample_start`` if the task overrides this, and ``name`` otherwise.
@@ -156,7 +156,7 @@ class EpisodeStarts:
         return name
 
 
-def _fill(row: Doubles, values: object, function: str) -> None:
+def _fill(row: Doubles, values: object, name: str) -> None:
     """Check the numbers that the task drew and write them into a state tensor's row.
 
     Raises:
@@ -165,6 +165,6 @@ def _fill(row: Doubles, values: object, function: str) -> None:
     drawn = np.asarray(values, dtype=np.float64)
     if drawn.shape != row.shape or not np.isfinite(drawn).all():
         raise ValueError(
-            f"{function} must return finite numbers of shape {row.shape}, got {values}"
+            f"{name} must return finite numbers of shape {row.shape}, got {values}"
         )
     row[:] = drawn

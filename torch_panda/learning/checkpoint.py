@@ -51,7 +51,11 @@ class Progress:
 
 
 class Stored(Protocol):
-    """A replay buffer, or a data set that is compared with that of the saved run."""
+    """The data of a run.
+
+    A replay buffer is saved and restored. A data set is not saved; resuming a run
+    checks that it is the same data set.
+    """
 
     def state_dict(self) -> dict[str, Any]:
         """The state to save."""

@@ -141,9 +141,10 @@ class Run:
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if not progress.curve:
-            # Save first, so that a run killed in this evaluation can be resumed.
+            # `Curve.add` evaluates the untrained policy. Save first, so that a run
+            # killed meanwhile can be resumed.
             checkpoint.save()
-            self.curve.add(progress)  # the untrained policy
+            self.curve.add(progress)
             checkpoint.save()
         if progress.pretrained < args.pretrain_updates:
             pretrain(
