@@ -73,7 +73,7 @@ def main() -> float:
     net = MLP(4, len(MOVES), depth=2, num_cells=256, activation_class=nn.ReLU)
     keys = ["observation", "desired_goal"]
     actor = QValueActor(net, in_keys=keys, spec=env.action_spec)
-    explore = TensorDictSequential(actor, EGreedyModule(env.action_spec, 0.2, 0.2))
+    explore = TensorDictSequential([actor, EGreedyModule(env.action_spec, 0.2, 0.2)])
     loss = DQNLoss(actor, delay_value=True)
     loss.make_value_estimator(gamma=0.98)
     target_update = SoftUpdate(loss, tau=0.05)

@@ -37,7 +37,7 @@ def make_env(seed: int, num_envs: int) -> TransformedEnv:
     keys = ["observation", "desired_goal"]
     concatenate = CatTensors(keys, "policy_input", del_keys=False)
     scale = ObservationNorm(loc=0.0, scale=10.0, in_keys=["policy_input"])
-    return TransformedEnv(env, Compose(concatenate, scale))
+    return TransformedEnv(env, Compose([concatenate, scale]))
 
 
 def make_actor_critic(env: TransformedEnv) -> tuple[ProbabilisticActor, ValueOperator]:
@@ -53,7 +53,7 @@ def make_actor_critic(env: TransformedEnv) -> tuple[ProbabilisticActor, ValueOpe
         return_log_prob=True,
     )
     critic = ValueOperator(MLP(out_features=1, **sizes), in_keys=["policy_input"])
-    TensorDictSequential(actor, critic)(env.reset())  # creates the lazy layers
+    TensorDictSequential([actor, critic])(env.reset())  # creates the lazy layers
     return actor, critic
 
 

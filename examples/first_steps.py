@@ -22,15 +22,16 @@ test_env = torch_panda.make("PandaReach-v1", num_envs=50, seed=1)
 class Net(MLP):
     """An MLP of observation, goal and action. Positions enter in decimetres."""
 
-    def forward(self, observation: Tensor, goal: Tensor, *action: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor:  # type: ignore[override]
         """(..., 6), (..., 3) and, for the critic, (..., 3) to (..., 3) or (..., 1)."""
-        return super().forward(10 * observation, 10 * goal, *action)
+        observation, goal, *action = inputs  # torchrl types them as tuples
+        return super().forward(10 * observation, 10 * goal, *action)  # type: ignore
 
 
 inputs = ["observation", "desired_goal"]
 net = Net(9, 3, depth=2, num_cells=256, activation_class=nn.ReLU)
-policy = TensorDictModule(net, inputs, ["action"])
-actor = TensorDictSequential(policy, TanhModule(in_keys=["action"]))
+policy = TensorDictModule(net, [*inputs], ["action"])
+actor = TensorDictSequential([policy, TanhModule(in_keys=["action"])])
 value = Net(12, 1, depth=2, num_cells=256, activation_class=nn.ReLU)
 critic = TensorDictModule(value, [*inputs, "action"], ["state_action_value"])
 noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
@@ -43,7 +44,7 @@ optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
 relabel = HindsightRelabel.from_env(env, her_ratio=0.8)
 storage = LazyTensorStorage(100_000)
 buffer = TensorDictReplayBuffer(storage=storage, transform=relabel, batch_size=256)
-explore = TensorDictSequential(actor, noise)
+explore = TensorDictSequential([actor, noise])
 for data in Collector(env, explore, frames_per_batch=400, total_frames=2_400):
     buffer.extend(data.reshape(-1))
     for _ in range(200):

@@ -71,7 +71,7 @@ def play(name: str) -> list[Image.Image]:
             if step % stride == 0:
                 cells.append(draw(env, name, bool(td["success"])))
             if step < env.max_episode_steps:
-                td = env.step(expert(td))["next"]
+                td = env.step(expert(td))["next"]  # type: ignore[assignment]
     if not bool(td["success"]):
         raise ValueError(f"{name} fails with seed {seed}: choose another seed")
     return cells

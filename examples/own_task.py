@@ -86,7 +86,7 @@ def main() -> Tensor:
         start = td["achieved_goal"]
         while not td["done"].any():
             to_ball = td["achieved_goal"] - td["observation"][:, :3]
-            td = env.step(td.set("action", 5 * to_ball))["next"]
+            td = env.step(td.set("action", 5 * to_ball))["next"]  # type: ignore[assignment]
         distance = torch.linalg.vector_norm(td["achieved_goal"] - start, dim=-1)
     for env_index, moved in enumerate(distance.tolist()):
         print(f"environment {env_index}: the ball moved by {100 * moved:.1f} cm")

@@ -22,9 +22,7 @@ NUM_ENVS = 8
 STEPS: dict = {"frames_per_batch": 400, "total_frames": 4_000}
 UPDATES_PER_BATCH = 150
 SIZE = 48  # of the pictures [pixels]
-CAMERA = torch_panda.Camera(
-    target=(0.0, 0.0, 0.15), distance=0.8, yaw=60, shadows=False
-)
+CAMERA = torch_panda.Camera((0.0, 0.0, 0.15), distance=0.8, yaw=60, shadows=False)
 
 
 def make_env(seed: int, num_envs: int) -> torch_panda.RobotTaskEnv:
@@ -52,16 +50,18 @@ class PixelActor(nn.Module):
 class StateCritic(MLP):
     """From state, goal and action to a value. Positions enter in decimetres."""
 
-    def forward(self, observation: Tensor, goal: Tensor, action: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor:  # type: ignore[override]
         """(..., 6), (..., 3) and (..., 3) to (..., 1)."""
-        return super().forward(10 * observation, 10 * goal, action)
+        observation, goal, action = inputs  # torchrl types them as tuples
+        return super().forward(10 * observation, 10 * goal, action)  # type: ignore
 
 
+@torch.no_grad()
 def evaluate(actor: TensorDictSequential, env: torch_panda.RobotTaskEnv) -> Tensor:
     """Mean distance from the goal at the end of an episode [m]."""
-    with torch.no_grad():
-        end = env.rollout(50, actor)["next"][:, -1]
-    return (end["achieved_goal"] - end["desired_goal"]).norm(dim=-1).mean()
+    rollout = env.rollout(50, actor)
+    error = rollout["next", "achieved_goal"] - rollout["next", "desired_goal"]
+    return error[:, -1].norm(dim=-1).mean()
 
 
 def main() -> tuple[float, float]:
@@ -69,18 +69,18 @@ def main() -> tuple[float, float]:
     torch.manual_seed(0)
     env, test_env = make_env(0, NUM_ENVS), make_env(1, 8)
     net = TensorDictModule(PixelActor(), ["pixels", "desired_goal"], ["action"])
-    actor = TensorDictSequential(net, TanhModule(in_keys=["action"]))
+    actor = TensorDictSequential([net, TanhModule(in_keys=["action"])])
     before = evaluate(actor, test_env).item()  # also creates the lazy layers
     value = StateCritic(12, 1, depth=2, num_cells=256, activation_class=nn.ReLU)
     keys = ["observation", "desired_goal", "action"]
-    critic = TensorDictModule(value, keys, ["state_action_value"])
+    critic = TensorDictModule(value, [*keys], ["state_action_value"])
     loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
     loss.make_value_estimator(gamma=0.8)
     target_update = SoftUpdate(loss, tau=0.02)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=64)
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.5, sigma_end=0.5)
-    explore = TensorDictSequential(actor, noise)
+    explore = TensorDictSequential([actor, noise])
     for data in Collector(env, explore, **STEPS):
         buffer.extend(data.reshape(-1))
         for _ in range(UPDATES_PER_BATCH):

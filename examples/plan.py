@@ -58,7 +58,7 @@ class Fork(EnvBase):
         reward = torch.zeros(*tensordict.batch_size, 1)
         for _ in range(HOLD):
             self.now["action"] = tensordict["action"]
-            self.now = self.model.step(self.now)["next"]
+            self.now = self.model.step(self.now)["next"]  # type: ignore[assignment]
             goal, cube = self.now["desired_goal"], self.now["achieved_goal"]
             distance = self.model.task.distance(cube, goal)
             hand_goal = cube - BEHIND * normalize(goal - cube)
@@ -69,7 +69,7 @@ class Fork(EnvBase):
         result = {"index": tensordict["index"] + 1, "reward": reward, "done": done}
         return TensorDict(result, tensordict.batch_size)
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase) -> TensorDict:  # type: ignore[override]
         raise NotImplementedError("a Fork starts from the state in its input")
 
     def _set_seed(self, seed: int | None) -> None:
@@ -86,7 +86,7 @@ def solve(env: torch_panda.RobotTaskEnv, fork: Fork) -> TensorDictBase:
         action = planner(TensorDict(start))["action"]
         for _ in range(HOLD):
             if not td["done"]:
-                td = env.step(td.set("action", action))["next"]
+                td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
     return td
 
 
