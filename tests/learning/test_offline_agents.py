@@ -104,9 +104,8 @@ def test_the_action_is_clipped_and_deterministic(env):
 
 
 def test_rewards_are_those_of_the_value_goal(env, transitions):
-    data = OfflineData(
-        transitions.clone(), env, OFFLINE_AGENTS["gcivl"].goals, discount=0.99
-    )
+    goals = make_agent(env, "gcivl").goals
+    data = OfflineData(transitions.clone(), env, goals, discount=0.99)
     batch = data.sample(1_000)
     b = Batch.from_tensordict(batch)
     reached = (b.achieved - b.g).norm(dim=-1) < 0.05
@@ -207,20 +206,17 @@ def test_a_component_of_iqe_is_the_length_of_the_union():
     torch.testing.assert_close(d(x, y).detach(), torch.tensor(4.0))
 
 
-def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env):
+@pytest.mark.parametrize("actor_goal", ["future", "geometric"])
+def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, actor_goal):
     """Each row has its episode and step as its observation and goal."""
     lengths = [7, 30, 1, 12]
     episode = torch.cat([torch.full((n,), i) for i, n in enumerate(lengths)])
     step = torch.cat([torch.arange(n) for n in lengths])
     names = torch.stack([episode, step], -1).float()
     rows = torch.zeros(50, 1)
-    data = OfflineData(
-        named_transitions(env, episode, names, rows),
-        env,
-        OFFLINE_AGENTS["hiql"].goals,
-        discount=0.9,
-    )
-    agent = make_agent(env, "hiql", subgoal_steps=5)
+    agent = make_agent(env, "hiql", subgoal_steps=5, actor_goal=actor_goal)
+    named = named_transitions(env, episode, names, rows)
+    data = OfflineData(named, env, agent.goals, discount=0.9)
     batch = agent.extend(data.sample(5_000), data)
     t = batch["index"]
     last = torch.tensor(lengths)[episode[t]] - 1

@@ -10,10 +10,10 @@ cares about, such as the position of a cube, because the policy gets ``desired_g
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -52,6 +52,10 @@ class OfflineHyperparameters:
     """units of each of the three hidden layers, with GELU and LayerNorm"""
     batch_size: Positive = 256
     """transitions per gradient step"""
+    actor_goal: Literal["future", "geometric"] = "future"
+    """goals of policies: achieved later in the episode, with equal probabilities as in
+    OGBench ("future") or with those of the discount ("geometric"). "geometric" suits
+    long episodes that pursue several goals ("play")"""
     relative_inputs: RelativeInputs = "fine"
     """further inputs of the networks: offsets of objects from the hand and of goals
     from objects ("coarse"); these and their values clipped at 3 cm, so that millimetres
@@ -114,14 +118,11 @@ class OfflineAgent(nn.Module, ABC):
             [-1, 1], deterministic.
         optimizer: Optimizer of all networks that learn.
         updates: Number of gradient steps so far.
-        goals: Strategies by which `GoalSampler` draws goals for values and policies.
+        value_goal: Strategy of the goals of values.
     """
 
     Hyperparameters: ClassVar[type[OfflineHyperparameters]]
-    goals: ClassVar[Mapping[str, StrategyOption]] = {
-        "value_goal": VALUE_GOALS,
-        "actor_goal": "future",
-    }
+    value_goal: ClassVar[StrategyOption] = VALUE_GOALS
     policy: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
 
@@ -132,6 +133,11 @@ class OfflineAgent(nn.Module, ABC):
         relative_inputs = hp.relative_inputs if spaces.geometry else "none"
         self.normalizer = Normalizer(spaces, relative_inputs)
         self.updates = 0
+
+    @property
+    def goals(self) -> dict[str, StrategyOption]:
+        """Strategies by which `GoalSampler` draws goals for values and policies."""
+        return {"value_goal": self.value_goal, "actor_goal": self.hp.actor_goal}
 
     def assemble(self, actor: nn.Module) -> None:
         """Assemble policy and optimizer at the end of a constructor.

@@ -50,7 +50,7 @@ class CRL(OfflineAgent):
     """A contrastive critic f(s, a, g), and a policy pi(a | s, g) that ascends it."""
 
     Hyperparameters: ClassVar = CRLHyperparameters
-    goals: ClassVar = {"value_goal": "geometric", "actor_goal": "future"}
+    value_goal: ClassVar = "geometric"
     hp: CRLHyperparameters
 
     def __init__(self, spaces: Spaces, hp: CRLHyperparameters) -> None:

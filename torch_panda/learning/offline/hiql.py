@@ -35,6 +35,7 @@ from torch_panda.learning.offline.base import (
 )
 from torch_panda.learning.offline.data import OfflineData
 from torch_panda.learning.spaces import Spaces
+from torch_panda.transforms.strategies import draw_geometric
 
 
 @dataclass
@@ -59,7 +60,6 @@ class HIQL(OfflineAgent):
     """Values of waypoints and goals, and a policy of each level."""
 
     Hyperparameters: ClassVar = HIQLHyperparameters
-    goals: ClassVar = {"value_goal": VALUE_GOALS}  # `extend` draws the policy's goals
     hp: HIQLHyperparameters
 
     def __init__(self, spaces: Spaces, hp: HIQLHyperparameters) -> None:
@@ -89,14 +89,14 @@ class HIQL(OfflineAgent):
         """
         t = batch["index"]
         last = data.last[t]
-        # The high level's goal: a later state of the episode, uniformly.
-        goal_row = t + (torch.rand(t.shape) * (last - t + 1)).long()
+        # The high level's goal: a later state of the episode.
+        if self.hp.actor_goal == "future":
+            goal_row = t + (torch.rand(t.shape) * (last - t + 1)).long()
+        else:
+            goal_row = draw_geometric_rows(t, last, self.hp.discount)
         waypoint_row = t + self.hp.subgoal_steps - 1
         # Of the values: this, a discounted later or a random state, as for goals.
-        u = torch.rand(t.shape, dtype=torch.float64)
-        ratio = 1 - self.hp.discount ** (last - t + 1).double()
-        steps = torch.log1p(-u * ratio) / torch.tensor(self.hp.discount).double().log()
-        geometric = torch.minimum(t + steps.long(), last)
+        geometric = draw_geometric_rows(t, last, self.hp.discount)
         random = torch.randint(len(data), t.shape)
         weights = torch.tensor([*VALUE_GOALS.values()])
         choice = torch.multinomial(weights, len(t), replacement=True)
@@ -198,6 +198,12 @@ class HierarchicalActor(nn.Module):
         """The mean action, (..., action size)."""
         z = with_unit_variance(self.high_actor(s, g))
         return self.low_actor(self.normalizer.state(s), z)
+
+
+def draw_geometric_rows(t: Tensor, last: Tensor, discount: float) -> Tensor:
+    """Draw rows t + k up to ``last``, with probability proportional to discount**k."""
+    steps = draw_geometric((last - t + 1).numpy(), discount, None)
+    return t + torch.from_numpy(steps)
 
 
 def with_unit_variance(z: Tensor) -> Tensor:

@@ -55,7 +55,7 @@ class QRL(OfflineAgent):
     """A quasimetric d(s, g), a model of latent dynamics, and a policy pi(a | s, g)."""
 
     Hyperparameters: ClassVar = QRLHyperparameters
-    goals: ClassVar = {"value_goal": "random", "actor_goal": "future"}
+    value_goal: ClassVar = "random"
     hp: QRLHyperparameters
 
     def __init__(self, spaces: Spaces, hp: QRLHyperparameters) -> None:

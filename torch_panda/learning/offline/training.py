@@ -54,7 +54,9 @@ class OfflineRun:
         with torch.device(args.device):
             self.agent = cls(read_spaces(self.env), args)
         data = data.to(args.device)
-        self.data = OfflineData(data, self.env, cls.goals, args.discount, data_hash)
+        self.data = OfflineData(
+            data, self.env, self.agent.goals, args.discount, data_hash
+        )
         sample = self.sample(min(FIT_ROWS, len(self.data)))
         self.agent.fit(sample["observation"], sample["actor_goal"])
         self.curve = Curve(
