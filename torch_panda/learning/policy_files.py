@@ -186,8 +186,9 @@ def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
         agent: The agent with the policy.
         env_id: Id of the environment that it was trained on.
     """
-    offline = isinstance(agent, OfflineAgent)
-    cls = agent.Hyperparameters if offline else Hyperparameters
+    cls: type[AnyHyperparameters] = Hyperparameters
+    if isinstance(agent, OfflineAgent):
+        cls = agent.Hyperparameters
     # The hyperparameters may be the options of a run, which has more of them.
     hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}
     content = {

@@ -6,6 +6,7 @@ from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from tqdm import tqdm
 
+from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint
 
 
@@ -40,6 +41,7 @@ def pretrain(
         stop: Object that becomes true to end the imitation early, such as `StopSignal`.
     """
     agent, progress = checkpoint.agent, checkpoint.progress
+    assert isinstance(agent, Agent)  # offline agents have no pretraining
     bar = tqdm(
         desc="imitation", initial=progress.pretrained, total=updates, unit="update"
     )

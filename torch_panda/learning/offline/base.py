@@ -42,6 +42,8 @@ class OfflineHyperparameters:
     eighth of the time, which suits a CPU.
     """
 
+    algo: str = ""
+    """algorithm"""
     discount: Discount = 0.99
     """discount factor of values, and of goals of the strategy "geometric\""""
     learning_rate: Ratio = 3e-4
@@ -54,8 +56,7 @@ class OfflineHyperparameters:
     """transitions per gradient step"""
     actor_goal: Literal["future", "geometric"] = "future"
     """goals of policies: achieved later in the episode, with equal probabilities as in
-    OGBench ("future") or with those of the discount ("geometric"). "geometric" suits
-    long episodes that pursue several goals ("play")"""
+    OGBench ("future"), or sooner ones more often, by the discount ("geometric")"""
     relative_inputs: RelativeInputs = "fine"
     """further inputs of the networks: offsets of objects from the hand and of goals
     from objects ("coarse"); these and their values clipped at 3 cm, so that millimetres
@@ -293,6 +294,14 @@ def ascend_and_imitate(q: Tensor, log_probs: Tensor, alpha: float) -> Tensor:
     """
     scale = q.detach().abs().mean() + 1e-6
     return -q.mean() / scale - alpha * log_probs.mean()
+
+
+@torch.no_grad()
+def move_towards(target: nn.Module, online: nn.Module, tau: float) -> None:
+    """Move the parameters of a target network towards those of its network."""
+    targets: list[Tensor] = [*target.parameters()]
+    sources: list[Tensor] = [*online.parameters()]
+    torch._foreach_lerp_(targets, sources, tau)
 
 
 @contextmanager

@@ -81,7 +81,7 @@ class OfflineData:
             Transitions (batch_size,) with a goal under each key of the strategies, and
             ``index``, their rows of the data.
         """
-        return self._buffer.sample(batch_size)  # type: ignore[no-any-return]
+        return self._buffer.sample(batch_size)
 
     def state_dict(self) -> dict[str, str]:
         """The hash of the data, in place of the data themselves."""

@@ -25,6 +25,7 @@ from torch_panda.learning.offline.base import (
     frozen,
     log_prob,
     make_gelu_mlp,
+    move_towards,
 )
 from torch_panda.learning.spaces import Spaces
 
@@ -91,8 +92,4 @@ class GCIQL(OfflineAgent):
 
     def move_targets(self) -> None:
         """Move the target critics towards the critics."""
-        with torch.no_grad():
-            target, online = (
-                list(net.parameters()) for net in (self.target_critic, self.critic)
-            )
-            torch._foreach_lerp_(target, online, self.hp.tau)
+        move_towards(self.target_critic, self.critic, self.hp.tau)

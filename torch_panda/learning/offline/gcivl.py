@@ -22,6 +22,7 @@ from torch_panda.learning.offline.base import (
     OfflineHyperparameters,
     expectile_loss,
     log_prob,
+    move_towards,
     weighted_regression,
 )
 from torch_panda.learning.spaces import Spaces
@@ -76,8 +77,4 @@ class GCIVL(OfflineAgent):
 
     def move_targets(self) -> None:
         """Move the target values towards the values."""
-        with torch.no_grad():
-            target, online = (
-                list(net.parameters()) for net in (self.target_value, self.value)
-            )
-            torch._foreach_lerp_(target, online, self.hp.tau)
+        move_towards(self.target_value, self.value, self.hp.tau)

@@ -31,6 +31,7 @@ from torch_panda.learning.offline.base import (
     expectile_loss,
     log_prob,
     make_gelu_mlp,
+    move_towards,
     weighted_regression,
 )
 from torch_panda.learning.offline.data import OfflineData
@@ -102,11 +103,11 @@ class HIQL(OfflineAgent):
         choice = torch.multinomial(weights, len(t), replacement=True)
         value_row = torch.stack([t, geometric, random]).gather(0, choice[None])[0]
 
-        after = data.rows["next"]
-        batch["actor_goal"] = after["achieved_goal"][goal_row]
-        batch["high_waypoint"] = after["observation"][waypoint_row.minimum(goal_row)]
-        batch["low_waypoint"] = after["observation"][waypoint_row.minimum(last)]
-        batch["value_waypoint"] = after["observation"][value_row]
+        observation = data.rows["next", "observation"]
+        batch["actor_goal"] = data.rows["next", "achieved_goal"][goal_row]
+        batch["high_waypoint"] = observation[waypoint_row.minimum(goal_row)]
+        batch["low_waypoint"] = observation[waypoint_row.minimum(last)]
+        batch["value_waypoint"] = observation[value_row]
         batch["is_at_waypoint"] = value_row == t
         return batch
 
@@ -171,11 +172,7 @@ class HIQL(OfflineAgent):
 
     def move_targets(self) -> None:
         """Move the targets of phi and of both values towards them."""
-        with torch.no_grad():
-            target, online = (
-                list(nets.parameters()) for nets in (self.target, self.online)
-            )
-            torch._foreach_lerp_(target, online, self.hp.tau)
+        move_towards(self.target, self.online, self.hp.tau)
 
 
 class HierarchicalActor(nn.Module):
