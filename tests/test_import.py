@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -117,3 +118,12 @@ def test_the_core_needs_no_torchrl():
             text = file.read_text()
             uses = "from torchrl" in text or "import torchrl" in text
             assert not uses or (room == "envs" and file.name in interface), file
+
+
+def test_the_wheel_holds_every_package():
+    text = (Path(__file__).parents[1] / "pyproject.toml").read_text()
+    packages = text.split("packages = [", 1)[1].split("]", 1)[0]
+    folders = {file.parent for file in PACKAGE.rglob("__init__.py")} | {PACKAGE}
+    names = {".".join(f.relative_to(PACKAGE.parent).parts) for f in folders}
+    names.add("torch_panda.transforms")  # from the folder transforms
+    assert set(re.findall(r'"([\w.]+)"', packages)) == names
