@@ -184,9 +184,10 @@ class DataCheck:
         """Refuses entries that are affine functions of achieved and desired goal.
 
         The desired goal is constant in each episode. An affine function has 2 *
-        goal_dim + 1 coefficients per column. With at most 2 * goal_dim + 1
-        distinct desired goals, it can fit any column that is constant in each episode,
-        so the check waits for more goals. Then it refuses a column if an affine
+        goal_dim + 1 coefficients per column. While no object moves, the
+        achieved goal is constant too. Then a function fits every column that is
+        constant in each episode, if there are at most 2 * goal_dim + 1 distinct desired
+        goals, so the check waits for more goals. Then it refuses a column if an affine
         function fits it, with three exceptions:
 
         - The base environment itself has the entry, in the same shape.

@@ -89,7 +89,7 @@ class Rewriter:
     def evaluate(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor
     ) -> dict[NestedKey, Tensor]:
-        """Computes what the entries that depend on the goal are with other goals.
+        """Computes the entries that depend on the goal for other goals.
 
         Args:
             batch: Transitions, (m,).
@@ -111,8 +111,8 @@ class Rewriter:
             )
         if self.terminated_fn is not None:
             done, terminated = batch.get(DONE), batch.get(TERMINATED)
-            # torchrl's trainers set "truncated" in every row, but "done" only where an
-            # episode ends.
+            # In data of torchrl's trainers, "truncated" is true in every row, and
+            # "done" only where an episode ends. So a truncated row must have both.
             truncated = batch.get(TRUNCATED, ~terminated) & done
 
             def reaches(desired: Tensor) -> Tensor:

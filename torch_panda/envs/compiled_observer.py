@@ -143,6 +143,8 @@ def _robot_columns(
         or robot_class.fingers_width is not Robot.fingers_width
     ):
         return selected_columns(robot.observation, simulation)
+    # `Robot.observation` has the position and the velocity of the hand, then the width.
+    # WIDTH is no column: it tells the C code to compute the distance of the fingers.
     first = simulation.state.ee_column
     columns = tuple(range(first, first + 6))
     if not robot.has_free_gripper:

@@ -58,9 +58,10 @@ class RobotTaskEnv(EnvBase):
     An environment belongs to one thread at a time: a call while another thread is
     inside raises `BulletError`.
 
-    A pickle holds the class, the arguments, and the seed that was last given to all
-    environments together, because the state of Bullet cannot be copied. An unpickled
-    environment builds its own clients and starts with the first episode of this seed.
+    The state of Bullet cannot be copied, so a pickle holds only the class, the
+    arguments, and the seed that was last given to all environments together. An
+    unpickled environment builds its own clients and starts with the first episode of
+    this seed.
 
     ``state_dict`` holds the seeds and the episode numbers, but not the state of the
     running episodes. After `load_state_dict`, the next reset starts the episode that

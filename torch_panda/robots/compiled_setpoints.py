@@ -23,6 +23,9 @@ class CompiledSetpoints:
         self._robot, self._library = robot, native.LIBRARY
         self._state = simulation.state.rows
         arm, is_ee = robot.num_arm_joints, robot.control_type == "ee"
+        # A setpoint has the position of the hand, or of the arm's joints (the first
+        # columns of the state), displaced by the scaled action. Then come the fingers:
+        # at their neutral positions if the gripper is blocked, else as the action says.
         num_displaced = 3 if is_ee else arm
         resting = () if robot.has_free_gripper else robot.neutral_joint_position[arm:]
         self._actuation = native.Actuation(
@@ -80,7 +83,8 @@ class CompiledSetpoints:
 def has_compiled_width(robot: Robot) -> bool:
     """Whether C can compute the distance between the fingers of a free gripper."""
     gripper = robot.gripper
-    # torch adds up the numbers of more than two joints in an order of its own.
+    # The width is the sum of the positions of the fingers' joints. Only for two joints
+    # is torch's order of addition known, and C does not know followers.
     return (
         type(gripper) is Gripper and gripper.num_joints == 2 and not gripper.followers
     )

@@ -49,7 +49,8 @@ class OfflineHyperparameters:
     learning_rate: Ratio = 3e-4
     """learning rate of Adam"""
     tau: Ratio = 0.005
-    """fraction that target networks move towards their networks in each step"""
+    """fraction that target networks move towards their networks in each step (not the
+    tau of expectiles)"""
     hidden_size: Positive = 256
     """units of each of the three hidden layers, with GELU and LayerNorm"""
     batch_size: Positive = 256
@@ -58,9 +59,9 @@ class OfflineHyperparameters:
     """goals of policies: achieved later in the episode, with equal probabilities as in
     OGBench ("future"), or sooner ones more often, by the discount ("geometric")"""
     relative_inputs: RelativeInputs = "fine"
-    """further inputs of the networks: offsets of objects from the hand and of goals
-    from objects ("coarse"); these and their values clipped at 3 cm, so that millimetres
-    count ("fine")"""
+    """further inputs of the networks: offsets of objects from the hand, and of goals
+    from objects ("coarse"); in addition a copy of these offsets that is clipped at 3
+    cm, in which millimetres are large after standardisation ("fine")"""
 
 
 class Batch(NamedTuple):
@@ -177,7 +178,11 @@ class OfflineAgent(nn.Module, ABC):
 
     @abstractmethod
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """The losses of all networks, scalars. A loss changes only its own network."""
+        """The losses of all networks, scalars, which are summed and differentiated.
+
+        A loss detaches or freezes the networks that it must not train, such as the
+        critic in the policy's loss.
+        """
 
     def move_targets(self) -> None:
         """Move the target networks towards their networks, by ``tau``; here none."""
@@ -262,7 +267,8 @@ def expectile_loss(diff: Tensor, advantage: Tensor, expectile: float) -> Tensor:
     Args:
         diff: Target minus prediction, (..., n).
         advantage: Advantage of each row, (n,).
-        expectile: Weight tau of rows with a positive advantage; others have 1 - tau.
+        expectile: Weight of rows with a positive advantage, tau in the paper. Others
+            have the weight 1 - tau.
 
     Returns:
         The weighted squares, (..., n).
@@ -274,6 +280,8 @@ def expectile_loss(diff: Tensor, advantage: Tensor, expectile: float) -> Tensor:
 def weighted_regression(log_probs: Tensor, advantage: Tensor, alpha: float) -> Tensor:
     """Advantage-weighted regression, a scalar (2110.06169, eq. 7).
 
+    The paper calls ``alpha`` beta.
+
     Args:
         log_probs: Log probabilities of the actions of the data, (n,).
         advantage: Advantages of these actions, (n,).
@@ -284,7 +292,9 @@ def weighted_regression(log_probs: Tensor, advantage: Tensor, alpha: float) -> T
 
 
 def ascend_and_imitate(q: Tensor, log_probs: Tensor, alpha: float) -> Tensor:
-    """DDPG+BC: ascend Q, and imitate the data with weight alpha (2106.06860, eq. 5).
+    """DDPG+BC, as in OGBench: ascend Q, and imitate the data with weight alpha.
+
+    TD3+BC (2106.06860) has the same two terms, but its alpha is the weight of Q.
 
     Args:
         q: Values of the policy's actions, (n,). They are divided by their mean

@@ -1,9 +1,11 @@
 """Contrastive reinforcement learning, CRL (arXiv 2206.07568).
 
-The critic f(s, a, g) = phi(s, a)^T psi(g) tells goals that follow (s, a), drawn with
-probability proportional to discount**k for k steps later, from goals of other rows. Its
-optimum is the log ratio of the discounted probability of reaching g to the marginal
-one, which ranks actions like Q does. The policy ascends f and imitates the data.
+The critic f(s, a, g) = phi(s, a)^T psi(g) is a classifier. Its positive goals are
+achieved k steps after (s, a), with probability proportional to discount**k. Its
+negative goals are those of other rows. As in OGBench, there are two critics, and f is
+divided by the square root of the size of phi. The optimum of f is the log ratio of the
+discounted probability of reaching g to the marginal one, which ranks actions like Q
+does. The policy ascends f and imitates the data.
 """
 
 from dataclasses import dataclass
@@ -33,7 +35,7 @@ ContrastiveLoss = Literal["binary", "infonce"]
 
 @dataclass
 class CRLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of CRL, by default OGBench's."""
+    """Hyperparameters of CRL, by default OGBench's, but with smaller phi and psi."""
 
     algo: Literal["crl"] = "crl"
     """algorithm"""

@@ -17,7 +17,7 @@ class OfflineData:
 
     Rewards do not depend on those of the data: a transition has the reward 0 if it
     reaches its value goal and -1 if not, and reaching the goal ends the return.
-    Everything is drawn from torch's global random generator, which runs save.
+    All draws come from torch's global random generator. A run saves its state.
 
     Args:
         data: Transitions (n,) in the order of time, with ``observation``, ``action``,
@@ -47,6 +47,9 @@ class OfflineData:
         def reward(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
             return env.is_success(achieved_goal, desired_goal).float() - 1.0
 
+        # Number the episodes 0, 1, ... in the order of the rows, so that the numbers
+        # index the rows where episodes end. `exclude` copies, so the caller's data stay
+        # as they are.
         ids = data["collector", "traj_ids"]
         ends = torch.ones_like(ids, dtype=torch.bool)
         ends[:-1] = ids[1:] != ids[:-1]

@@ -32,12 +32,15 @@ from torch_panda.learning.spaces import Spaces
 
 @dataclass
 class GCIQLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of GCIQL, by default OGBench's."""
+    """Hyperparameters of GCIQL, by default OGBench's.
+
+    For its cube tasks, OGBench takes an alpha of 0.03 (noisy) or 1 (play).
+    """
 
     algo: Literal["gciql"] = "gciql"
     """algorithm"""
     expectile: Ratio = 0.9
-    """expectile tau of the values"""
+    """expectile of the values, tau in the paper"""
     alpha: Weight = 0.3
     """weight of the imitation in the policy's loss"""
 

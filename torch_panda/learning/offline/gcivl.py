@@ -1,4 +1,6 @@
-"""Goal-conditioned implicit V-learning, GCIVL (arXiv 2307.11949, section 3).
+"""Goal-conditioned implicit V-learning, GCIVL.
+
+OGBench's name for the action-free values of HIQL (arXiv 2307.11949, section 3).
 
 IQL (arXiv 2110.06169) without Q: an expectile of r + discount * V(s', g) over the
 actions of the data approximates the maximum over them, as transitions are nearly
@@ -35,7 +37,7 @@ class GCIVLHyperparameters(OfflineHyperparameters):
     algo: Literal["gcivl"] = "gcivl"
     """algorithm"""
     expectile: Ratio = 0.9
-    """expectile tau of the values"""
+    """expectile of the values, tau in the paper"""
     alpha: Weight = 10.0
     """inverse temperature of the weights of imitated actions"""
 
@@ -63,6 +65,8 @@ class GCIVL(OfflineAgent):
         x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * self.target_value(x_next)  # (2, n)
+            # The paper has one value. As in OGBench, each of two values regresses to
+            # its own target, and both share the sign of this advantage.
             advantage = q.amin(0) - self.target_value(x).mean(0)
         diff = q - self.value(x)
         return expectile_loss(diff, advantage, self.hp.expectile).sum(0).mean()

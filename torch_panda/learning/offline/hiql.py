@@ -1,7 +1,7 @@
 """Hierarchical implicit Q-learning, HIQL (arXiv 2307.11949).
 
-The high-level policy names a waypoint that should be reached k steps later, as a
-representation z = phi(s, w), and the low-level policy acts towards it. Both imitate the
+The high-level policy names a waypoint w, to be reached k steps later, by its
+representation z = phi(s, w). The low-level policy acts towards it. Both imitate the
 data in proportion to exp(alpha * advantage), with the action-free values of GCIVL.
 
 The paper's goals are states, so one value function judges waypoints and goals. Here a
@@ -46,7 +46,7 @@ class HIQLHyperparameters(OfflineHyperparameters):
     algo: Literal["hiql"] = "hiql"
     """algorithm"""
     expectile: Ratio = 0.7
-    """expectile tau of the values"""
+    """expectile of the values, tau in the paper"""
     high_alpha: Weight = 3.0
     """inverse temperature of the weights of imitated waypoints"""
     low_alpha: Weight = 3.0
@@ -67,11 +67,17 @@ class HIQL(OfflineAgent):
         super().__init__(spaces, hp)
         inputs, hidden_size = len(self.normalizer.mean), hp.hidden_size
         state_size = len(self.normalizer.state_columns)
-        # phi([s; w]), with values and target values of waypoints.
+        # phi([s; w]), the values of waypoints and of goals, and targets of all three.
         self.phi = make_gelu_mlp(2 * state_size, hp.rep_dim, hidden_size)
         self.waypoint_value = Ensemble(state_size + hp.rep_dim, hidden_size)
         self.goal_value = Ensemble(inputs, hidden_size)
-        self.online = nn.ModuleList([self.phi, self.waypoint_value, self.goal_value])
+        self.online = nn.ModuleDict(
+            {
+                "phi": self.phi,
+                "waypoint_value": self.waypoint_value,
+                "goal_value": self.goal_value,
+            }
+        )
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         # pi^h(z | s, g) and pi^l(a | s, z).
         self.high_actor = Actor(self.normalizer, hp.rep_dim, hidden_size)
@@ -83,7 +89,7 @@ class HIQL(OfflineAgent):
         )
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
-        """Draw waypoints and goals of both policies, and waypoints of the values.
+        """Draw the high level's goal, and waypoints of both policies and the values.
 
         Row t of the data leads to the state s_t+1, so the state k steps after s_t is
         s' of row t + k - 1. No waypoint lies beyond its goal or the end of its episode.
@@ -96,7 +102,8 @@ class HIQL(OfflineAgent):
         else:
             goal_row = draw_geometric_rows(t, last, self.hp.discount)
         waypoint_row = t + self.hp.subgoal_steps - 1
-        # Of the values: this, a discounted later or a random state, as for goals.
+        # The waypoint of the values is s' of this row, a later s' (with probability
+        # proportional to discount**k), or a random s', in the ratios of VALUE_GOALS.
         geometric = draw_geometric_rows(t, last, self.hp.discount)
         random = torch.randint(len(data), t.shape)
         weights = torch.tensor([*VALUE_GOALS.values()])
@@ -126,11 +133,11 @@ class HIQL(OfflineAgent):
 
     def represent(self, phi: nn.Module, s: Tensor, w: Tensor) -> Tensor:
         """phi([s; w]) with the length sqrt(rep_dim), (n, rep_dim)."""
-        return with_unit_variance(phi(s, self.normalizer.state(w)))
+        return with_length_sqrt_n(phi(s, self.normalizer.state(w)))
 
     def goal_value_loss(self, b: Batch) -> Tensor:
         """Action-free expectile regression of V(s, g) (eq. 4)."""
-        value, target = self.goal_value, self.target[2]
+        value, target = self.goal_value, self.target["goal_value"]
         x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * target(x_next)  # (2, n)
@@ -142,7 +149,7 @@ class HIQL(OfflineAgent):
         self, s: Tensor, s_next: Tensor, w: Tensor, is_at_w: Tensor
     ) -> Tensor:
         """The same for V(s, phi(s, w)), which trains phi (section 5.2)."""
-        phi, value, _ = self.target
+        phi, value = self.target["phi"], self.target["waypoint_value"]
         with torch.no_grad():
             v_next = value(s_next, self.represent(phi, s_next, w))
             # -1 per step, until s' is the waypoint: then 0, and the return ends.
@@ -193,7 +200,7 @@ class HierarchicalActor(nn.Module):
 
     def forward(self, s: Tensor, g: Tensor) -> Tensor:
         """The mean action, (..., action size)."""
-        z = with_unit_variance(self.high_actor(s, g))
+        z = with_length_sqrt_n(self.high_actor(s, g))
         return self.low_actor(self.normalizer.state(s), z)
 
 
@@ -203,6 +210,6 @@ def draw_geometric_rows(t: Tensor, last: Tensor, discount: float) -> Tensor:
     return t + torch.from_numpy(steps)
 
 
-def with_unit_variance(z: Tensor) -> Tensor:
+def with_length_sqrt_n(z: Tensor) -> Tensor:
     """Scale vectors (..., n) to the length sqrt(n)."""
     return z * (sqrt(z.shape[-1]) / z.norm(dim=-1, keepdim=True).clamp(min=1e-6))

@@ -3,7 +3,8 @@
 The cost of going from a state to a goal is a quasimetric: it satisfies the triangle
 inequality, but need not be symmetric. QRL learns the largest quasimetric d in which
 every observed step costs at most 1. That is the optimal cost, because paths of steps
-bound d from above. d is an interval quasimetric embedding, IQE (arXiv 2211.15120). The
+bound d from above. A Lagrange multiplier lambda, which is learned too, enforces the
+bound on steps. d is an interval quasimetric embedding, IQE (arXiv 2211.15120). The
 policy descends d through a learned model of the dynamics, and imitates the data.
 
 The paper's goals are states. Here a goal is a part of a state, so goals have an encoder
@@ -32,16 +33,22 @@ from torch_panda.learning.offline.base import (
 from torch_panda.learning.spaces import Spaces
 
 INTERVALS = 8  # of each component of the quasimetric
-EPSILON = 0.25  # accepted root mean square of costs above 1 (appendix)
-LAMBDA_LEARNING_RATE = 0.01  # of the multiplier (appendix)
-# Distances beyond the offset are hardly pushed further. It should exceed most costs,
-# which are below the 50 steps of an episode here; beta is the slope's sharpness.
+# As in the paper's code: root mean square by which the cost of a step may exceed 1, and
+# the learning rate of lambda.
+EPSILON = 0.25
+LAMBDA_LEARNING_RATE = 0.01
+# Pairs are pushed apart by softplus(OFFSET - d, BETA): with slope 1 far below OFFSET,
+# and hardly beyond it. OFFSET should exceed most costs, which are below the 50 steps of
+# an episode here.
 OFFSET, BETA = 50.0, 0.1
 
 
 @dataclass
 class QRLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of QRL, by default OGBench's for its noisy cube tasks."""
+    """Hyperparameters of QRL.
+
+    The weight is OGBench's for its noisy cube tasks. The quasimetric is half as large.
+    """
 
     algo: Literal["qrl"] = "qrl"
     """algorithm"""
@@ -105,13 +112,16 @@ class QRL(OfflineAgent):
         }
 
     def dynamics_loss(self, z: Tensor, a: Tensor, z_next: Tensor) -> Tensor:
-        """Distance of z + T(z, a) from z', both ways (section 3.3)."""
+        """Distance of z + T(z, a) from z', both ways (section 3.4).
+
+        This loss also trains the encoder and the quasimetric.
+        """
         predicted = z + self.dynamics(z, a)
         distance = self.quasimetric(predicted, z_next)
         return (distance + self.quasimetric(z_next, predicted)).mean() / 2
 
     def actor_loss(self, b: Batch) -> Tensor:
-        """Descend d(z + T(z, pi(s, g)), g) (section 3.3), and imitate as OGBench."""
+        """Descend d(z + T(z, pi(s, g)), g) (section 3.4), and imitate as OGBench."""
         mean = self.actor(b.s, b.g_actor)
         with torch.no_grad():
             z, goal = self.encode_state(b.s), self.encode_goal(b.g_actor)
@@ -133,7 +143,10 @@ class IQE(nn.Module):
         self.mixture = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        """Distances from x to y, (..., components * INTERVALS) each: (...)."""
+        """Distances from x to y, (...).
+
+        The arguments have the shape (..., components * INTERVALS).
+        """
         x, y = (values.unflatten(-1, (-1, INTERVALS)) for values in (x, y))
         # From the lowest start on, an interval adds its part beyond the ends so far.
         start, order = x.sort(dim=-1)
