@@ -24,8 +24,7 @@ class Net(MLP):
 
     def forward(self, *inputs: Tensor) -> Tensor:  # type: ignore[override]
         """(..., 6), (..., 3) and, for the critic, (..., 3) to (..., 3) or (..., 1)."""
-        observation, goal, *action = inputs  # torchrl types them as tuples
-        return super().forward(10 * observation, 10 * goal, *action)  # type: ignore
+        return super().forward(*(10 * x for x in inputs[:2]), *inputs[2:])
 
 
 inputs = ["observation", "desired_goal"]

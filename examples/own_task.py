@@ -48,7 +48,7 @@ class PushBall(torch_panda.Task):
         """The ball's position: (num_envs, 3)."""
         return simulation.object_pose[:, 0, :3]
 
-    # The rest are optional overrides. Leaving them out costs no time.
+    # The remaining methods are optional.
 
     def randomize(
         self, client: PhysicsClient, bodies: Bodies, rng: np.random.Generator

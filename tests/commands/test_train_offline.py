@@ -69,7 +69,7 @@ def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
         refine.main(refine.Args(policy=out, out=tmp_path / "refined"))
 
 
-@pytest.mark.parametrize("algo", OFFLINE_AGENTS)
+@pytest.mark.parametrize("algo", ["hiql", "qrl"])  # the two with most state
 def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo):
     args = make_args(tmp_path / "whole", algo)
     whole = train.make_run(args, args.out)

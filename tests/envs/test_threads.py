@@ -125,7 +125,7 @@ def test_threads_share_one_scratch_directory(monkeypatch):
         time.sleep(0.1)
         return tempfile.TemporaryDirectory()
 
-    monkeypatch.setattr(urdf, "_scratch", make_slowly)
+    monkeypatch.setattr(urdf, "_process_folder", make_slowly)
     with ThreadPoolExecutor(4) as threads:
         folders = list(threads.map(lambda _: urdf.make_scratch_folder(), range(4)))
     gc.collect()
@@ -146,14 +146,14 @@ def test_every_call_is_refused_while_another_thread_is_inside(monkeypatch, call)
             "get_state": env.get_state,
             "close": env.close,
         }
-        observation = env.robot.observation
+        observe = env.episodes._observe
 
-        def wait(simulation):
+        def wait(*arguments):
             is_in.set()
             assert may_leave.wait(60)
-            return observation(simulation)
+            return observe(*arguments)
 
-        monkeypatch.setattr(env.robot, "observation", wait)
+        monkeypatch.setattr(env.episodes, "_observe", wait)
         thread = threading.Thread(target=env.step, args=(td.clone(),))
         thread.start()
         assert is_in.wait(60)

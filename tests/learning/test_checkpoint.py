@@ -32,7 +32,7 @@ def train_whole(args, out):
     return run.agent.state_dict(), rows
 
 
-def kill(*arguments):
+def kill(*arguments, **options):
     raise Kill
 
 

@@ -93,7 +93,9 @@ def test_a_state_with_numbers_that_are_not_finite_is_not_resumed(tmp_path):
 WRITERS = {
     "numbers.pt": lambda path: files.save(path, torch.zeros(100_000)),
     "text.txt": lambda path: files.save_text(path, "x" * 100_000),
-    "curve.png": lambda path: plot_curve([{"step": 0, "success": 0}], "Reach", path),
+    "curve.png": lambda path: plot_curve(
+        [{"step": 0, "success": 0}], "Reach", path, steps="steps"
+    ),
     "args.json": lambda path: write_options(path.parent, Args(), Args()),
 }
 

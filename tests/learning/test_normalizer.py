@@ -5,7 +5,7 @@ import torch
 
 import torch_panda
 from torch_panda.learning.geometry import read_geometry
-from torch_panda.learning.normalizer import CLIP_NORMALIZED, FINE, Normalizer
+from torch_panda.learning.normalizer import CLIP_NORMALIZED, FINE_LIMIT, Normalizer
 from torch_panda.learning.spaces import read_spaces
 
 
@@ -24,7 +24,7 @@ def test_relative_inputs():
         differences = read_geometry(env).differences(observation, goal)
     torch.testing.assert_close(plain, torch.cat((observation, goal), -1))
     torch.testing.assert_close(coarse, torch.cat((plain, differences), -1))
-    clipped = differences.clamp(-FINE, FINE)
+    clipped = differences.clamp(-FINE_LIMIT, FINE_LIMIT)
     assert 0 < (clipped != differences).sum() < differences.numel()
     torch.testing.assert_close(fine, torch.cat((coarse, clipped), -1))
 

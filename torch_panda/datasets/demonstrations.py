@@ -44,12 +44,13 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         try:
             # (n,), or [episodes, steps] of the kinds other than expert.
             shape = content["action"].shape[:-1]
-            demos = TensorDict(content, shape).select(*STORED_KEYS).reshape(-1)
+            demos = TensorDict(content, shape).select(*STORED_KEYS)
         # Lengths or types differ.
         except (AttributeError, RuntimeError, TypeError) as error:
             raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
+    demos = demos.reshape(-1)
     for key in ("observation", "action", "desired_goal"):
         expected = env.full_observation_spec.get(key, None)
         size = (env.action_spec if expected is None else expected).shape[-1]
