@@ -22,9 +22,9 @@ test_env = torch_panda.make("PandaReach-v1", num_envs=50, seed=1)
 class Net(MLP):
     """An MLP of observation, goal and action. Positions enter in decimetres."""
 
-    def forward(self, *inputs: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(self, *x: Tensor) -> Tensor:  # type: ignore[override]
         """(..., 6), (..., 3) and, for the critic, (..., 3) to (..., 3) or (..., 1)."""
-        return super().forward(*(10 * x for x in inputs[:2]), *inputs[2:])
+        return super().forward(10 * x[0], 10 * x[1], *x[2:])  # type: ignore[arg-type]
 
 
 inputs = ["observation", "desired_goal"]

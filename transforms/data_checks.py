@@ -185,10 +185,10 @@ class DataCheck:
 
         The desired goal is constant in each episode. An affine function has 2 *
         goal_dim + 1 coefficients per column. While no object moves, the
-        achieved goal is constant too. Then a function fits every column that is
-        constant in each episode, if there are at most 2 * goal_dim + 1 distinct desired
-        goals, so the check waits for more goals. Then it refuses a column if an affine
-        function fits it, with three exceptions:
+        achieved goal is also constant within each episode. With at most 2 * goal_dim +
+        1 distinct desired goals, some affine function then fits any column that is
+        constant within each episode, so the check waits for more goals. Then it refuses
+        a column if an affine function fits it, with three exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.

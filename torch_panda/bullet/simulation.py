@@ -205,8 +205,8 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # A step with another control ran in Python threads. If a second Ctrl-C
-                # interrupted it, they may still run.
+                # An earlier step, with another kind of control, may have run in Python
+                # threads. If a second Ctrl-C interrupted that step, they may still run.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -214,8 +214,8 @@ class VectorSimulation:
             client = self._clients[env]
             control(client, self.scene.robot, setpoint[env])
             if isinstance(control, MotorControl):
-                # A torque acts in one time step only, so `advance` applies the torques
-                # before each time step.
+                # Bullet applies a torque in one substep only, so `advance` sets the
+                # torques again before each substep.
                 control.advance(
                     client, self.scene.robot, setpoint[env], self.n_substeps
                 )

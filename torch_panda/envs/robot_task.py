@@ -59,9 +59,8 @@ class RobotTaskEnv(EnvBase):
     inside raises `BulletError`.
 
     The state of Bullet cannot be copied, so a pickle holds only the class, the
-    arguments, and the seed that was last given to all environments together. An
-    unpickled environment builds its own clients and starts with the first episode of
-    this seed.
+    arguments, and the seed of the constructor or of the last `set_seed`. An unpickled
+    environment builds its own clients and starts with the first episode of this seed.
 
     ``state_dict`` holds the seeds and the episode numbers, but not the state of the
     running episodes. After `load_state_dict`, the next reset starts the episode that
@@ -585,7 +584,7 @@ class RobotTaskEnv(EnvBase):
         """Write a start into the caller's tensordict, as in torchrl.
 
         torchrl's own method also adds missing ``done`` entries and checks that no
-        episode is done at its start. These entries are never missing here, and no start
+        episode is done at its start. The new start always has these entries, and none
         is done. The extra work would take as long as the rest of the method.
         """
         if tensordict is None or tensordict._get_str("done", None) is None:

@@ -28,14 +28,19 @@ WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0395
 CATCH = 0.034  # distance that stops a swing; a smaller one squeezes the cube out [m]
 LOOSEN, STAY = 0.0012, -0.001  # actions that loosen the grasp and keep it loose
 ASIDE = 0.014  # offset of the grasp from the centre, so that the cube swings [m]
-LAG = 0.004  # shift of the grasp towards -x in the arm's first step upwards [m]
+# The arm's first step upwards shifts the grasp towards -x by this distance [m], which
+# the grasp must anticipate.
+LAG = 0.004
 CLEAR, LIFTED = 0.035, 0.075  # heights at which the grasp loosens, and of the swing [m]
 LOST = 0.025  # distance of the cube below the fingers at which it nearly falls [m]
-TILT = 0.15  # largest tilt of a cube that can swing without being straightened [rad]
+# Largest angle from the nearest straight orientation, about any axis, at which a cube
+# can swing without being straightened first [rad].
+TILT = 0.15
 TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
 SUCCESS, DONE = 0.2, 0.17  # distances at which the task succeeds, and the hand stops
-# Costs of a plan: each quarter turn about y and z, the last swing, the distance that it
-# leaves, and the part of this distance above `GOOD`. A plan that fails costs 1 more.
+# Costs of a plan: each quarter turn about y, each about z, a swing as the last move,
+# the distance to the goal after the plan, and the part of this distance above `GOOD`,
+# or above `GOOD_LYING` if no swing comes last. A plan that fails costs 1 more.
 PITCH_COST, YAW_COST, SWING_COST, LEFT_COST, MISS_COST = 0.3, 0.15, 0.1, 0.2, 6.0
 GOOD, GOOD_LYING = 0.15, 0.13
 # Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
@@ -68,11 +73,14 @@ class Plan(NamedTuple):
     """A plan for a cube.
 
     Attributes:
-        lying: Straight orientation in which the cube lies, or will lie, (..., 4).
+        lying: Orientation in which the hand catches the cube, now or during or after
+            its spin, rounded to a straight one (edges parallel to the world's axes),
+            (..., 4).
         pitch: Quarter turns about y, which come first, (..., 1).
         yaw: Quarter turns about z, which follow, (..., 1).
         swing: Whether a swing comes last, (..., 1).
-        stops: Whether the cube has ``lying`` after its spin, not during it, (..., 1).
+        stops: Whether the hand waits until the spin ends before it catches the cube,
+            (..., 1).
     """
 
     lying: Tensor
@@ -129,13 +137,16 @@ def tap(
 ) -> Tensor:
     """Knock a corner of the cube with a finger, towards the middle of the table."""
     x, y, z = position.split(1, -1)
-    ahead = torch.where(y > 0, -1.0, 1.0)
-    ready = torch.cat((x + yaw.sign() * ahead * TAP_ASIDE, y, 0 * z + 0.02), -1)
+    towards_middle = torch.where(y > 0, -1.0, 1.0)  # sign of the knock along y
+    ready = torch.cat(
+        (x + yaw.sign() * towards_middle * TAP_ASIDE, y, 0 * z + 0.02), -1
+    )
     error = ready - ee
     around = (error[..., :1].abs() < 0.005) & (error[..., 1:2].abs() < 0.03)
     around = around & ((error[..., 2:] - 0.002).abs() < 0.012) & (width > 0.07)
     speed = torch.where(yaw.abs() > 1, table.half, table.quarter)
-    knock = torch.cat((GAIN * error[..., :1], speed * ahead, GAIN * error[..., 2:]), -1)
+    sideways = speed * towards_middle
+    knock = torch.cat((GAIN * error[..., :1], sideways, GAIN * error[..., 2:]), -1)
     action = torch.where(around, knock, descend(ee, ready))
     return torch.cat((action, open_to(width, WIDE)), -1)
 

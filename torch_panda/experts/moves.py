@@ -48,13 +48,14 @@ def go_over(
     Args:
         position: Present position, (..., 3).
         point: Point to reach, (..., 3).
-        clearance: Height above the point at which the way leads to it [m].
+        clearance: Height above the point [m] at which the hand travels until it is
+            almost over the point.
         limit: Largest length of the action.
     """
     offset = point - position
     height = (2 * (norm(offset[..., :2]) - 0.01)).clamp(0.0, clearance)
     rise = offset[..., 2:] + height
-    # Move sideways only as far as the hand is high enough: 0 below, 1 at the height.
+    # Share of the sideways motion: 1 at the wanted height, 0 if 5 cm or more below it.
     sideways = (1 - rise / 0.05).clamp(0.0, 1.0)
     return move(torch.cat((offset[..., :2] * sideways, rise), -1), limit)
 

@@ -9,7 +9,8 @@ from torch import Tensor
 from torch_panda.experts.moves import go_over, norm, unit
 from torch_panda.rotations import dot
 
-# Reach of the closed fingers from the end-effector along x and y, and the puck [m].
+# How far the closed fingers extend from the end-effector along x and along y, and the
+# radius of the puck [m].
 FINGERS_X, FINGERS_Y, PUCK_RADIUS = 0.008, 0.0217, 0.029
 STRIKE_GAP = 0.014  # distance between fingers and puck before the strike [m]
 STRIKE_HEIGHT = 0.02  # height of the end-effector in the strike [m]

@@ -38,11 +38,11 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     def upper_crowds(point: Tensor) -> Tensor:
         return ((upper - point)[..., :2].abs() < room).all(-1, True)
 
-    # Push the upper cube away from this point, along x or along y.
+    # Push the upper cube away from the point that it crowds, along x or along y.
     crowded = torch.where(upper_crowds(lower) | placed, lower, goal)
     apart = (upper - crowded)[..., :2]
     along_x = apart[..., :1].abs() > apart[..., 1:].abs()
-    # `push_to` may leave the cube 3 cm short of this point.
+    # Aim 3 cm too far, because `push_to` may stop the cube 3 cm before its target.
     sign = torch.where(apart < 0, -1.0, 1.0)
     side = crowded[..., :2] + sign * apart.new_tensor((0.1, 0.125))
     x, y, z = upper.split(1, -1)
@@ -58,7 +58,7 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     blocked = upper_crowds(crowded) & ~(is_holding | placed & on_top)
     action = torch.where(placed, finish, carry(ee, width, lower, goal))
     action = torch.where(blocked, torch.where(leave, rise, clear), action)
-    # Leave two cubes at their goals alone.
+    # If both cubes are at their goals, do not touch them any more.
     done = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.03
     hold = torch.cat((0 * ee, torch.where(upper_held, -1.0, 0.0)), -1)
     return torch.where(done, hold, action)

@@ -146,7 +146,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
         else None,
         positions=(0, *objects),
         goal_positions=tuple(start for _, start in positions),
-        goal_height=task.drawn_goal_height,
+        goal_height=task.sampled_goal_height,
         orientation=rotations[0][0].start if rotations else None,
     )
 

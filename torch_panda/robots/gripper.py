@@ -45,8 +45,8 @@ class Gripper:
         opened = torch.tensor(self.opened, dtype=double, device="cpu")
         if closed.shape != opened.shape or not (closed != opened).any():
             raise ValueError(
-                f"closed and opened must hold the same joints, of which one moves, "
-                f"got {self.closed} and {self.opened}"
+                "closed and opened must have the same length and differ in at least "
+                f"one position, got {self.closed} and {self.opened}"
             )
         if not self.width > 0:
             raise ValueError(f"width must be above 0 [m], got {self.width}")

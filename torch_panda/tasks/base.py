@@ -129,7 +129,8 @@ class Task(Configured, ABC):
     goal_entries: ClassVar[GoalEntries | None] = None
     """Where the observation holds the achieved goal; None if it does not.
 
-    `RobotTaskEnv.goal_indices` and ``goal="observation"`` need it. A subclass that
+    `RobotTaskEnv.goal_indices` needs it, and so does the environment's option
+    ``goal="observation"``, which makes full observations the goals. A subclass that
     overrides `observation` or `achieved_goal` must declare it again."""
 
     observation_layout: ClassVar[tuple[Quantity, ...] | None] = None
@@ -137,8 +138,9 @@ class Task(Configured, ABC):
 
     Relative inputs and data augmentation in training need it, and ``goal_entries`` too.
     The position of each object must precede its other quantities."""
-    drawn_goal_height: ClassVar[float | None] = None
-    """Height of all sampled goals [m], if objects come to rest below it; else None."""
+    sampled_goal_height: ClassVar[float | None] = None
+    """Height of all sampled goals [m], in a task whose objects sink below this height
+    before they rest, as in Slide. None in all other tasks."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05

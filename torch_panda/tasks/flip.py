@@ -96,7 +96,8 @@ class Flip(Task):
         position = torch.zeros_like(goal[:, :3])
         upwards = goal.new_tensor((0.0, 0.0, 1.0))
         inverse = goal * goal.new_tensor((-1.0, -1.0, -1.0, 1.0))
-        # The table's normal in the cube's frame: its 1-norm is the corner's distance.
+        # In the cube's frame, the 1-norm of the table's normal is the height of the
+        # centre above the lowest corner, in half edge lengths.
         normal = rotate(inverse, upwards)
         position[:, 2] = CUBE_SIZE / 2 * normal.abs().sum(dim=1)
         return objects._replace(pose=torch.cat((position, goal), dim=1).unsqueeze(1))

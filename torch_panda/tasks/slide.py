@@ -48,7 +48,7 @@ class Slide(Task):
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = OBJECT_LAYOUT
-    drawn_goal_height = PUCK_START_HEIGHT
+    sampled_goal_height = PUCK_START_HEIGHT
 
     goal_xy_range: float = 0.5
     goal_x_offset: float = 0.51

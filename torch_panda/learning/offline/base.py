@@ -59,9 +59,9 @@ class OfflineHyperparameters:
     """goals of policies: achieved later in the episode, with equal probabilities as in
     OGBench ("future"), or sooner ones more often, by the discount ("geometric")"""
     relative_inputs: RelativeInputs = "fine"
-    """further inputs of the networks: offsets of objects from the hand, and of goals
-    from objects ("coarse"); in addition a copy of these offsets that is clipped at 3
-    cm, in which millimetres are large after standardisation ("fine")"""
+    """further inputs of the networks: "coarse" adds the offsets of objects from the
+    hand, and of goals from objects. "fine" also adds these offsets clipped at 3 cm, so
+    that millimetres are large after standardisation"""
 
 
 class Batch(NamedTuple):

@@ -47,7 +47,8 @@ OFFSET, BETA = 50.0, 0.1
 class QRLHyperparameters(OfflineHyperparameters):
     """Hyperparameters of QRL.
 
-    The weight is OGBench's for its noisy cube tasks. The quasimetric is half as large.
+    `alpha` is OGBench's for its noisy cube tasks, and `num_components` is half of
+    OGBench's.
     """
 
     algo: Literal["qrl"] = "qrl"
