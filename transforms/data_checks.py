@@ -233,7 +233,8 @@ class DataCheck:
                 if self.shapes is not None:
                     raise ValueError(message)
                 hint = (
-                    "; or make the transform with from_env, if the task has this entry"
+                    "; or make the transform with from_env, which accepts the entry if "
+                    "the environment itself returns it"
                 )
                 self._warn(f"it seems that {message}{hint}", f"computed {key}")
                 break
