@@ -147,8 +147,9 @@ def test_keys_draw_independently():
 def test_slices_share_goals():
     sampler = SliceSampler(slice_len=4, traj_key=("collector", "traj_ids"))
     rb = buffer(GoalSampler(ALL, reward_fn, unit="slice"), sampler=sampler)
-    # In 7 steps no slice of 4 can follow another one, which would join both.
-    rb.extend(name_goals(Envs(4, [7]).chunk(32)).reshape(-1))
+    # Slices of 4 start at steps 0 to 2 and end at steps 3 to 5 of 6, so no slice begins
+    # where another one ends, which would join both.
+    rb.extend(name_goals(Envs(4, [6]).chunk(32)).reshape(-1))
     slices = rb.sample().reshape(-1, 4)
     for key in ALL:
         expected = slices["next", "achieved_goal"][:, -1:] if key[:3] == "cur" else None
