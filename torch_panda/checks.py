@@ -89,7 +89,7 @@ def check_choice(name: str, value: object, choices: Collection[object]) -> None:
     """Check that an argument is one of several values.
 
     Raises:
-        ValueError: The argument is none of these values.
+        ValueError: The argument is not one of these values.
     """
     if value not in choices:
         raise ValueError(f"{name} must be one of {tuple(choices)}, got {value!r}")

@@ -1,4 +1,4 @@
-"""Logs of training runs: what they hold, and that a resumed run continues them."""
+"""Tests of training logs: their values, and logs that a resumed run continues."""
 
 import csv
 
@@ -16,7 +16,7 @@ def make_args(out, **options):
 
 
 class Recorder:
-    """In place of a logger of torchrl: remembers what it is asked to do."""
+    """Replaces a torchrl logger and records the calls of its methods."""
 
     def __init__(self, name, *arguments, **options):
         self.name, self.options, self.experiment = name, options, self

@@ -1,4 +1,4 @@
-"""Offline agents: their losses, the goals that they draw, and what they learn."""
+"""Tests of the offline agents: losses, sampled goals and learned policies."""
 
 import math
 

@@ -154,7 +154,8 @@ struct gripper { /* Gripper of gripper.py, if it has two joints */
     double weights[2], offset, closed[2], per_width[2];
 };
 
-/* What Robot.setpoint computes. A setpoint has the targets, then the other joints. */
+/* Data from which the library computes Robot.setpoint. A setpoint has the targets of the
+   hand or the arm, then those of the fingers. */
 struct actuation {
     int row_size;
     int column, num_displaced; /* numbers in the row that an action displaces */

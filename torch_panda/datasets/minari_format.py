@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch_panda import RobotTaskEnv
 
 OBSERVED = ("observation", "achieved_goal", "desired_goal")
-# What acted, by the kind of the data.
+# Description of the policy that chose the actions, for each kind of data.
 ALGORITHMS = {
     "expert": "the scripted expert of torch_panda.experts",
     "noisy": "the scripted expert of torch_panda.experts, with noise",

@@ -60,10 +60,10 @@ class Randomization:
             contact, Bullet multiplies the frictions of the two bodies.
         table_friction: Lateral friction of the table and all other fixed bodies.
         finger_friction: Lateral friction of the robot's ``finger_links``.
-        object_restitution: Restitution of all objects. Where the nominal value is 0,
-            which is Bullet's default, the drawn number is the restitution itself. This
-            range also gives the table and all other fixed bodies a restitution of 1,
-            because Bullet multiplies the restitutions of the two bodies in contact.
+        object_restitution: Restitution of all objects. If the nominal value is 0
+            (Bullet's default), the drawn number replaces it instead of multiplying it.
+            This range also gives the table and all other fixed bodies a restitution of
+            1, because Bullet multiplies the restitutions of the two bodies in contact.
         joint_damping: Damping of the robot's joints. Where the nominal value is 0, as
             in the Panda, the drawn number is the damping itself [N m s/rad].
         gravity: Gravity of the world.

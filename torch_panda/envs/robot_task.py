@@ -293,8 +293,8 @@ class RobotTaskEnv(EnvBase):
             or tensordict._get_str("next", None) is not None
         ):
             return super().step(tensordict)
-        # The result is complete already, so skip the checks of torchrl's own step, and
-        # those of `TensorDict.set`, which take as long as the rest of this function.
+        # The result is complete already. Skip the checks of torchrl's own step and of
+        # `TensorDict.set`, which together take as long as the rest of this function.
         return tensordict._set_str(
             "next", self._step(tensordict), inplace=False, validated=True
         )
@@ -438,7 +438,7 @@ class RobotTaskEnv(EnvBase):
 
         Args:
             envs: Index or indices of the environments; None means all.
-            camera: The camera; None means `Camera`'s defaults, which are panda-gym's.
+            camera: The camera; None means a `Camera` with panda-gym's defaults.
             size: Height and width of the picture [pixels], or both in one number; None
                 means the camera's.
 

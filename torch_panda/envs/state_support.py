@@ -13,7 +13,7 @@ _RESOLVE_CODE = EnvBase._resolve_set_state.__code__
 
 @dataclass(frozen=True)
 class StateSupport:
-    """What ``_supports_set_state`` of an environment returns: true, or an error.
+    """The answer of ``_supports_set_state``. Its truth test is true or raises an error.
 
     torchrl asks an environment whether its resets may start from a state. The wrappers
     `TransformedEnv`, `SerialEnv` and `ParallelEnv` give the answer of the environment

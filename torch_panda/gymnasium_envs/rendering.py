@@ -38,8 +38,8 @@ def take_camera(
     """Separate the camera arguments of panda-gym from other arguments.
 
     Args:
-        camera: The camera that these arguments change; None means `Camera`'s defaults,
-            which are panda-gym's.
+        camera: The camera that these arguments change; None means a `Camera` with
+            panda-gym's defaults.
         arguments: Keyword arguments, among them ``render_width``, ``render_height``,
             ``render_target_position``, ``render_distance``, ``render_yaw``,
             ``render_pitch`` or ``render_roll``.

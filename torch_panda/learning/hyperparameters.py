@@ -46,7 +46,7 @@ class Hyperparameters:
     relative_inputs: RelativeInputs = "none"
     """additional inputs of the networks: "coarse" adds the offsets from the hand to
     objects and from objects to goals; "fine" also adds these offsets clipped at 3 cm,
-    which shows differences of millimetres"""
+    so that differences of millimetres count"""
     fine_fingers: bool = False
     """let networks and noise work with the cube root of the fingers' action, which
     makes differences of 0.1 mm visible"""

@@ -63,7 +63,7 @@ def log_row(logger: Logger, row: Mapping[str, float]) -> None:
 
 
 def close_logger(logger: Logger) -> None:
-    """Write what is still to be written."""
+    """Write all remaining values and close the log."""
     if isinstance(logger, WandbLogger):
         logger.experiment.finish()
     else:

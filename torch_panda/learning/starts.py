@@ -73,8 +73,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
                 f"PickAndPlace, Slide, Stack and Flip, got {env_id}: pass "
                 "--start-at-object 0"
             )
-        # The columns at which positions start in an observation: that of the hand, then
-        # those of the objects.
+        # The first column of each position in an observation: of the hand (not needed
+        # here), then of each object.
         _, *columns = geometry.positions
         last = columns[-1]
         # For each situation, the column of the object to which the hand moves.

@@ -28,7 +28,7 @@ LONGEST_ARROW = 0.12  # [m]
 
 
 class Frame(NamedTuple):
-    """What the page shows of an environment at one step; see `WebBodies.show`.
+    """State of an environment at one step, which the page shows (`WebBodies.show`).
 
     Attributes:
         joint_position: Positions of the robot's joints.

@@ -1,5 +1,5 @@
 /*
- * Those structs of Bullet that the solver reads or writes.
+ * Structs of Bullet that the solver reads or writes.
  *
  * These declarations were written for this package. They name only the fields that it
  * uses; the bytes between are padding. The offsets are those of pybullet 3.2.7 on

@@ -88,8 +88,8 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         solver.set_mode(FOLLOW)
     if counts.bullet_groups or not counts.groups:
         raise GateError("the packed solver did not solve all groups of the self-test")
-    # Some rows are Bullet's even with the replacement: the first rows of a joint, and
-    # those for which Bullet has to enlarge an array.
+    # Bullet still creates some rows: the first rows of a joint, and rows for which it
+    # must enlarge an array.
     if counts.joints <= counts.bullet_joints or not counts.manifolds:
         raise GateError("the packed solver did not create the rows of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):

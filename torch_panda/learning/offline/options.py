@@ -15,7 +15,7 @@ KINDS = ("noisy", "play", "random")  # of `torch_panda.datasets.generate`
 
 @dataclass
 class OfflineArgs(OfflineHyperparameters):
-    """What to learn from which data, how long, and where to write."""
+    """Options of offline training: algorithm, data, duration and folder."""
 
     algo: str = "gcivl"
     """algorithm"""
