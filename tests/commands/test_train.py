@@ -1,6 +1,5 @@
 """The training example: it learns something, writes its files, stops and resumes."""
 
-import csv
 import json
 import os
 import signal
@@ -14,6 +13,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from tests.commands.runs import After, read_curve
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import training
@@ -22,22 +22,6 @@ from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")
-
-
-class After:
-    """A stop signal: true from the n-th question on."""
-
-    def __init__(self, number):
-        self.left = number
-
-    def __bool__(self):
-        self.left -= 1
-        return self.left < 0
-
-
-def read_curve(folder):
-    with (folder / "curve.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def weights(run):

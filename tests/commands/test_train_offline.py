@@ -1,6 +1,5 @@
 """``train --offline`` writes its files, stops, resumes and explains errors."""
 
-import csv
 import json
 from dataclasses import fields, replace
 
@@ -8,6 +7,7 @@ import pytest
 import torch
 
 import torch_panda
+from tests.commands.runs import After, read_curve
 from torch_panda.commands import evaluate, plot, refine, train
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -18,25 +18,9 @@ pytestmark = pytest.mark.usefixtures("quick")
 SMALL = {"hidden_size": 32, "batch_size": 64, "num_envs": 4, "video": False}
 
 
-class After:
-    """A stop signal: true from the n-th question on."""
-
-    def __init__(self, number):
-        self.left = number
-
-    def __bool__(self):
-        self.left -= 1
-        return self.left < 0
-
-
 def make_args(out, algo="gcbc", **options):
     options = {**SMALL, "transitions": 400, "total_steps": 6, **options}
     return make_args_class(algo)(out=out, eval_interval=4, **options)
-
-
-def read_curve(folder):
-    with (folder / "curve.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def state(run):

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 import torch_panda
-from tests.commands.test_train import After
+from tests.commands.runs import After
 from torch_panda.commands.train import make_run
 from torch_panda.datasets.demonstrations import read_demos
 from torch_panda.learning import pretraining

@@ -123,10 +123,7 @@ class Refinement:
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
         if len(progress.curve) > 1:
             return True
-        if not progress.curve:
-            checkpoint.save()
-            self.curve.add(progress)  # the policy before refinement
-            checkpoint.save()
+        self.curve.begin(checkpoint)
         self.play(stop)
         checkpoint.save()
         if stop:

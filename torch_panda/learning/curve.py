@@ -9,7 +9,7 @@ from torchrl.record.loggers import Logger
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
-from torch_panda.learning.checkpoint import Progress
+from torch_panda.learning.checkpoint import Checkpoint, Progress
 from torch_panda.learning.evaluation import (
     evaluate_episodes,
     evaluate_fixed_starts,
@@ -52,6 +52,18 @@ class Curve:
         self.steps = "gradient steps" if offline else "environment steps"
         self.tasks = evaluation_tasks(env_id) if offline else {}
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
+
+    def begin(self, checkpoint: Checkpoint) -> None:
+        """Evaluate the policy of a new run. A resumed run has this row already.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
+        if not checkpoint.progress.curve:
+            # Save first, so that a run killed in this evaluation can be resumed.
+            checkpoint.save()
+            self.add(checkpoint.progress)
+            checkpoint.save()
 
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
         """Evaluate the policy, and add a row with the result to the curve.

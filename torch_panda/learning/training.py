@@ -140,12 +140,7 @@ class Run:
             OSError: A file cannot be written.
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
-        if not progress.curve:
-            # `Curve.add` evaluates the untrained policy. Save first, so that a run
-            # killed meanwhile can be resumed.
-            checkpoint.save()
-            self.curve.add(progress)
-            checkpoint.save()
+        self.curve.begin(checkpoint)
         if progress.pretrained < args.pretrain_updates:
             pretrain(
                 checkpoint,

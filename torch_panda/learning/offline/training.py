@@ -13,11 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
-from torch_panda.learning.checkpoint import (
-    SAVE_INTERVAL,
-    Checkpoint,
-    Progress,
-)
+from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint, Progress
 from torch_panda.learning.curve import Curve
 from torch_panda.learning.logger import make_logger
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -88,11 +84,7 @@ class OfflineRun:
             OSError: A file cannot be written.
         """
         args, progress, checkpoint = self.args, self.progress, self.checkpoint
-        if not progress.curve:
-            # Save first, so that a run killed in this evaluation can be resumed.
-            checkpoint.save()
-            self.curve.add(progress)  # the untrained policy
-            checkpoint.save()
+        self.curve.begin(checkpoint)
         bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
         bar.set_description(f"{args.env_id} {args.algo} offline")
         bar.set_postfix(success=progress.success)
