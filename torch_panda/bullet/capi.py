@@ -16,10 +16,9 @@ from ctypes import (
     c_ubyte,
     c_void_p,
 )
+from functools import partial
 
-from torch_panda.bullet.library import CHEAP as _cheap
-from torch_panda.bullet.library import WORK as _work
-from torch_panda.bullet.library import bind
+from torch_panda.bullet.library import CHEAP, WORK, bind
 
 # enum EnumSharedMemoryServerStatus
 CMD_CLIENT_COMMAND_COMPLETED = 2
@@ -149,77 +148,59 @@ class CameraImage(ctypes.Structure):
     )
 
 
-# Functions of `_work` release the GIL during a call, and those of `_cheap` keep it; see
-# library.py.
+# Functions that `_work` declares release the GIL during a call, and those that `_cheap`
+# declares keep it; see library.py.
+_work = partial(bind, WORK)
+_cheap = partial(bind, CHEAP)
 _client = _command = _status = c_void_p
 # An array of numbers is passed as a ctypes array or as an address.
 _doubles = _floats = c_void_p
 _address = POINTER(c_void_p)
+_vector = (c_double,) * 3
+_quaternion = (c_double,) * 4
 
 # Connection, and the submission of commands
-connect_direct = bind(_work, "b3ConnectPhysicsDirect", _client)
-disconnect = bind(_work, "b3DisconnectSharedMemory", None, _client)
-submit = bind(_work, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command)
-submit_quick = bind(  # for commands that take about a microsecond
-    _cheap, "b3SubmitClientCommandAndWaitStatus", _status, _client, _command
+connect_direct = _work("b3ConnectPhysicsDirect", _client)
+disconnect = _work("b3DisconnectSharedMemory", None, _client)
+submit = _work("b3SubmitClientCommandAndWaitStatus", _status, _client, _command)
+submit_quick = _cheap(  # for commands that take about a microsecond
+    "b3SubmitClientCommandAndWaitStatus", _status, _client, _command
 )
-status_type = bind(_cheap, "b3GetStatusType", c_int, _status)
+status_type = _cheap("b3GetStatusType", c_int, _status)
 
 # World
-physics_init = bind(_cheap, "b3InitPhysicsParamCommand", _command, _client)
-physics_set_gravity = bind(
-    _cheap, "b3PhysicsParamSetGravity", c_int, _command, c_double, c_double, c_double
+physics_init = _cheap("b3InitPhysicsParamCommand", _command, _client)
+physics_set_gravity = _cheap("b3PhysicsParamSetGravity", c_int, _command, *_vector)
+physics_set_timestep = _cheap("b3PhysicsParamSetTimeStep", c_int, _command, c_double)
+physics_set_solver_iterations = _cheap(
+    "b3PhysicsParamSetNumSolverIterations", c_int, _command, c_int
 )
-physics_set_timestep = bind(
-    _cheap, "b3PhysicsParamSetTimeStep", c_int, _command, c_double
+physics_set_residual_threshold = _cheap(
+    "b3PhysicsParamSetSolverResidualThreshold", c_int, _command, c_double
 )
-physics_set_solver_iterations = bind(
-    _cheap, "b3PhysicsParamSetNumSolverIterations", c_int, _command, c_int
-)
-physics_set_residual_threshold = bind(
-    _cheap, "b3PhysicsParamSetSolverResidualThreshold", c_int, _command, c_double
-)
-step_init = bind(_cheap, "b3InitStepSimulationCommand", _command, _client)
-detect_init = bind(_cheap, "b3InitPerformCollisionDetectionCommand", _command, _client)
+step_init = _cheap("b3InitStepSimulationCommand", _command, _client)
+detect_init = _cheap("b3InitPerformCollisionDetectionCommand", _command, _client)
 
 # Bodies
-urdf_init = bind(_cheap, "b3LoadUrdfCommandInit", _command, _client, c_char_p)
-urdf_set_position = bind(
-    _cheap,
-    "b3LoadUrdfCommandSetStartPosition",
-    c_int,
-    _command,
-    c_double,
-    c_double,
-    c_double,
+urdf_init = _cheap("b3LoadUrdfCommandInit", _command, _client, c_char_p)
+urdf_set_position = _cheap(
+    "b3LoadUrdfCommandSetStartPosition", c_int, _command, *_vector
 )
-urdf_set_orientation = bind(
-    _cheap,
-    "b3LoadUrdfCommandSetStartOrientation",
-    c_int,
-    _command,
-    c_double,
-    c_double,
-    c_double,
-    c_double,
+urdf_set_orientation = _cheap(
+    "b3LoadUrdfCommandSetStartOrientation", c_int, _command, *_quaternion
 )
-urdf_set_fixed_base = bind(
-    _cheap, "b3LoadUrdfCommandSetUseFixedBase", c_int, _command, c_int
+urdf_set_fixed_base = _cheap("b3LoadUrdfCommandSetUseFixedBase", c_int, _command, c_int)
+urdf_set_flags = _cheap("b3LoadUrdfCommandSetFlags", c_int, _command, c_int)
+status_body = _cheap("b3GetStatusBodyIndex", c_int, _status)
+shape_init = _cheap("b3CreateCollisionShapeCommandInit", _command, _client)
+shape_add_box = _cheap("b3CreateCollisionShapeAddBox", c_int, _command, _doubles)
+shape_add_sphere = _cheap("b3CreateCollisionShapeAddSphere", c_int, _command, c_double)
+shape_add_cylinder = _cheap(
+    "b3CreateCollisionShapeAddCylinder", c_int, _command, c_double, c_double
 )
-urdf_set_flags = bind(_cheap, "b3LoadUrdfCommandSetFlags", c_int, _command, c_int)
-status_body = bind(_cheap, "b3GetStatusBodyIndex", c_int, _status)
-shape_init = bind(_cheap, "b3CreateCollisionShapeCommandInit", _command, _client)
-shape_add_box = bind(_cheap, "b3CreateCollisionShapeAddBox", c_int, _command, _doubles)
-shape_add_sphere = bind(
-    _cheap, "b3CreateCollisionShapeAddSphere", c_int, _command, c_double
-)
-shape_add_cylinder = bind(
-    _cheap, "b3CreateCollisionShapeAddCylinder", c_int, _command, c_double, c_double
-)
-status_shape = bind(_cheap, "b3GetStatusCollisionShapeUniqueId", c_int, _status)
-body_init = bind(_cheap, "b3CreateMultiBodyCommandInit", _command, _client)
-body_set_base = bind(
-    _cheap,
+status_shape = _cheap("b3GetStatusCollisionShapeUniqueId", c_int, _status)
+body_init = _cheap("b3CreateMultiBodyCommandInit", _command, _client)
+body_set_base = _cheap(
     "b3CreateMultiBodyBase",
     c_int,
     _command,
@@ -231,59 +212,29 @@ body_set_base = bind(
     _doubles,  # inertial frame position
     _doubles,  # inertial frame orientation
 )
-dynamics_init = bind(_cheap, "b3InitChangeDynamicsInfo", _command, _client)
-dynamics_set_mass = bind(
-    _cheap, "b3ChangeDynamicsInfoSetMass", c_int, _command, c_int, c_int, c_double
+dynamics_init = _cheap("b3InitChangeDynamicsInfo", _command, _client)
+_set_dynamics = (c_int, _command, c_int, c_int, c_double)  # body, link, value
+dynamics_set_mass = _cheap("b3ChangeDynamicsInfoSetMass", *_set_dynamics)
+dynamics_set_restitution = _cheap("b3ChangeDynamicsInfoSetRestitution", *_set_dynamics)
+dynamics_set_joint_damping = _cheap(
+    "b3ChangeDynamicsInfoSetJointDamping", *_set_dynamics
 )
-dynamics_set_restitution = bind(
-    _cheap,
-    "b3ChangeDynamicsInfoSetRestitution",
-    c_int,
-    _command,
-    c_int,
-    c_int,
-    c_double,
+dynamics_set_lateral_friction = _cheap(
+    "b3ChangeDynamicsInfoSetLateralFriction", *_set_dynamics
 )
-dynamics_set_joint_damping = bind(
-    _cheap,
-    "b3ChangeDynamicsInfoSetJointDamping",
-    c_int,
-    _command,
-    c_int,
-    c_int,
-    c_double,
+dynamics_set_spinning_friction = _cheap(
+    "b3ChangeDynamicsInfoSetSpinningFriction", *_set_dynamics
 )
-dynamics_set_lateral_friction = bind(
-    _cheap,
-    "b3ChangeDynamicsInfoSetLateralFriction",
-    c_int,
-    _command,
-    c_int,
-    c_int,
-    c_double,
+dynamics_info_init = _cheap(
+    "b3GetDynamicsInfoCommandInit", _command, _client, c_int, c_int
 )
-dynamics_set_spinning_friction = bind(
-    _cheap,
-    "b3ChangeDynamicsInfoSetSpinningFriction",
-    c_int,
-    _command,
-    c_int,
-    c_int,
-    c_double,
-)
-dynamics_info_init = bind(
-    _cheap, "b3GetDynamicsInfoCommandInit", _command, _client, c_int, c_int
-)
-dynamics_info = bind(_cheap, "b3GetDynamicsInfo", c_int, _status, POINTER(DynamicsInfo))
-joint_count = bind(_cheap, "b3GetNumJoints", c_int, _client, c_int)
-joint_info = bind(
-    _cheap, "b3GetJointInfo", c_int, _client, c_int, c_int, POINTER(JointInfo)
-)
+dynamics_info = _cheap("b3GetDynamicsInfo", c_int, _status, POINTER(DynamicsInfo))
+joint_count = _cheap("b3GetNumJoints", c_int, _client, c_int)
+joint_info = _cheap("b3GetJointInfo", c_int, _client, c_int, c_int, POINTER(JointInfo))
 
 # Collision filter
-filter_init = bind(_cheap, "b3CollisionFilterCommandInit", _command, _client)
-filter_set_group_mask = bind(
-    _cheap,
+filter_init = _cheap("b3CollisionFilterCommandInit", _command, _client)
+filter_set_group_mask = _cheap(
     "b3SetCollisionFilterGroupMask",
     None,
     _command,
@@ -294,80 +245,52 @@ filter_set_group_mask = bind(
 )
 
 # Poses
-pose_init = bind(_cheap, "b3CreatePoseCommandInit", _command, _client, c_int)
-pose_set_position = bind(
-    _cheap,
-    "b3CreatePoseCommandSetBasePosition",
-    c_int,
-    _command,
-    c_double,
-    c_double,
-    c_double,
+pose_init = _cheap("b3CreatePoseCommandInit", _command, _client, c_int)
+pose_set_position = _cheap(
+    "b3CreatePoseCommandSetBasePosition", c_int, _command, *_vector
 )
-pose_set_orientation = bind(
-    _cheap,
-    "b3CreatePoseCommandSetBaseOrientation",
-    c_int,
-    _command,
-    c_double,
-    c_double,
-    c_double,
-    c_double,
+pose_set_orientation = _cheap(
+    "b3CreatePoseCommandSetBaseOrientation", c_int, _command, *_quaternion
 )
-pose_set_linear_velocity = bind(
-    _cheap, "b3CreatePoseCommandSetBaseLinearVelocity", c_int, _command, _doubles
+pose_set_linear_velocity = _cheap(
+    "b3CreatePoseCommandSetBaseLinearVelocity", c_int, _command, _doubles
 )
-pose_set_angular_velocity = bind(
-    _cheap, "b3CreatePoseCommandSetBaseAngularVelocity", c_int, _command, _doubles
+pose_set_angular_velocity = _cheap(
+    "b3CreatePoseCommandSetBaseAngularVelocity", c_int, _command, _doubles
 )
-pose_set_joint_position = bind(
-    _cheap,
-    "b3CreatePoseCommandSetJointPosition",
-    c_int,
-    _client,
-    _command,
-    c_int,
-    c_double,
+pose_set_joint_position = _cheap(
+    "b3CreatePoseCommandSetJointPosition", c_int, _client, _command, c_int, c_double
 )
-pose_set_joint_velocity = bind(
-    _cheap,
-    "b3CreatePoseCommandSetJointVelocity",
-    c_int,
-    _client,
-    _command,
-    c_int,
-    c_double,
+pose_set_joint_velocity = _cheap(
+    "b3CreatePoseCommandSetJointVelocity", c_int, _client, _command, c_int, c_double
 )
 
 # Snapshots
-save_init = bind(_cheap, "b3SaveStateCommandInit", _command, _client)
-status_snapshot = bind(_cheap, "b3GetStatusGetStateId", c_int, _status)
-load_init = bind(_cheap, "b3LoadStateCommandInit", _command, _client)
-load_set_snapshot = bind(_cheap, "b3LoadStateSetStateId", c_int, _command, c_int)
+save_init = _cheap("b3SaveStateCommandInit", _command, _client)
+status_snapshot = _cheap("b3GetStatusGetStateId", c_int, _status)
+load_init = _cheap("b3LoadStateCommandInit", _command, _client)
+load_set_snapshot = _cheap("b3LoadStateSetStateId", c_int, _command, c_int)
 
 # Motors
-motor_init = bind(_cheap, "b3JointControlCommandInit2", _command, _client, c_int, c_int)
-motor_set_position = bind(
-    _cheap, "b3JointControlSetDesiredPosition", c_int, _command, c_int, c_double
+motor_init = _cheap("b3JointControlCommandInit2", _command, _client, c_int, c_int)
+motor_set_position = _cheap(
+    "b3JointControlSetDesiredPosition", c_int, _command, c_int, c_double
 )
-motor_set_velocity = bind(
-    _cheap, "b3JointControlSetDesiredVelocity", c_int, _command, c_int, c_double
+motor_set_velocity = _cheap(
+    "b3JointControlSetDesiredVelocity", c_int, _command, c_int, c_double
 )
-motor_set_torque = bind(
-    _cheap, "b3JointControlSetDesiredForceTorque", c_int, _command, c_int, c_double
+motor_set_torque = _cheap(
+    "b3JointControlSetDesiredForceTorque", c_int, _command, c_int, c_double
 )
-motor_set_kp = bind(_cheap, "b3JointControlSetKp", c_int, _command, c_int, c_double)
-motor_set_kd = bind(_cheap, "b3JointControlSetKd", c_int, _command, c_int, c_double)
-motor_set_force = bind(
-    _cheap, "b3JointControlSetMaximumForce", c_int, _command, c_int, c_double
+motor_set_kp = _cheap("b3JointControlSetKp", c_int, _command, c_int, c_double)
+motor_set_kd = _cheap("b3JointControlSetKd", c_int, _command, c_int, c_double)
+motor_set_force = _cheap(
+    "b3JointControlSetMaximumForce", c_int, _command, c_int, c_double
 )
 
 # Inverse kinematics
-ik_init = bind(
-    _cheap, "b3CalculateInverseKinematicsCommandInit", _command, _client, c_int
-)
-ik_set_target = bind(
-    _cheap,
+ik_init = _cheap("b3CalculateInverseKinematicsCommandInit", _command, _client, c_int)
+ik_set_target = _cheap(
     "b3CalculateInverseKinematicsAddTargetPositionWithOrientation",
     None,
     _command,
@@ -375,19 +298,13 @@ ik_set_target = bind(
     _doubles,
     _doubles,
 )
-ik_set_iterations = bind(
-    _cheap, "b3CalculateInverseKinematicsSetMaxNumIterations", None, _command, c_int
+ik_set_iterations = _cheap(
+    "b3CalculateInverseKinematicsSetMaxNumIterations", None, _command, c_int
 )
-ik_set_damping = bind(
-    _cheap,
-    "b3CalculateInverseKinematicsSetJointDamping",
-    None,
-    _command,
-    c_int,
-    _doubles,
+ik_set_damping = _cheap(
+    "b3CalculateInverseKinematicsSetJointDamping", None, _command, c_int, _doubles
 )
-ik_result = bind(
-    _cheap,
+ik_result = _cheap(
     "b3GetStatusInverseKinematicsJointPositions",
     c_int,
     _status,
@@ -397,12 +314,11 @@ ik_result = bind(
 )
 
 # State
-state_init = bind(_cheap, "b3RequestActualStateCommandInit", _command, _client, c_int)
-state_want_link_velocity = bind(
-    _cheap, "b3RequestActualStateCommandComputeLinkVelocity", c_int, _command, c_int
+state_init = _cheap("b3RequestActualStateCommandInit", _command, _client, c_int)
+state_want_link_velocity = _cheap(
+    "b3RequestActualStateCommandComputeLinkVelocity", c_int, _command, c_int
 )
-state_result = bind(
-    _cheap,
+state_result = _cheap(
     "b3GetStatusActualState2",
     c_int,
     _status,
@@ -419,40 +335,28 @@ state_result = bind(
     _address,  # link poses (7 per link), centre of mass, world frame
     _address,  # link velocities (6 per link), world frame
 )
-contact_init = bind(_cheap, "b3InitRequestContactPointInformation", _command, _client)
-contact_result = bind(
-    _cheap,
-    "b3GetContactPointInformation",
-    None,
-    _client,
-    POINTER(ContactInformation),
+contact_init = _cheap("b3InitRequestContactPointInformation", _command, _client)
+contact_result = _cheap(
+    "b3GetContactPointInformation", None, _client, POINTER(ContactInformation)
 )
 
 # Sensors
-sensor_init = bind(_cheap, "b3CreateSensorCommandInit", _command, _client, c_int)
-sensor_enable_wrench = bind(
-    _cheap,
-    "b3CreateSensorEnable6DofJointForceTorqueSensor",
-    c_int,
-    _command,
-    c_int,
-    c_int,
+sensor_init = _cheap("b3CreateSensorCommandInit", _command, _client, c_int)
+sensor_enable_wrench = _cheap(
+    "b3CreateSensorEnable6DofJointForceTorqueSensor", c_int, _command, c_int, c_int
 )
-physics_set_joint_feedback = bind(
-    _cheap, "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
+physics_set_joint_feedback = _cheap(
+    "b3PhysicsParameterSetJointFeedbackMode", c_int, _command, c_int
 )
 
 # Visual shapes and cameras
-visual_init = bind(_cheap, "b3CreateVisualShapeCommandInit", _command, _client)
-visual_add_box = bind(_cheap, "b3CreateVisualShapeAddBox", c_int, _command, _doubles)
-visual_add_sphere = bind(
-    _cheap, "b3CreateVisualShapeAddSphere", c_int, _command, c_double
+visual_init = _cheap("b3CreateVisualShapeCommandInit", _command, _client)
+visual_add_box = _cheap("b3CreateVisualShapeAddBox", c_int, _command, _doubles)
+visual_add_sphere = _cheap("b3CreateVisualShapeAddSphere", c_int, _command, c_double)
+visual_add_cylinder = _cheap(
+    "b3CreateVisualShapeAddCylinder", c_int, _command, c_double, c_double
 )
-visual_add_cylinder = bind(
-    _cheap, "b3CreateVisualShapeAddCylinder", c_int, _command, c_double, c_double
-)
-visual_add_mesh = bind(
-    _cheap,
+visual_add_mesh = _cheap(
     "b3CreateVisualShapeAddMesh2",
     c_int,
     _client,
@@ -467,23 +371,20 @@ visual_add_mesh = bind(
     _doubles,  # texture coordinates
     c_int,
 )
-visual_set_color = bind(
-    _cheap, "b3CreateVisualShapeSetRGBAColor", None, _command, c_int, _doubles
+visual_set_color = _cheap(
+    "b3CreateVisualShapeSetRGBAColor", None, _command, c_int, _doubles
 )
-visual_set_specular = bind(
-    _cheap, "b3CreateVisualShapeSetSpecularColor", None, _command, c_int, _doubles
+visual_set_specular = _cheap(
+    "b3CreateVisualShapeSetSpecularColor", None, _command, c_int, _doubles
 )
-status_visual = bind(_cheap, "b3GetStatusVisualShapeUniqueId", c_int, _status)
-texture_init = bind(_cheap, "b3InitLoadTexture", _command, _client, c_char_p)
-status_texture = bind(_cheap, "b3GetStatusTextureUniqueId", c_int, _status)
-visual_update_init = bind(
-    _cheap, "b3InitUpdateVisualShape2", _command, _client, c_int, c_int, c_int
+status_visual = _cheap("b3GetStatusVisualShapeUniqueId", c_int, _status)
+texture_init = _cheap("b3InitLoadTexture", _command, _client, c_char_p)
+status_texture = _cheap("b3GetStatusTextureUniqueId", c_int, _status)
+visual_update_init = _cheap(
+    "b3InitUpdateVisualShape2", _command, _client, c_int, c_int, c_int
 )
-visual_update_texture = bind(
-    _cheap, "b3UpdateVisualShapeTexture", None, _command, c_int
-)
-view_matrix = bind(
-    _cheap,
+visual_update_texture = _cheap("b3UpdateVisualShapeTexture", None, _command, c_int)
+view_matrix = _cheap(
     "b3ComputeViewMatrixFromYawPitchRoll",
     None,
     _floats,  # target
@@ -494,8 +395,7 @@ view_matrix = bind(
     c_int,  # up axis
     _floats,
 )
-view_matrix_from_positions = bind(
-    _cheap,
+view_matrix_from_positions = _cheap(
     "b3ComputeViewMatrixFromPositions",
     None,
     _floats,  # eye
@@ -503,8 +403,7 @@ view_matrix_from_positions = bind(
     _floats,  # up
     _floats,
 )
-projection_matrix = bind(
-    _cheap,
+projection_matrix = _cheap(
     "b3ComputeProjectionMatrixFOV",
     None,
     c_float,  # field of view
@@ -513,28 +412,25 @@ projection_matrix = bind(
     c_float,  # far
     _floats,
 )
-camera_init = bind(_cheap, "b3InitRequestCameraImage", _command, _client)
-camera_set_matrices = bind(
-    _cheap, "b3RequestCameraImageSetCameraMatrices", None, _command, _floats, _floats
+camera_init = _cheap("b3InitRequestCameraImage", _command, _client)
+camera_set_matrices = _cheap(
+    "b3RequestCameraImageSetCameraMatrices", None, _command, _floats, _floats
 )
-camera_set_size = bind(
-    _cheap, "b3RequestCameraImageSetPixelResolution", None, _command, c_int, c_int
+camera_set_size = _cheap(
+    "b3RequestCameraImageSetPixelResolution", None, _command, c_int, c_int
 )
-camera_set_shadow = bind(_cheap, "b3RequestCameraImageSetShadow", None, _command, c_int)
-camera_set_flags = bind(_cheap, "b3RequestCameraImageSetFlags", None, _command, c_int)
-camera_result = bind(
-    _cheap, "b3GetCameraImageData", None, _client, POINTER(CameraImage)
+camera_set_shadow = _cheap("b3RequestCameraImageSetShadow", None, _command, c_int)
+camera_set_flags = _cheap("b3RequestCameraImageSetFlags", None, _command, c_int)
+camera_result = _cheap("b3GetCameraImageData", None, _client, POINTER(CameraImage))
+plugin_init = _cheap("b3CreateCustomCommand", _command, _client)
+plugin_set_path = _cheap("b3CustomCommandLoadPlugin", None, _command, c_char_p)
+plugin_set_suffix = _cheap(
+    "b3CustomCommandLoadPluginSetPostFix", None, _command, c_char_p
 )
-plugin_init = bind(_cheap, "b3CreateCustomCommand", _command, _client)
-plugin_set_path = bind(_cheap, "b3CustomCommandLoadPlugin", None, _command, c_char_p)
-plugin_set_suffix = bind(
-    _cheap, "b3CustomCommandLoadPluginSetPostFix", None, _command, c_char_p
-)
-status_plugin = bind(_cheap, "b3GetStatusPluginUniqueId", c_int, _status)
+status_plugin = _cheap("b3GetStatusPluginUniqueId", c_int, _status)
 
 # The window of pybullet's GUI
-connect_window = bind(
-    _work,
+connect_window = _work(
     "b3CreateInProcessPhysicsServerAndConnectMainThread"
     if sys.platform == "darwin"
     else "b3CreateInProcessPhysicsServerAndConnect",
@@ -542,17 +438,11 @@ connect_window = bind(
     c_int,
     POINTER(c_char_p),
 )
-window_init = bind(_cheap, "b3InitConfigureOpenGLVisualizer", _command, _client)
-window_set_flag = bind(
-    _cheap,
-    "b3ConfigureOpenGLVisualizerSetVisualizationFlags",
-    None,
-    _command,
-    c_int,
-    c_int,
+window_init = _cheap("b3InitConfigureOpenGLVisualizer", _command, _client)
+window_set_flag = _cheap(
+    "b3ConfigureOpenGLVisualizerSetVisualizationFlags", None, _command, c_int, c_int
 )
-window_set_camera = bind(
-    _cheap,
+window_set_camera = _cheap(
     "b3ConfigureOpenGLVisualizerSetViewMatrix",
     None,
     _command,

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from torch_panda.bullet import capi
+from torch_panda.bullet.library import bind
 
 # Version of the C sources, as ``loop_version`` in client.h: the library must have been
 # compiled from sources of this version.
@@ -245,62 +246,47 @@ class Library:
     """
 
     def __init__(self, path: str) -> None:
-        library = ctypes.CDLL(path)
+        work, cheap = ctypes.CDLL(path), ctypes.PyDLL(path)
         self.path = path
         try:
-            self.version: int = library.loop_version()
+            self.version: int = work.loop_version()
         except AttributeError:
             self.version = 0  # the library is older than the version numbers
         if self.version != VERSION:
             return  # do not bind the functions: `loop_name` refuses this library
-        self.create = library.loop_create
-        self.create.restype = c_void_p
-        self.create.argtypes = (POINTER(Batch), c_int)
-        self.step = library.loop_step
-        self.step.argtypes = (
-            c_void_p,
-            POINTER(Control),
-            c_void_p,
-            POINTER(c_int),
+        integers = POINTER(c_int)
+        self.create = bind(work, "loop_create", c_void_p, POINTER(Batch), c_int)
+        self.step = bind(
+            work,
+            "loop_step",
             c_int,
+            *(c_void_p, POINTER(Control), c_void_p, integers, c_int),
         )
-        self.reset = library.loop_reset
-        self.reset.argtypes = (c_void_p, POINTER(c_int), c_int)
-        self.reset_one = library.client_reset
-        self.reset_one.argtypes = (POINTER(Batch), c_int)
-        self.euler_angles = library.euler_angles
-        self.euler_angles.restype = None
-        self.euler_angles.argtypes = (POINTER(c_double), POINTER(c_double))
-        quick = ctypes.PyDLL(path)
-        self.environment_begin_step = quick.environment_begin_step
-        self.environment_begin_step.argtypes = (
-            c_void_p,
-            c_void_p,
+        self.reset = bind(work, "loop_reset", c_int, c_void_p, integers, c_int)
+        self.reset_one = bind(work, "client_reset", c_int, POINTER(Batch), c_int)
+        self.destroy = bind(work, "loop_destroy", None, c_void_p)
+        doubles = POINTER(c_double)
+        self.euler_angles = bind(work, "euler_angles", None, doubles, doubles)
+        self.environment_begin_step = bind(
+            cheap,
+            "environment_begin_step",
             c_int,
-            c_void_p,
-            c_int,
+            *(c_void_p, c_void_p, c_int, c_void_p, c_int),
         )
-        self.environment_any = quick.environment_any
-        self.environment_any.argtypes = (c_void_p, c_size_t)
-        self.environment_setpoints = quick.environment_setpoints
-        self.environment_setpoints.restype = None
-        self.environment_setpoints.argtypes = (
-            POINTER(Actuation),
-            c_void_p,
-            c_int,
-            c_void_p,
-            c_void_p,
+        self.environment_any = bind(cheap, "environment_any", c_int, c_void_p, c_size_t)
+        self.environment_setpoints = bind(
+            cheap,
+            "environment_setpoints",
+            None,
+            *(POINTER(Actuation), c_void_p, c_int, c_void_p, c_void_p),
         )
-        self.environment_observe = quick.environment_observe
-        self.environment_observe.argtypes = (
-            POINTER(Observation),
-            c_void_p,
+        self.environment_observe = bind(
+            cheap,
+            "environment_observe",
             c_int,
+            *(POINTER(Observation), c_void_p, c_int),
             *(c_void_p,) * 10,
         )
-        self.destroy = library.loop_destroy
-        self.destroy.restype = None
-        self.destroy.argtypes = (c_void_p,)
 
 
 def load() -> Library | str:
