@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from torch import Tensor
 
 from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.body_state import Doubles
@@ -39,7 +38,9 @@ class VectorSimulation:
     Attributes:
         scene: Body ids of the scene.
         state: Tensors with the state of all clients. Steps and resets overwrite them:
-            copy what you keep.
+            copy what you keep. Those that tasks read are also attributes of the
+            simulation, for example ``simulation.ee_position`` (num_envs, 3) [m]; see
+            `SimulationState`.
         n_substeps: Substeps per step.
         ctrl_dt: Length of a step [s].
     """
@@ -73,7 +74,21 @@ class VectorSimulation:
             for _ in range(1, num_envs):
                 self._clients.append(PhysicsClient(physics=physics))
                 self._broad_phases.append(self._build_same_scene(self._clients[-1]))
-            self.state = SimulationState(self.scene, num_envs)
+            self.state = state = SimulationState(self.scene, num_envs)
+            # Tasks, robots and sensors read these tensors here.
+            self.joint_position = state.joint_position
+            self.joint_velocity = state.joint_velocity
+            self.ee_position = state.ee_position
+            self.ee_velocity = state.ee_velocity
+            self.ee_state = state.ee_state
+            self.ee_orientation = state.ee_orientation
+            self.object_pose = state.object_pose
+            self.object_state = state.object_state
+            self.object_velocity = state.object_velocity
+            self.object_euler = state.object_euler
+            self.object_joint_position = state.object_joint_position
+            self.object_joint_velocity = state.object_joint_velocity
+            self.marker_pose = state.marker_pose
             if is_native:
                 self._native = NativeLoop(
                     self._clients,
@@ -110,73 +125,6 @@ class VectorSimulation:
     def blueprint(self) -> Blueprint:
         """The commands that built the scene, the same in every client."""
         return self._blueprint
-
-    # ---- the tensors of `state`, which tasks, robots and sensors read ------------
-
-    @property
-    def joint_position(self) -> Tensor:
-        """(num_envs, n_joints) [rad] or [m]."""
-        return self.state.joint_position
-
-    @property
-    def joint_velocity(self) -> Tensor:
-        """(num_envs, n_joints) [rad/s] or [m/s]."""
-        return self.state.joint_velocity
-
-    @property
-    def ee_position(self) -> Tensor:
-        """(num_envs, 3) [m]."""
-        return self.state.ee_position
-
-    @property
-    def ee_velocity(self) -> Tensor:
-        """(num_envs, 3) [m/s]."""
-        return self.state.ee_velocity
-
-    @property
-    def ee_state(self) -> Tensor:
-        """(num_envs, 6), position and velocity of the end-effector."""
-        return self.state.ee_state
-
-    @property
-    def ee_orientation(self) -> Tensor:
-        """(num_envs, 4), quaternion xyzw."""
-        return self.state.ee_orientation
-
-    @property
-    def object_pose(self) -> Tensor:
-        """(num_envs, n_objects, 7), position [m] and quaternion xyzw."""
-        return self.state.object_pose
-
-    @property
-    def object_state(self) -> Tensor:
-        """(num_envs, n_objects, 12), position, Euler angles, velocity."""
-        return self.state.object_state
-
-    @property
-    def object_velocity(self) -> Tensor:
-        """(num_envs, n_objects, 6) [m/s] and [rad/s]."""
-        return self.state.object_velocity
-
-    @property
-    def object_euler(self) -> Tensor:
-        """(num_envs, n_objects, 3) [rad]."""
-        return self.state.object_euler
-
-    @property
-    def object_joint_position(self) -> Tensor:
-        """(num_envs, n_object_joints) [rad] or [m]."""
-        return self.state.object_joint_position
-
-    @property
-    def object_joint_velocity(self) -> Tensor:
-        """(num_envs, n_object_joints) [rad/s] or [m/s]."""
-        return self.state.object_joint_velocity
-
-    @property
-    def marker_pose(self) -> Tensor:
-        """(num_envs, n_markers, 7), position [m] and quaternion xyzw."""
-        return self.state.marker_pose
 
     # ---- steps and resets --------------------------------------------------------
 
