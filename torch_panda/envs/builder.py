@@ -8,58 +8,37 @@ from torch_panda.sensors import Sensor
 from torch_panda.tasks import Bodies, Task
 
 
-class RobotTaskBuilder:
-    """Builds the same scene in any client.
+def build_scene(
+    robot: Robot, task: Task, sensors: Sequence[Sensor], client: PhysicsClient
+) -> Scene:
+    """Build the scene in a client. It is the same scene in every client.
 
-    It refers to descriptions only. The simulation refers to the builder. If the builder
-    also referred to the simulation, this cycle of references would keep a forgotten
-    environment alive.
-
-    Args:
-        robot: The robot.
-        task: The task.
-        sensors: The sensors for which the clients are prepared.
+    Raises:
+        TypeError: `Robot.build` does not return a body id, or `Task.build` does not
+            return `Bodies`.
     """
-
-    def __init__(self, robot: Robot, task: Task, sensors: Sequence[Sensor]) -> None:
-        self._robot = robot
-        self._task = task
-        self._sensors = sensors
-
-    def __call__(self, client: PhysicsClient) -> Scene:
-        """Build the scene in a client.
-
-        Raises:
-            TypeError: `Robot.build` does not return a body id, or `Task.build` does not
-                return `Bodies`.
-        """
-        robot = self._robot
-        body = robot.build(client)
-        if not isinstance(body, int):
-            raise TypeError(
-                f"{type(robot).__name__}.build must return the robot's body id, "
-                f"got {body!r}"
-            )
-        bodies = self._build_task(client)
-        for sensor in self._sensors:
-            sensor.build(client, body, robot)
-        objects = tuple(bodies.objects)
-        return Scene(
-            robot=body,
-            joints=_movable_joints(client, body),
-            ee_link=robot.ee_link,
-            objects=objects,
-            object_joints=tuple(_movable_joints(client, k) for k in objects),
-            markers=tuple(bodies.markers),
+    body = robot.build(client)
+    if not isinstance(body, int):
+        raise TypeError(
+            f"{type(robot).__name__}.build must return the robot's body id, "
+            f"got {body!r}"
         )
-
-    def _build_task(self, client: PhysicsClient) -> Bodies:
-        bodies = self._task.build(client)
-        if not isinstance(bodies, Bodies):
-            raise TypeError(
-                f"{type(self._task).__name__}.build must return Bodies, got {bodies!r}"
-            )
-        return bodies
+    bodies = task.build(client)
+    if not isinstance(bodies, Bodies):
+        raise TypeError(
+            f"{type(task).__name__}.build must return Bodies, got {bodies!r}"
+        )
+    for sensor in sensors:
+        sensor.build(client, body, robot)
+    objects = tuple(bodies.objects)
+    return Scene(
+        robot=body,
+        joints=_movable_joints(client, body),
+        ee_link=robot.ee_link,
+        objects=objects,
+        object_joints=tuple(_movable_joints(client, k) for k in objects),
+        markers=tuple(bodies.markers),
+    )
 
 
 def _movable_joints(client: PhysicsClient, body: int) -> tuple[int, ...]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Literal, get_args
 
 import torch
@@ -24,7 +25,7 @@ from torch_panda.checks import (
     check_memory,
     check_positive,
 )
-from torch_panda.envs.builder import RobotTaskBuilder
+from torch_panda.envs.builder import build_scene
 from torch_panda.envs.goal_observation import (
     GoalName,
     GoalObserver,
@@ -124,9 +125,11 @@ class Episodes:
         # Environments that need a reset: new ones, and those whose last reset failed.
         self._needs_reset = set(range(n))
         sensors = read_sensors(sensors, robot)
-        build_scene = RobotTaskBuilder(robot, task, sensors)
+        # A method of this object would close a cycle of references, which keeps a
+        # forgotten environment alive.
+        build = partial(build_scene, robot, task, sensors)
         self.simulation = VectorSimulation(
-            build_scene, n, num_threads=num_threads, physics=self.physics
+            build, n, num_threads=num_threads, physics=self.physics
         )
         try:
             self._compiled_setpoints = None
@@ -144,7 +147,7 @@ class Episodes:
                     robot,
                     task,
                     self.simulation,
-                    build_scene,
+                    build,
                     self.physics,
                     self.goal_indices,
                 )
