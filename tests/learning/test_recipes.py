@@ -1,4 +1,4 @@
-"""Recipes of --preset tuned."""
+"""Recipes of --preset tuned and --preset sample-efficient."""
 
 from dataclasses import replace
 from functools import partial
@@ -9,16 +9,26 @@ import torch_panda
 from torch_panda.commands import train
 from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args, default_args
-from torch_panda.learning.recipes import RECIPES, find_recipe
+from torch_panda.learning.recipes import RECIPES, SAMPLE_EFFICIENT, find_recipe
 from torch_panda.learning.training import Run
 
 
+@pytest.mark.parametrize("preset", ["tuned", "sample-efficient"])
 @pytest.mark.parametrize("task", RECIPES)
-def test_recipes_are_options(task):
-    args = default_args("tuned", f"Panda{task.__name__}-v1")
+def test_recipes_are_options(task, preset):
+    args = default_args(preset, f"Panda{task.__name__}-v1")
     check_limits(args)
-    assert args.preset == "tuned"
-    assert args != Args(preset="tuned", env_id=args.env_id)
+    assert args.preset == preset
+    assert args != Args(preset=preset, env_id=args.env_id)
+
+
+def test_the_sample_efficient_recipe_changes_the_tuned_recipe():
+    tuned = default_args("tuned", "PandaPickAndPlace-v3")
+    args = default_args("sample-efficient", "PandaPickAndPlace-v3")
+    assert (args.exploration, args.network) == ("points", "layer-norm")
+    assert args.updates_per_step == 4 * tuned.updates_per_step
+    assert tuned.start_at_object > args.start_at_object == 0
+    assert args.relative_inputs == tuned.relative_inputs == "fine"
 
 
 def test_every_task_has_a_recipe():
@@ -47,6 +57,7 @@ def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(tmp_path, c
     blocked = partial(torch_panda.Panda, block_gripper=True)
     torch_panda.register("PushBall-v0", robot=blocked, task=PushBall)
     assert find_recipe("PushBall-v0") == {}
+    assert find_recipe("PushBall-v0", "sample-efficient") == SAMPLE_EFFICIENT
     default = Args(preset="tuned", env_id="PushBall-v0")
     assert default_args("tuned", "PushBall-v0") == default
     near = partial(torch_panda.Push, goal_xy_range=0.1)

@@ -4,8 +4,9 @@
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
 
 The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687) or,
-where the paper gives none, those of the HER of OpenAI Baselines. `--preset tuned` uses
-the recipe of the task in `torch_panda.learning.recipes`.
+where the paper gives none, those of the HER of OpenAI Baselines. `--preset tuned`
+and `--preset sample-efficient` use the recipes of the task in
+`torch_panda.learning.recipes`.
 
 With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
 """

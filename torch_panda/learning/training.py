@@ -181,7 +181,7 @@ class Run:
 
     def store(self, data: TensorDictBase) -> None:
         """Add episodes [num_envs, steps] to the buffer and to the normaliser."""
-        keep_unmoved = KEEP_UNMOVED if self.args.preset == "tuned" else 1.0
+        keep_unmoved = 1.0 if self.args.preset == "paper" else KEEP_UNMOVED
         data = select_episodes(data, keep_unmoved)
         if len(data):
             indices = self.buffer.extend(data.reshape(-1))
