@@ -2,7 +2,8 @@
 
 A run is a folder with args.json and curve.csv. A line is the median over the seeds, and
 a band shows the interquartile range, as in the panda-gym paper. A panel has at most
-four lines. A task with more lines has a panel for each algorithm.
+four lines. A task with more lines has a panel for each algorithm. Colour and dashes of
+a line show the options, and its marker shows the algorithm, the same in all panels.
 
 The legend names the algorithm and the options that differ from the preset. An entry
 ``label`` in args.json replaces the options by a name. Runs of one task and algorithm
@@ -30,11 +31,18 @@ LABEL_WIDTH = 56  # characters after which a label is wrapped
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 DASHES = ("-", "--", ":", "-.")
+# The first algorithm in the alphabet has no marker.
+MARKERS = ("", "s", "^", "D", "v", "P", "X", "*")
+PRESETS = ("tuned", "paper")  # have the first looks, so that figures agree
 
-Lines = dict[str, list[Curve]]
+Curves = dict[str, list[Curve]]
 """The curves of all seeds, by the label of the way to train."""
-Runs = dict[str, dict[str, Lines]]
-"""Lines by algorithm, by task."""
+Runs = dict[str, dict[str, Curves]]
+"""Curves by algorithm, by task."""
+Line = tuple[str, str]
+"""Algorithm and way to train."""
+Panel = dict[Line, list[Curve]]
+"""The curves of all seeds, by line."""
 
 
 def plot_curve(curve: Curve, title: str, path: Path, *, steps: str) -> None:
@@ -86,7 +94,7 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     save(figure, path)
 
 
-def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
+def split(task: str, algorithms: dict[str, Curves]) -> list[tuple[str, Panel]]:
     """Distribute the lines of a task over panels.
 
     All algorithms share a panel if it has at most `LINES` lines. Otherwise each
@@ -96,13 +104,13 @@ def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
         Title and lines of each panel.
     """
     by_algorithm = {
-        algo: {f"{algo}, {way}": curves for way, curves in sorted(ways.items())}
+        algo: {(algo, way): curves for way, curves in sorted(ways.items())}
         for algo, ways in sorted(algorithms.items())
     }
     together = {
-        name: curves
+        line: curves
         for lines in by_algorithm.values()
-        for name, curves in lines.items()
+        for line, curves in lines.items()
     }
     if len(together) <= LINES:
         return [(task, together)]
@@ -113,43 +121,57 @@ def split(task: str, algorithms: dict[str, Lines]) -> list[tuple[str, Lines]]:
     ]
 
 
-def choose_looks(panels: list[list[str]]) -> dict[str, dict[str, str]]:
-    """Colour and dashes of each line, the same in all panels.
+def choose_looks(panels: list[list[Line]]) -> dict[Line, dict[str, str]]:
+    """Colour, dashes and marker of each line, the same in all panels.
 
-    The first 28 lines differ. The lines of a panel have different colours where the
-    lines that they share with earlier panels allow it.
+    Colour and dashes depend on the way to train, and the marker on the algorithm. The
+    first 28 ways differ. The ways of a panel have different colours where the ways that
+    they share with earlier panels allow it.
     """
-    looks: dict[str, dict[str, str]] = {}
     unused = [(color, dashes) for dashes in DASHES for color in COLORS]
-    for names in panels:
-        for name in names:
-            if name not in looks:
-                taken = {looks[other]["color"] for other in names if other in looks}
+    chosen: dict[str, tuple[str, str]] = {}
+    all_ways = {way for lines in panels for _, way in lines}
+    first = [way for way in PRESETS if way in all_ways]
+    for ways in [first, *([way for _, way in lines] for lines in panels)]:
+        for way in ways:
+            if way not in chosen:
+                taken = {chosen[other][0] for other in ways if other in chosen}
                 free = [look for look in unused if look[0] not in taken]
-                color, dashes = (free or unused or [(COLORS[0], DASHES[0])])[0]
-                looks[name] = {"color": color, "linestyle": dashes}
-                unused = [look for look in unused if look != (color, dashes)]
-    return looks
+                chosen[way] = (free or unused or [(COLORS[0], DASHES[0])])[0]
+                unused = [look for look in unused if look != chosen[way]]
+    algorithms = sorted({algo for lines in panels for algo, _ in lines})
+    return {
+        (algo, way): {
+            "color": chosen[way][0],
+            "linestyle": chosen[way][1],
+            "marker": MARKERS[algorithms.index(algo) % len(MARKERS)],
+        }
+        for lines in panels
+        for algo, way in lines
+    }
 
 
 def draw_panel(
     axes: Axes,
-    lines: Lines,
+    lines: Panel,
     metric: Metric,
-    looks: dict[str, dict[str, Any]],
+    looks: dict[Line, dict[str, str]],
 ) -> None:
     """Draw lines with a band over their seeds."""
-    for name, curves in lines.items():
+    for line, curves in lines.items():
         # Unfinished seeds are shorter, so use the steps that all seeds have.
         points = [{row["step"]: row[metric] for row in curve} for curve in curves]
         steps = sorted(set.intersection(*map(set, points)))
         values = np.array([[curve[step] for step in steps] for curve in points])
         low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-        label = f"{name} ({len(curves)} seed{'s' if len(curves) > 1 else ''})"
-        label = textwrap.fill(label, LABEL_WIDTH)
-        marker = "o" if len(steps) == 1 else None
-        axes.plot(steps, median, marker=marker, label=label, **looks[name])
-        axes.fill_between(steps, low, high, color=looks[name]["color"], alpha=0.2, lw=0)
+        seeds = f"{len(curves)} seed{'s' if len(curves) > 1 else ''}"
+        label = textwrap.fill(f"{', '.join(line)} ({seeds})", LABEL_WIDTH)
+        look: dict[str, Any] = dict(looks[line])
+        if len(steps) == 1:
+            look["marker"] = look["marker"] or "o"
+        # Markers at most every tenth of the panel's diagonal.
+        axes.plot(steps, median, label=label, markersize=4, markevery=0.1, **look)
+        axes.fill_between(steps, low, high, color=look["color"], alpha=0.2, lw=0)
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
