@@ -17,7 +17,8 @@ URDF = Path(__file__).with_name("drawer.urdf")
 SLIDE = 0  # index of the drawer's joint
 TRAVEL = 0.25  # distance from closed to open [m]
 HANDLE = (-0.06, 0.0, 0.06)  # position when closed, cabinet frame [m]
-HANDLE_BAR = Box((0.005, 0.07, 0.01))
+# The marker is thicker than the handle, so that it is visible around a handle there.
+MARKER = Box((0.009, 0.074, 0.014))
 
 # The table is longer than panda-gym's, because the cabinet stands at its far end.
 TABLE_LENGTH = 1.4  # [m]
@@ -63,7 +64,7 @@ class Drawer(Task):
             )
 
     def build(self, client: PhysicsClient) -> Bodies:
-        """Build the table, the drawer and the marker, which is a handle."""
+        """Build the table, the drawer and the marker, which looks like a handle."""
         create_table(
             client,
             length=TABLE_LENGTH,
@@ -74,7 +75,7 @@ class Drawer(Task):
         client.set_dynamics(drawer, SLIDE, mass=self.drawer_mass)
         client.set_joint_friction(drawer, SLIDE, self.drawer_friction)
         return Bodies(
-            objects=(drawer,), markers=(client.create_marker(HANDLE, HANDLE_BAR),)
+            objects=(drawer,), markers=(client.create_marker(HANDLE, MARKER),)
         )
 
     def sample_start(self, rng: np.random.Generator) -> Start:
