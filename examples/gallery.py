@@ -15,21 +15,22 @@ import torch_panda
 from torch_panda import Camera
 from torch_panda.experts import make_expert
 
-# A seed whose episode ends in success, and a view of where it happens.
+# A seed whose episode ends close to the goal, and a view of where it happens.
 SCENES = {
-    "Reach": (4, Camera((0.03, 0.0, 0.2), 0.75, 60, -20, fov=50)),
-    "Push": (2, Camera((0.0, -0.04, 0.06), 0.52, 60, -30, fov=50)),
-    "Slide": (3, Camera((0.15, -0.02, 0.05), 0.7, 60, -30, fov=50)),
-    "PickAndPlace": (4, Camera((0.06, -0.06, 0.12), 0.55, 60, -20, fov=50)),
-    "Stack": (6, Camera((0.04, -0.02, 0.07), 0.5, 60, -30, fov=50)),
-    "Flip": (6, Camera((0.0, 0.0, 0.08), 0.5, 60, -25, fov=50)),
-    "Drawer": (0, Camera((0.03, -0.05, 0.06), 0.65, 60, -30, fov=50)),
-    "PegInsertion": (1, Camera((0.02, 0.05, 0.08), 0.42, 60, -25, fov=50)),
+    "Reach": (0, Camera((0.02, -0.02, 0.13), 0.5, 40, -20, fov=50)),
+    "Push": (2, Camera((0.0, -0.07, 0.06), 0.45, 60, -30, fov=50)),
+    "Slide": (24, Camera((0.2, -0.02, 0.06), 0.62, 30, -35, fov=50)),
+    "PickAndPlace": (7, Camera((0.03, 0.0, 0.09), 0.42, 60, -20, fov=50)),
+    "Stack": (6, Camera((0.04, -0.02, 0.07), 0.42, 60, -30, fov=50)),
+    "Flip": (282, Camera((0.025, -0.04, 0.04), 0.27, 65, -28, fov=50)),
+    "Drawer": (5, Camera((0.05, 0.05, 0.04), 0.61, -35, -33, fov=45)),
+    "PegInsertion": (1, Camera((0.02, 0.06, 0.08), 0.36, 60, -25, fov=50)),
 }
 COLUMNS = 4
 NUM_FRAMES = 26  # a frame every second step; Stack, with 100 steps, every fourth
 FRAME_TIME = 80  # of two steps [ms]
-LAST_FRAME_TIME = 2_000  # [ms]
+FIRST_FRAME_TIME = 800  # shows the goals before the arms hide some of them [ms]
+LAST_FRAME_TIME = 3_000  # [ms]
 CELL = (300, 240)  # width and height [pixels]
 BORDER = 5  # [pixels]
 GREEN = (30, 160, 70)
@@ -43,13 +44,12 @@ def draw(env: torch_panda.RobotTaskEnv, name: str, success: bool) -> Image.Image
     cell = Image.fromarray(pixels.numpy()).resize(CELL, Image.Resampling.LANCZOS)
     pen = ImageDraw.Draw(cell)
     width, height = CELL
-    pen.text((12, 9), name, fill=(20, 20, 20), font_size=20)
+    pen.text((12, 9), name, "black", font_size=20, stroke_width=3, stroke_fill="white")
+    outline = GREEN if success else "white"
+    pen.rectangle((0, 0, width - 1, height - 1), outline=outline, width=BORDER)
     if success:
-        pen.rectangle((0, 0, width - 1, height - 1), outline=GREEN, width=BORDER)
         tick = [(width - 36, 24), (width - 28, 32), (width - 14, 14)]
         pen.line(tick, fill=GREEN, width=5, joint="curve")
-    else:
-        pen.rectangle((0, 0, width - 1, height - 1), outline="white", width=BORDER)
     return cell
 
 
@@ -86,7 +86,7 @@ def main(path: Path) -> None:
         row, column = divmod(index, COLUMNS)
         for frame, cell in zip(frames, play(name), strict=True):
             frame.paste(cell, (column * CELL[0], row * CELL[1]))
-    times = [FRAME_TIME] * (NUM_FRAMES - 1) + [LAST_FRAME_TIME]
+    times = [FIRST_FRAME_TIME, *[FRAME_TIME] * (NUM_FRAMES - 2), LAST_FRAME_TIME]
     first, *others = frames
     first.save(
         path, save_all=True, append_images=others, duration=times, loop=0, quality=85
