@@ -1,18 +1,21 @@
 """Environments, buffers and collectors, as the tests of pipelines build them."""
 
+import pytest
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import torch_panda
+from torch_panda.transforms import HindsightAugment, HindsightRelabel
+
+BOTH = pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
 
 
 def make(env_id="PandaPush-v1", num_envs=4):
     return torch_panda.make(env_id, num_envs=num_envs, seed=0)
 
 
-def buffer(transform, **options):
-    ndim = options.pop("ndim", 1)
-    storage = LazyTensorStorage(1000, ndim=ndim)
+def buffer(transform, *, capacity=1000, ndim=1, **options):
+    storage = LazyTensorStorage(capacity, ndim=ndim)
     return TensorDictReplayBuffer(
         storage=storage, transform=transform, batch_size=64, **options
     )

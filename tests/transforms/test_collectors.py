@@ -4,14 +4,20 @@ import pytest
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from tests.transforms import panda, toy
+from tests.transforms import toy
 from tests.transforms.identifiable import check_batch, relabelled, reward_fn
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 SINGLE = functools.partial(Collector, toy.make_env)
-PARALLEL = functools.partial(Collector, toy.make_parallel)
-SYNC = functools.partial(MultiSyncCollector, [toy.make_first, toy.make_second])
-ASYNC = functools.partial(MultiAsyncCollector, [toy.make_first, toy.make_second])
+WORKERS = [toy.make_first, toy.make_second]
+COLLECTORS = {
+    "ParallelEnv": functools.partial(Collector, toy.make_parallel),
+    "synchronous": functools.partial(MultiSyncCollector, WORKERS),
+    "asynchronous": functools.partial(MultiAsyncCollector, WORKERS),
+    "asynchronous ParallelEnv": functools.partial(
+        MultiAsyncCollector, [toy.make_parallel, toy.make_third_in_parallel]
+    ),
+}
 
 
 def collect(make_collector, frames_per_batch, total_frames, **options):
@@ -24,29 +30,40 @@ def collect(make_collector, frames_per_batch, total_frames, **options):
         collector.shutdown()
 
 
-def check(make_collector, frames, total, *, capacity=200, flat=True, **options):
+def check(make_collector, frames, batches, *, ndim=1, **options):
     rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, ndim=1 if flat else 2),
+        storage=LazyTensorStorage(200, ndim=ndim),
         transform=HindsightRelabel(reward_fn),
         batch_size=64,
     )
-    share = []
-    for data in collect(make_collector, frames, total, **options):
-        rb.extend(data.reshape(-1) if flat else data)
+    share, written = [], 0
+    for data in collect(make_collector, frames, frames * batches, **options):
+        rb.extend(data if ndim == 2 else data.reshape(-1))
+        written += data.numel()
         batch = rb.sample()
         check_batch(batch, rb.storage[:], "future")
         share.append(relabelled(batch).float().mean())
     assert abs(sum(share) / len(share) - 0.8) < 0.1
+    assert written == frames * batches
 
 
-@pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("reset_at_each_iter", [True, False])
-@pytest.mark.parametrize("steps", [1, 2, 5, 17])
-def test_single_process(flat, reset_at_each_iter, steps):
-    if not flat and steps == 1:
-        pytest.skip("TensorDictReplayBuffer cannot write one step of ndim=2 data")
-    options = {"flat": flat, "reset_at_each_iter": reset_at_each_iter}
-    check(SINGLE, 3 * steps, 3 * steps * 40, **options)
+@pytest.mark.parametrize(("ndim", "steps"), [(1, 1), (1, 5), (2, 5), (2, 17)])
+def test_single_process(ndim, steps, reset_at_each_iter):
+    check(SINGLE, 3 * steps, 40, ndim=ndim, reset_at_each_iter=reset_at_each_iter)
+
+
+@pytest.mark.parametrize(
+    "collector",
+    [
+        "ParallelEnv",
+        "synchronous",
+        "asynchronous",
+        pytest.param("asynchronous ParallelEnv", marks=pytest.mark.slow),
+    ],
+)
+def test_worker_processes(collector):
+    check(COLLECTORS[collector], 6 * 4, 20)
 
 
 @pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
@@ -55,68 +72,10 @@ def test_collectors_in_turn(hindsight):
     rb = TensorDictReplayBuffer(
         storage=LazyTensorStorage(5000), transform=hindsight(reward_fn), batch_size=256
     )
-    for make in (toy.make_first, toy.make_second, toy.make_env):
+    for make in (*WORKERS, toy.make_env):
         for data in collect(functools.partial(Collector, make), 3 * 5, 3 * 5 * 4):
             rb.extend(data.reshape(-1))
     check_batch(rb.sample(), rb.storage[:], "future")
-
-
-@pytest.mark.slow
-def test_parallel_env():
-    check(PARALLEL, 6 * 4, 6 * 4 * 20)
-
-
-@pytest.mark.slow
-def test_multi_process_synchronous():
-    check(SYNC, 6 * 4, 6 * 4 * 20)
-
-
-@pytest.mark.slow
-def test_multi_process_asynchronous():
-    check(ASYNC, 3 * 4, 3 * 4 * 40)
-
-
-PANDAS = {
-    "batched": functools.partial(Collector, panda.make_env),
-    "ParallelEnv": functools.partial(Collector, panda.make_parallel),
-    "synchronous": functools.partial(
-        MultiSyncCollector, [panda.make_env, panda.make_longer]
-    ),
-    "asynchronous": functools.partial(
-        MultiAsyncCollector, [panda.make_env, panda.make_longer]
-    ),
-}
-PANDAS_NESTED = {
-    "synchronous": functools.partial(MultiSyncCollector, [panda.make_parallel] * 2),
-    "asynchronous": functools.partial(MultiAsyncCollector, [panda.make_parallel] * 2),
-}
-
-
-@pytest.mark.parametrize("collector", PANDAS)
-def test_panda_environments(collector):
-    check_panda(PANDAS[collector])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("collector", PANDAS_NESTED)
-def test_panda_parallel_env_in_workers(collector):
-    check_panda(PANDAS_NESTED[collector])
-
-
-def check_panda(make_collector):
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100),
-        transform=HindsightRelabel(panda.reward_fn),
-        batch_size=128,
-    )
-    share, written = [], 0
-    for data in collect(make_collector, 8 * 3, 8 * 3 * 12):
-        rb.extend(data.reshape(-1))
-        written += data.numel()
-        mask = panda.check_batch(rb.sample(), rb.storage[:])
-        share.append(mask.float().mean())
-    assert written > 2 * len(rb) == 200  # it was full, and written over
-    assert abs(sum(share) / len(share) - 0.8) < 0.1
 
 
 def test_augment_of_a_collectors_data():

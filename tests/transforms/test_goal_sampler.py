@@ -4,18 +4,15 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from torchrl.collectors import Collector
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     ReplayBuffer,
     SliceSampler,
     TensorDictReplayBuffer,
-    TensorStorage,
 )
 from torchrl.envs import CatTensors, TransformedEnv
 
-from tests.transforms import toy
 from tests.transforms.identifiable import (
     Envs,
     check_goals,
@@ -83,28 +80,6 @@ def test_storages_on_disk_and_prefetching(cls, prefetch, tmp_path):
         check_sample(rb.sample(), before)
     check_sample(rb[:], before)
     assert (rb.storage[:] == before).all(), "the storage was written into"
-
-
-@pytest.mark.parametrize("ndim", [1, 2])
-def test_collectors(ndim):
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(200, ndim=ndim),
-        transform=GoalSampler(ALL, reward_fn),
-        batch_size=64,
-    )
-    for data in Collector(toy.make_env, frames_per_batch=15, total_frames=600):
-        rb.extend(data if ndim == 2 else data.reshape(-1))
-        check_sample(rb.sample(), rb.storage[:])
-
-
-def test_existing_data():
-    data = name_goals(Envs(20, [9]).chunk(9)).exclude("collector")
-    transform = GoalSampler(ALL, reward_fn)
-    prepared = transform.prepare(data)
-    rb = TensorDictReplayBuffer(
-        storage=TensorStorage(prepared), transform=transform, batch_size=256
-    )
-    check_sample(rb.sample(), prepared)
 
 
 def test_the_first_key_determines_reward_success_and_ends():

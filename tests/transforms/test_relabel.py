@@ -16,6 +16,7 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.data.replay_buffers import HERReplayBuffer
+from torchrl.data.replay_buffers.samplers import prioritized
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
@@ -50,11 +51,11 @@ def make_buffer(capacity=1000, *, ndim=1, sampler=None, batch_size=64, **options
     )
 
 
-def flatten(data, how):
-    """[N, T] as an unflattened, an environment by environment or a stepwise batch."""
-    if how == "none":
-        return data
-    return (data if how == "env_first" else data.transpose(0, 1)).reshape(-1)
+def flatten(data, layout):
+    """[N, T] unflattened, without ids, or flattened by environment or by time."""
+    if layout in ("none", "no_ids"):
+        return data if layout == "none" else data.exclude("collector")
+    return (data if layout == "env_first" else data.transpose(0, 1)).reshape(-1)
 
 
 def is_mixed(batch):
@@ -101,17 +102,11 @@ def test_no_goal_is_wrong(
         batch_size=batch_size,
     )
     # Shows that roots are what the step before achieved.
-    first = Envs(num_envs, [3], first_env=1000).chunk(2)
-    if layout == "no_ids":
-        del first["collector"]
-    rb.extend(flatten(first, layout if ndim == 1 else "none"))
+    rb.extend(flatten(Envs(num_envs, [3], first_env=1000).chunk(2), layout))
     for i in range(60):
         if restart and i % restart == 0:  # a new collector, whose ids begin anew
             envs = Envs(num_envs, lengths, seed=i, first_env=10 * i)
-        data = envs.chunk(steps[i % len(steps)])
-        if layout == "no_ids":
-            del data["collector"]
-        rb.extend(flatten(data, layout if ndim == 1 else "none"))
+        rb.extend(flatten(envs.chunk(steps[i % len(steps)]), layout))
         if i % every or len(rb) < batch_size:
             continue
         batch = rb.sample()
@@ -120,41 +115,29 @@ def test_no_goal_is_wrong(
         check_untouched(batch, stored)
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
-def test_samples_of_whole_episodes_while_others_wait(strategy):
-    envs = Envs(1, [5])
-    rb = make_buffer(strategy=strategy, batch_size=1, seed=0)
-    for _ in range(40):  # ended episodes, most of which a sample leaves alone
-        rb.extend(flatten(envs.chunk(5), "env_first"))
-        check_batch(rb.sample(), rb.storage[:], strategy)
-
-
-@pytest.mark.parametrize("layout", ["env_first", "time_first", "none"])
+@pytest.mark.parametrize("layout", ["env_first", "time_first"])
 @pytest.mark.parametrize("steps", [1, 10, 50])
-def test_no_mixed_goals_where_her_buffer_has_them(layout, steps, record_property):
+def test_no_mixed_goals_where_her_buffer_has_them(layout, steps):
+    """Prints the README's shares of goals from other episodes (pytest -s)."""
+
     def her_reward(td):
         return reward_fn(td["next", "achieved_goal"], td["desired_goal"])
 
-    if layout == "none" and steps == 1:
-        pytest.skip("TensorDictReplayBuffer cannot write one step of ndim=2 data")
     envs = Envs(4, [50])
     storage = LazyTensorStorage(5000)
     theirs = HERReplayBuffer(her_reward, storage=storage, batch_size=256)
-    ours = make_buffer(5000, ndim=2 if layout == "none" else 1, batch_size=256)
-    mixed = {"ours": [], "HERReplayBuffer": []}
+    ours = make_buffer(5000, batch_size=256)
+    mixed = []
     for i in range(800 // steps):
-        data = envs.chunk(steps)
-        theirs.extend(flatten(data, "env_first" if layout == "none" else layout))
-        ours.extend(flatten(data, layout))
+        data = flatten(envs.chunk(steps), layout)
+        theirs.extend(data)
+        ours.extend(data)
         if i % max(1, 40 // steps) == 0:
-            for name, rb in [("ours", ours), ("HERReplayBuffer", theirs)]:
-                batch = rb.sample()
-                mixed[name].append(is_mixed(batch)[relabelled(batch)].float().mean())
-    share = {name: float(torch.stack(x).mean()) for name, x in mixed.items()}
-    for name, value in share.items():
-        record_property(name, value)
-        print(f"{layout}, {steps} steps a batch: {name} mixes {value:.0%}")
-    assert share["ours"] == 0
+            assert not is_mixed(ours.sample()).any()
+            batch = theirs.sample()
+            mixed.append(is_mixed(batch)[relabelled(batch)].float().mean())
+    share = float(torch.stack(mixed).mean())
+    print(f"{layout}, {steps} steps a batch: HERReplayBuffer mixes {share:.0%}")
 
 
 @pytest.mark.parametrize("her_ratio", [0.0, 0.3, 0.8, 1.0])
@@ -274,52 +257,26 @@ def test_bad_values_are_refused(hindsight, options, message):
         hindsight(reward_fn, **options)
 
 
-@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
-def test_reward_fn_must_be_a_function(hindsight):
+def test_reward_fn_must_be_a_function():
     with pytest.raises(ValueError, match="reward_fn must be a function, got None"):
-        hindsight(None)
+        HindsightRelabel(None)
 
 
-def test_terminated_and_done_are_rewritten():
-    rb = make_buffer(strategy="future", her_ratio=0.7, terminated_fn=terminated_fn)
-    rb.extend(Envs(4, [3, 8]).chunk(40).reshape(-1))
-    batch, stored = rb.sample(), rb.storage[:]
-    mask = relabelled(batch)[:, None]
-    reached = terminated_fn(batch["next", "achieved_goal"], batch["desired_goal"])
-    assert (batch["next", "terminated"] == (reached & mask)).all()
-    truncated = stored["next", "truncated"][batch["index"]]
-    assert (batch["next", "truncated"] == truncated).all()
-    assert (batch["next", "done"] == (batch["next", "terminated"] | truncated)).all()
-    assert batch["next", "terminated"].any()
-
-
-FUNCTIONS = {"reward_fn": reward_fn, "terminated_fn": terminated_fn}
-
-
-def sample_with(**function):
-    """Samples relabelled rows with another reward or termination."""
+@pytest.mark.parametrize(
+    ("values", "got"),
+    [(lambda achieved, desired: torch.zeros(8), r"\(8,\)"), (lambda *_: 0.0, "float")],
+)
+@pytest.mark.parametrize("name", ["reward_fn", "terminated_fn"])
+def test_functions_that_return_no_column_raise(name, values, got):
+    functions = {"reward_fn": reward_fn, "terminated_fn": terminated_fn, name: values}
     rb = TensorDictReplayBuffer(
         storage=LazyTensorStorage(100),
-        transform=HindsightRelabel(**(FUNCTIONS | function), her_ratio=1.0),
+        transform=HindsightRelabel(**functions, her_ratio=1.0),
         batch_size=8,
     )
-    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
-    return rb.sample()
-
-
-@pytest.mark.parametrize("which", FUNCTIONS)
-def test_wrong_shape_raises(which):
-    def flat(achieved, desired):
-        return FUNCTIONS[which](achieved, desired).squeeze(-1)
-
-    with pytest.raises(ValueError, match=rf"{which}.*\(8, 1\), got \(8,\)"):
-        sample_with(**{which: flat})
-
-
-@pytest.mark.parametrize("which", FUNCTIONS)
-def test_function_that_returns_no_tensor_raises(which):
-    with pytest.raises(ValueError, match=rf"{which}.*tensor.*\(8, 1\), got float"):
-        sample_with(**{which: lambda achieved, desired: 0.0})
+    with pytest.raises(ValueError, match=rf"{name}.*tensor.*\(.*, 1\), got {got}"):
+        rb.extend(Envs(2, [4]).chunk(4).reshape(-1))
+        rb.sample()
 
 
 def test_other_types_are_cast():
@@ -340,24 +297,6 @@ def test_other_types_are_cast():
     assert batch["next", "terminated"].dtype == torch.bool
 
 
-def test_reward_fn_sees_the_relabelled_rows_once():
-    calls = []
-
-    def counting(achieved, desired):
-        calls.append(len(achieved))
-        return reward_fn(achieved, desired)
-
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100),
-        transform=HindsightRelabel(counting),
-        batch_size=64,
-    )
-    rb.extend(Envs(2, [5]).chunk(5).reshape(-1))
-    assert calls == []
-    batch = rb.sample()
-    assert calls == [int(relabelled(batch).sum())]
-
-
 # -- which trajectory -----------------------------------------------------------------
 
 
@@ -367,16 +306,12 @@ def test_flat_data_without_ids_raise():
         rb.extend(Envs(2, [5]).chunk(5).exclude("collector").reshape(-1))
 
 
-def test_missing_entries_raise():
-    rb = make_buffer()
-    with pytest.raises(KeyError, match="desired_goal"):
-        rb.extend(Envs(2, [5]).chunk(5).exclude("desired_goal").reshape(-1))
-
-
-@pytest.mark.parametrize("key", ["achieved_goal", "done"])
-def test_missing_entries_of_later_data_raise(key):
+@pytest.mark.parametrize("key", ["desired_goal", "achieved_goal", "done"])
+@pytest.mark.parametrize("later", [False, True])
+def test_missing_entries_raise(key, later):
     rb, envs = make_buffer(), Envs(2, [5])
-    rb.extend(envs.chunk(5).reshape(-1))
+    if later:
+        rb.extend(envs.chunk(5).reshape(-1))
     with pytest.raises(KeyError, match=rf"needs .*{key}"):
         rb.extend(envs.chunk(5).exclude(("next", key)).reshape(-1))
 
@@ -397,37 +332,27 @@ def test_rows_stored_without_the_transform_raise(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["env_first", "time_first", "no_ids"])
-@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
-@pytest.mark.parametrize("sample_between", [True, False])
 @pytest.mark.parametrize("rooted", [True, False])
-def test_ids_that_begin_anew(layout, strategy, sample_between, rooted):
+def test_ids_that_begin_anew(layout, rooted):
     """Collectors in turn, each of which leaves episodes unfinished."""
-    rb = make_buffer(ndim=2 if layout == "no_ids" else 1, strategy=strategy)
+    rb = make_buffer(ndim=2 if layout == "no_ids" else 1, strategy="episode")
     for i in range(4):
         envs = Envs(3, [7], first_env=10 * i)
         for _ in range(5):
-            data = envs.chunk(2)
-            if layout == "no_ids":
-                data, how = data.exclude("collector"), "none"
-            else:
-                how = layout
-            data = flatten(data, how)
+            data = flatten(envs.chunk(2), layout)
             rb.extend(data if rooted else data.exclude("achieved_goal"))
-            if sample_between:
-                rb.sample()
         if not rooted:
             rb.transform[0].end_trajectories()
     for _ in range(5):
         batch = rb.sample()
-        check_batch(batch, rb.storage[:], strategy)
+        check_batch(batch, rb.storage[:], "episode")
         assert relabelled(batch).any()
 
 
 @pytest.mark.parametrize(
     ("layout", "steps"), [("env_first", 1), ("env_first", 2), ("no_ids", 2)]
 )
-@pytest.mark.parametrize("sample_between", [True, False])
-def test_root_goals_that_tell_nothing(layout, steps, sample_between):
+def test_root_goals_that_tell_nothing(layout, steps):
     """As in made-up data: then the ids alone decide."""
     rb = make_buffer(
         ndim=2 if layout == "no_ids" else 1, strategy="final", her_ratio=1.0
@@ -436,11 +361,7 @@ def test_root_goals_that_tell_nothing(layout, steps, sample_between):
     for _ in range(14 // steps):
         data = envs.chunk(steps)
         data["achieved_goal"] = torch.randn(data["achieved_goal"].shape)
-        if layout == "no_ids":
-            data = data.exclude("collector")
-        rb.extend(flatten(data, "none" if layout == "no_ids" else layout))
-        if sample_between:
-            rb.sample()
+        rb.extend(flatten(data, layout))
     batch = rb.sample()
     assert (batch["desired_goal"][:, 2] == 7).all()  # the last step of the episode
 
@@ -504,20 +425,6 @@ def test_three_dimensional_data():
     assert relabelled(batch).any()
 
 
-def test_workers_that_take_turns():
-    """Each worker's environments, with ids of a common pool, in no fixed order."""
-    workers = [Envs(2, [13, 7], seed=i) for i in range(3)]
-    rb = make_buffer(150)
-    for i in range(100):
-        worker = int(torch.randint(3, ()))
-        data = workers[worker].chunk(1 + i % 4)
-        for key in ("achieved_goal", ("next", "achieved_goal")):
-            data[key][..., 0] += 2 * worker
-        data["collector", "traj_ids"] = data["collector", "traj_ids"] * 3 + worker
-        rb.extend(data.reshape(-1))
-        check_batch(rb.sample(), rb.storage[:], "future")
-
-
 # -- storages, samplers, buffers ------------------------------------------------------
 
 
@@ -536,7 +443,13 @@ def test_memmap_storage_and_reading_it_all(tmp_path):
         assert (rb.storage[:] == before).all(), "the storage was written into"
 
 
-def test_reading_one_row():
+def test_reading_one_row_or_all_of_two_dimensions():
+    rb = make_buffer(60, ndim=2)
+    rb.extend(Envs(3, [5, 9]).chunk(20))
+    batch = rb[:]
+    assert batch.shape == (3, 20)
+    assert not is_mixed(batch).any()
+    assert relabelled(batch).any()
     rb = make_buffer(her_ratio=1.0, strategy="final")
     rb.extend(Envs(3, [5]).chunk(5).reshape(-1))
     before = rb.storage[:].clone()
@@ -547,37 +460,17 @@ def test_reading_one_row():
     assert (rb.storage[:] == before).all(), "the storage was written into"
 
 
-def test_two_dimensional_storage_read_whole():
-    rb = make_buffer(60, ndim=2)
-    rb.extend(Envs(3, [5, 9]).chunk(20))
-    batch = rb[:]
-    assert batch.shape == (3, 20)
-    assert not is_mixed(batch).any()
-    assert relabelled(batch).any()
-
-
-@pytest.mark.parametrize("strategy", STRATEGIES)
-@pytest.mark.parametrize("options", [{}, {"capacity": 50}])
-def test_plain_replay_buffer(strategy, options):
+@pytest.mark.parametrize("strategy", ["future", "random"])
+def test_plain_replay_buffer(strategy):
     rb = ReplayBuffer(
         storage=LazyTensorStorage(50),
-        transform=HindsightRelabel(reward_fn, strategy=strategy, **options),
+        transform=HindsightRelabel(reward_fn, strategy=strategy),
         batch_size=32,
     )
     envs = Envs(3, [5, 9])
     for _ in range(30):
         rb.extend(envs.chunk(3).reshape(-1))
         check_batch(rb.sample(), rb.storage[:], strategy)
-
-
-def test_chunks_as_items_raise():
-    """[N, T] data in a 1-d storage: its rows are not written one after the other."""
-    rb = make_buffer(30, batch_size=8)
-    envs = Envs(4, [5])
-    with pytest.raises(RuntimeError, match="several dimensions"):
-        for _ in range(20):
-            rb.extend(envs.chunk(5))
-            rb.sample()
 
 
 @pytest.mark.parametrize("strict", [True, False])
@@ -625,42 +518,11 @@ def test_padded_slices():
         assert (pieces == pieces[:, :1]).all()
 
 
-class SumTree:
-    """What torchrl's compiled trees do, slowly."""
-
-    def __init__(self, size):
-        self.values = torch.zeros(size)
-
-    def __getitem__(self, index):
-        return self.values[index]
-
-    def __setitem__(self, index, value):
-        self.values[index] = torch.as_tensor(value, dtype=torch.float32)
-
-    def query(self, left, right):
-        return self.values[left:right].sum().item()
-
-    def scan_lower_bound(self, mass):
-        index = torch.searchsorted(self.values.cumsum(0), torch.as_tensor(mass))
-        return index.clamp(max=len(self.values) - 1)
-
-
-class MinTree(SumTree):
-    def query(self, left, right):
-        return self.values[left:right].min().item()
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_prioritized_sampler(compiled, monkeypatch):
-    from torchrl.data.replay_buffers.samplers import prioritized
-
-    if not compiled:
-        for trees, tree in ("SumSegmentTree", SumTree), ("MinSegmentTree", MinTree):
-            for dtype in ("Fp32", "Fp64"):
-                monkeypatch.setattr(prioritized, trees + dtype, tree)
-    elif prioritized.SumSegmentTreeFp32 is None:
-        pytest.skip("torchrl's compiled extension does not load with this torch")
-
+@pytest.mark.skipif(
+    prioritized.SumSegmentTreeFp32 is None,
+    reason="torchrl's compiled extension does not load with this torch",
+)
+def test_prioritized_sampler():
     def make(transform):
         return TensorDictReplayBuffer(
             storage=LazyTensorStorage(100),
@@ -720,7 +582,7 @@ def test_prefetch_beside_writing():
 
 @pytest.mark.parametrize("how", ["state_dict", "dumps"])
 @pytest.mark.parametrize("seed", [None, 3])
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("strategy", ["future", "random"])
 def test_reloaded_buffer_draws_the_same_goals(how, seed, strategy, tmp_path):
     def sample(rb, envs):
         torch.manual_seed(5)
@@ -769,19 +631,18 @@ def test_new_collector_after_a_reload(how, rooted, tmp_path):
     check_batch(new.sample(), new.storage[:], "future")
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
-@pytest.mark.parametrize("before", [7, 33, 60, 75])  # the last: 9 x capacity
-def test_emptied_buffer(strategy, before):
-    rb, envs = make_buffer(100, strategy=strategy), Envs(3, [5, 9, 40])
-    for _ in range(before):
+@pytest.mark.parametrize("forgets", [False, True])
+def test_emptied_buffer(forgets):
+    rb, envs = make_buffer(100, strategy="random"), Envs(3, [5, 9, 40])
+    for _ in range(33):
         rb.extend(envs.chunk(4).reshape(-1))
         rb.sample()
-    if before * 12 % 100 == 0:
+    if forgets:
         rb.transform[0].empty()
     rb.empty()
     for _ in range(30):
         rb.extend(envs.chunk(4).reshape(-1))
-        check_batch(rb.sample(), rb.storage[:], strategy)
+        check_batch(rb.sample(), rb.storage[:], "random")
 
 
 def test_the_memory_takes_few_bytes_per_transition():
@@ -794,11 +655,6 @@ def test_the_memory_takes_few_bytes_per_transition():
     arrays = sum(x.nbytes for x in state.values() if isinstance(x, torch.Tensor))
     serials = rb.storage[:]["hindsight_serial"].nbytes
     assert (arrays + serials) / capacity <= 3 * 4 + 24  # a goal of 3 numbers
-
-
-def test_shared_buffer_raises():
-    with pytest.raises(RuntimeError, match="share_memory_"):
-        make_buffer(100, shared=True)
 
 
 def test_seed_does_not_touch_torchs_generator():
@@ -830,14 +686,13 @@ def test_random_numbers_are_reproducible():
 # -- what it cannot be combined with --------------------------------------------------
 
 
-@pytest.mark.parametrize("nested", ["neither", "relabel", "multi_step", "both"])
+@pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("late", [False, True])
 def test_multi_step_raises(nested, late):
     relabel = HindsightRelabel(reward_fn)
     multi_step = MultiStepTransform(n_steps=3, gamma=0.9)
-    if nested in ("relabel", "both"):
+    if nested:
         relabel = Compose(relabel)
-    if nested in ("multi_step", "both"):
         multi_step = Compose(DoubleToFloat(), Compose(multi_step))
     rb = TensorDictReplayBuffer(
         storage=LazyTensorStorage(100, ndim=2),
@@ -870,11 +725,7 @@ def test_default_device(seed, layout):
     """torchrl's buffers themselves do without one."""
     transform = HindsightRelabel(reward_fn, seed=seed, strategy="episode")
     data = Envs(3, [5]).chunk(10)
-    data["index"] = torch.arange(10).repeat(3, 1)
-    if layout == "no_ids":
-        data = data.exclude("collector")
-    else:
-        data = flatten(data, layout).set("index", torch.arange(30))
+    data = flatten(data, layout)
     with torch.device("meta"):
         batch = transform.forward(transform._inv_call(data))
     assert relabelled(batch).any()

@@ -64,5 +64,13 @@ def make_second() -> ToyEnv:
     return ToyEnv(3, 2)
 
 
+def make_third() -> ToyEnv:
+    return ToyEnv(3, 3)
+
+
 def make_parallel() -> ParallelEnv:
     return ParallelEnv(2, [make_first, make_second])
+
+
+def make_third_in_parallel() -> ParallelEnv:
+    return ParallelEnv(1, make_third)
