@@ -7,7 +7,7 @@ import torch_panda
 from tests.learning.test_agents import critics_of
 from tests.learning.transitions import make_transitions
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.imitation import BC_WEIGHT
+from torch_panda.learning.agents.ddpg import BC_WEIGHT
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
 from torch_panda.learning.agents.base import TAU, Agent
 from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.imitation import imitation_loss
 from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.transitions import Transitions
@@ -22,6 +21,8 @@ from torch_panda.learning.transitions import Transitions
 # inputs can grow until the gradient of the tanh vanishes, which ruined policies of
 # Slide (arXiv 1707.01495, appendix A).
 SATURATION_L2 = 0.01
+# Weight of imitation in the actor's loss (Nair et al., arXiv 1709.10089).
+BC_WEIGHT = 20.0
 
 
 class DDPG(Agent):
@@ -109,10 +110,11 @@ class DDPG(Agent):
         penalty = penalty + SATURATION_L2 * before_tanh.square().mean()
         actor_loss = penalty - value.mean()
         if num_demos:
-            demos = slice(-num_demos, None)
-            actor_loss = actor_loss + imitation_loss(
-                action[demos], rows.action[demos], value[demos], values[0][demos]
-            )
+            # Imitate only demonstrated actions that the critic prefers (the Q filter).
+            is_preferred = (values[0] > value)[-num_demos:].detach()
+            difference = (action - rows.action)[-num_demos:]
+            imitation_loss = (difference.square() * is_preferred).mean()
+            actor_loss = actor_loss + BC_WEIGHT * imitation_loss
         # Only for the actor: the critics already have the gradients of their own loss.
         actor_loss.backward(inputs=self.actor_parameters)
         return {"critic_loss": critic_loss, "actor_loss": actor_loss}
