@@ -10,16 +10,14 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import version
-from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium
 import numpy as np
@@ -34,6 +32,8 @@ import torch_panda
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.solver import SOLVER_VARIABLE
 from torch_panda.info import num_cores
+from torch_panda.learning import files
+from torch_panda.learning.limits import Positive, check_limits
 from torch_panda.learning.user_modules import (
     Imports,
     UserModule,
@@ -61,24 +61,23 @@ class Args:
 
     ids: tuple[str, ...] = ("PandaPush-v3",)
     """environments to measure; `python -m torch_panda info` lists the ids"""
-    num_envs: tuple[int, ...] = (16,)
+    num_envs: tuple[Positive, ...] = (16,)
     """numbers of environments that are stepped in parallel"""
-    num_threads: int | None = None
+    num_threads: Positive | None = None
     """number of threads of contenders that use threads; None means one per core, and at
     most one per environment"""
     others: tuple[Other, ...] = get_args(Other)
-    """contenders beside torch_panda; a contender whose libraries are missing is
-    skipped"""
-    rounds: int = 7
+    """contenders beside torch_panda; one whose libraries are missing is not measured"""
+    rounds: Positive = 7
     """number of turns of each contender; the table shows the median"""
-    steps: int = 50
+    steps: Positive = 50
     """steps of each environment in a turn, after as many steps that warm up"""
-    render_size: int | None = None
+    render_size: Positive | None = None
     """width and height of pictures to observe [pixels]; measures only torch_panda,
     `fast` and `async`"""
     buffers: bool = False
     """measure replay buffers with and without hindsight instead of environments"""
-    plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    plot: Path | None = None
     """picture of the speeds to write, for instance speed.png"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
@@ -86,15 +85,7 @@ class Args:
 
 @dataclass(frozen=True)
 class Setting:
-    """A workload that all contenders run.
-
-    Attributes:
-        env_id: Id of one of our environments.
-        num_envs: Number of environments stepped in parallel.
-        num_threads: Number of threads of contenders that use threads.
-        render_size: Width and height of observed pictures [pixels]; None means none.
-        modules: Modules of the user that register ids.
-    """
+    """A workload that all contenders run. `Args` explains the options."""
 
     env_id: str
     num_envs: int
@@ -214,9 +205,8 @@ def _make_bare_bullet(setting: Setting) -> Running:
 
 
 def _panda_gym_id(setting: Setting) -> str:
-    major = version("panda-gym").split(".")[0]
     # The prefix names the module whose import registers the id.
-    return f"panda_gym:{setting.env_id.rsplit('-', 1)[0]}-v{major}"
+    return f"panda_gym:{setting.env_id.rsplit('-', 1)[0]}-v3"
 
 
 def _make_panda_gym_env(setting: Setting) -> gymnasium.Env[Any, Any]:
@@ -255,28 +245,24 @@ def _make_parallel(setting: Setting) -> Running:
     return _run_torchrl(ParallelEnv(setting.num_envs, make_env, mp_start_method="fork"))
 
 
-def _newest_fetch_id(env_id: str, ids: Sequence[str]) -> str:
-    """Return the newest version of the Fetch robot's task of the same name."""
-    match = re.fullmatch(r"Panda(Reach|Push|Slide|PickAndPlace)(Dense)?-v\d+", env_id)
-    if match is None:
-        raise ValueError(f"Fetch has no task like {env_id}")
-    prefix = f"Fetch{match[1]}{match[2] or ''}-v"
-    versions = [int(x.removeprefix(prefix)) for x in ids if x.startswith(prefix)]
-    return f"{prefix}{max(versions)}"
+def _fetch_id(setting: Setting) -> str:
+    """Return the id of the Fetch robot's task of the same name."""
+    task = setting.env_id.removeprefix("Panda").rsplit("-", 1)[0]
+    return f"Fetch{task}-v4"
 
 
 def _make_fetch_env(setting: Setting) -> gymnasium.Env[Any, Any]:
     import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    return gymnasium.make(_newest_fetch_id(setting.env_id, list(gymnasium.registry)))
+    return gymnasium.make(_fetch_id(setting))
 
 
 def _make_envpool(setting: Setting) -> Running:
     import envpool
 
     env = envpool.make(
-        _newest_fetch_id(setting.env_id, envpool.list_all_envs()),
+        _fetch_id(setting),
         env_type="gymnasium",
         num_envs=setting.num_envs,
         num_threads=setting.num_threads,
@@ -284,83 +270,38 @@ def _make_envpool(setting: Setting) -> Running:
     return _run_vector_env(env, setting.num_envs, env.action_space)
 
 
-@dataclass(frozen=True)
-class Contender:
+class Contender(NamedTuple):
     """Vector environment to compare.
 
     Attributes:
         title: Name in the table.
         make: Makes the environments of a setting.
-        memory: Typical memory of one environment [MB].
-        modules: Modules that must be installed.
-        renders: Whether it can observe pictures.
-        variables: Environment variables of its process.
+        solver: Value of the environment variable `SOLVER_VARIABLE`; None leaves it.
     """
 
     title: str
     make: Callable[[Setting], Running]
-    memory: float
-    modules: tuple[str, ...] = ()
-    renders: bool = False
-    variables: Mapping[str, str] = field(default_factory=dict)
-
-    def obstacle(self, setting: Setting) -> str | None:
-        """Return the reason why the contender cannot run here, or None if it can."""
-        missing = [module for module in self.modules if find_spec(module) is None]
-        if missing:
-            return f"{' and '.join(missing)} is not installed"
-        if setting.render_size is not None and not self.renders:
-            return "--render-size is not supported"
-        needed, free = self.memory * setting.num_envs, available_memory()
-        # Linux ends arbitrary processes when memory runs out.
-        if needed > 0.9 * free:
-            return (
-                f"{setting.num_envs} environments need about {needed / 1000:.1f} GB, "
-                f"{free / 1000:.1f} GB are free"
-            )
-        return None
+    solver: str | None = None
 
 
-_OWN_SOLVER = {SOLVER_VARIABLE: "bullet"}
-
-CONTENDERS: dict[str, Contender] = {
-    OURS: Contender("torch_panda", _make_ours, 45, renders=True),
+CONTENDERS = {
+    OURS: Contender("torch_panda", _make_ours),
     "fast": Contender(
-        'torch_panda, physics="fast"',
-        partial(_make_ours, physics="fast"),
-        45,
-        renders=True,
+        'torch_panda, physics="fast"', partial(_make_ours, physics="fast")
     ),
-    "own-solver": Contender(
-        "torch_panda, Bullet's own solver", _make_ours, 45, variables=_OWN_SOLVER
-    ),
-    "bare-bullet": Contender(
-        "bare Bullet, C threads", _make_bare_bullet, 45, variables=_OWN_SOLVER
-    ),
+    "own-solver": Contender("torch_panda, Bullet's own solver", _make_ours, "bullet"),
+    "bare-bullet": Contender("bare Bullet, C threads", _make_bare_bullet, "bullet"),
     "async": Contender(
-        "panda-gym, AsyncVectorEnv",
-        partial(_make_async, _make_panda_gym_env),
-        115,
-        ("panda_gym",),
-        renders=True,
+        "panda-gym, AsyncVectorEnv", partial(_make_async, _make_panda_gym_env)
     ),
-    "sb3": Contender(
-        "panda-gym, SB3 SubprocVecEnv",
-        _make_sb3,
-        155,
-        ("panda_gym", "stable_baselines3"),
-    ),
-    "parallel": Contender(
-        "panda-gym, torchrl ParallelEnv", _make_parallel, 115, ("panda_gym",)
-    ),
+    "sb3": Contender("panda-gym, SB3 SubprocVecEnv", _make_sb3),
+    "parallel": Contender("panda-gym, torchrl ParallelEnv", _make_parallel),
     "fetch": Contender(
-        "Fetch (MuJoCo), AsyncVectorEnv",
-        partial(_make_async, _make_fetch_env),
-        50,
-        ("gymnasium_robotics",),
+        "Fetch (MuJoCo), AsyncVectorEnv", partial(_make_async, _make_fetch_env)
     ),
-    "envpool": Contender("Fetch (MuJoCo), EnvPool", _make_envpool, 15, ("envpool",)),
+    "envpool": Contender("Fetch (MuJoCo), EnvPool", _make_envpool),
 }
+RENDERING = (OURS, "fast", "async")  # contenders that can observe pictures
 
 
 # Measurement ------------------------------------------------------------------
@@ -368,11 +309,6 @@ CONTENDERS: dict[str, Contender] = {
 
 def measure(name: str, setting: Setting, steps: int) -> Measurement:
     """Measure one turn of a contender in a new process.
-
-    Args:
-        name: Key of `CONTENDERS`.
-        setting: Workload.
-        steps: Steps of each environment, after as many steps that warm up.
 
     Raises:
         Exception: The contender's own error, or ``BrokenProcessPool`` if its process
@@ -390,8 +326,9 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     import_modules(setting.modules)
     # pybullet prints on stdout whenever it loads a robot.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    os.environ.update(CONTENDERS[name].variables)
-    make = CONTENDERS[name].make
+    _, make, solver = CONTENDERS[name]
+    if solver is not None:
+        os.environ[SOLVER_VARIABLE] = solver
     # A first environment imports all modules, which should not count.
     first = make(replace(setting, num_envs=1, num_threads=1))
     used_before, start = _memory(), time.perf_counter()
@@ -446,15 +383,6 @@ def _cpu_time() -> float:
     return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
 
-def available_memory() -> float:
-    """Memory that is still available on this machine [MB]; infinite except on Linux."""
-    if sys.platform != "linux":
-        return math.inf
-    text = Path("/proc/meminfo").read_text()
-    match = re.search(r"^MemAvailable: +(\d+) kB", text, re.MULTILINE)
-    return 1024 * int(match[1]) / 1e6 if match else math.inf
-
-
 # Report -----------------------------------------------------------------------
 
 _COLUMNS = (
@@ -470,51 +398,39 @@ _COLUMNS = (
 )
 
 Results = dict[tuple[Setting, str], list[Measurement]]
-Obstacles = dict[tuple[str, str], None]
 
 
 def compare(
     settings: Sequence[Setting], names: Sequence[str], *, rounds: int, steps: int
-) -> tuple[Results, Obstacles]:
+) -> tuple[Results, list[str]]:
     """Measure contenders in turns: A B C, A B C, and so on.
 
-    A contender that fails takes no further turns. Ctrl-C ends the measurement. The
-    results until then are kept in both cases.
-
-    Args:
-        settings: Workloads.
-        names: Keys of `CONTENDERS`, in the order of their turns.
-        rounds: Number of turns of each contender.
-        steps: Steps of each environment in a turn.
+    A contender that fails takes no further turns. Ctrl-C ends the measurement. In both
+    cases the results until then are kept.
 
     Returns:
-        The measurements of each setting and contender, and the contenders that did not
-        run with the reason, both in the order of the turns.
+        The measurements of each setting and contender in the order of the turns, and a
+        line for each contender that did not run or failed, with the reason.
     """
     results: Results = {}
-    obstacles: Obstacles = {}
-    with tqdm(total=len(settings) * rounds * len(names), unit="turn") as bar:
-        for setting in settings:
-            running = list(names)
+    failures: list[str] = []
+    running = [(setting, name) for setting in settings for name in names]
+    try:
+        with tqdm(total=rounds * len(running), unit="turn") as bar:
             for _ in range(rounds):
-                for name in list(running):
+                for setting, name in list(running):
                     bar.set_description(f"{setting.env_id} x {setting.num_envs} {name}")
-                    obstacle = CONTENDERS[name].obstacle(setting)
-                    if obstacle is None:
-                        try:
-                            measurement = measure(name, setting, steps)
-                        except KeyboardInterrupt:
-                            obstacles["all", "interrupted"] = None
-                            return results, obstacles
-                        except Exception as error:  # of any library
-                            obstacle = f"{type(error).__name__}: {error}"
-                        else:
-                            results.setdefault((setting, name), []).append(measurement)
-                    if obstacle is not None:
-                        running.remove(name)
-                        obstacles[CONTENDERS[name].title, obstacle] = None
+                    try:
+                        measurement = measure(name, setting, steps)
+                        results.setdefault((setting, name), []).append(measurement)
+                    except Exception as error:  # of any library
+                        running.remove((setting, name))
+                        title = CONTENDERS[name].title
+                        failures.append(f"{title}: {type(error).__name__}: {error}")
                     bar.update()
-    return results, obstacles
+    except KeyboardInterrupt:
+        failures.append("all: interrupted")
+    return results, list(dict.fromkeys(failures))
 
 
 def table(results: Results) -> str:
@@ -561,45 +477,35 @@ def _spread(values: Sequence[float], *, digits: int) -> str:
 
 
 def plot(path: Path, results: Results) -> None:
-    """Draw steps per second: a panel for each setting, and a bar for each contender.
-
-    Args:
-        path: File to write, in the format that its suffix names.
-        results: Measurements in the order in which they are drawn.
-    """
+    """Draw steps per second: a panel for each setting, and a bar for each contender."""
     from matplotlib.figure import Figure
 
     settings = list(dict.fromkeys(setting for setting, _ in results))
-    panels = [[name for other, name in results if other == x] for x in settings]
-    figure = Figure(
-        figsize=(7, 0.8 * len(panels) + 0.3 * len(results)), layout="constrained"
-    )
-    axes = figure.subplots(
-        len(panels),
-        squeeze=False,
-        sharex=True,
-        height_ratios=[len(names) for names in panels],
-    )
-    for axis, setting, names in zip(axes[:, 0], settings, panels, strict=True):
-        speeds = [[turn.speed for turn in results[setting, name]] for name in names]
-        middle = [median(values) for values in speeds]
-        spread = [
-            [m - min(values) for m, values in zip(middle, speeds, strict=True)],
-            [max(values) - m for m, values in zip(middle, speeds, strict=True)],
-        ]
-        colors = ["tab:blue" if name == OURS else "tab:gray" for name in names]
-        titles = [CONTENDERS[name].title for name in names]
-        bars = axis.barh(titles, middle, xerr=spread, color=colors)
-        axis.bar_label(bars, fmt="%.0f", label_type="center", color="white")
-        axis.invert_yaxis()
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.set_title(
+    height = 0.8 * len(settings) + 0.3 * len(results)
+    figure = Figure(figsize=(7, height), layout="constrained")
+    grid = figure.subplots(len(settings), squeeze=False, sharex=True)
+    for axes, setting in zip(grid[:, 0], settings, strict=True):
+        for (other, name), turns in results.items():
+            if other != setting:
+                continue
+            speeds = [turn.speed for turn in turns]
+            middle = median(speeds)
+            bar = axes.barh(
+                CONTENDERS[name].title,
+                middle,
+                xerr=[[middle - min(speeds)], [max(speeds) - middle]],
+                color="tab:blue" if name == OURS else "tab:gray",
+            )
+            axes.bar_label(bar, fmt="%.0f", label_type="center", color="white")
+        axes.invert_yaxis()
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_title(
             f"{setting.env_id}: {setting.num_envs} environments, "
             f"{setting.num_threads} threads",
             fontsize="medium",
             loc="left",
         )
-    axes[-1, 0].set_xlabel("steps/s")
+    grid[-1, 0].set_xlabel("steps/s")
     figure.savefig(path, dpi=150)
 
 
@@ -609,12 +515,8 @@ def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
     A cycle is ``extend`` of one episode of 50 steps and ``sample`` of 256 rows, in full
     buffers that hold episodes of Push, on one thread.
 
-    Args:
-        rounds: Number of turns of each buffer.
-        capacity: Number of rows of a buffer.
-
     Returns:
-        Markdown table of medians and ranges.
+        Markdown table of medians and ranges over the rounds.
     """
     torch.set_num_threads(1)
     num_episodes, cycles = 20, 20
@@ -651,27 +553,6 @@ def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
     return _markdown(rows)
 
 
-def check(args: Args) -> None:
-    """Check the options.
-
-    Raises:
-        ValueError: An option is out of range, or an id is unknown.
-    """
-    for env_id in args.ids:
-        torch_panda.max_episode_steps(env_id)  # refuses an unknown id
-    for option, value in (
-        ("--num-envs", min(args.num_envs, default=0)),
-        ("--num-threads", args.num_threads),
-        ("--rounds", args.rounds),
-        ("--steps", args.steps),
-        ("--render-size", args.render_size),
-    ):
-        if value is not None and value < 1:
-            raise ValueError(f"{option} must be at least 1, got {value}")
-    if args.plot is not None and not args.plot.absolute().parent.is_dir():
-        raise ValueError(f"--plot must be a file in an existing folder: {args.plot}")
-
-
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run the command.
 
@@ -680,10 +561,14 @@ def run(arguments: Sequence[str] | None = None) -> None:
     """
     args = tyro.cli(Args, args=arguments, prog="python -m torch_panda bench")
     try:
+        check_limits(args)
         modules = read_modules(args.imports)
         import_modules(modules)
-        check(args)
-    except ValueError as error:
+        for env_id in args.ids:
+            torch_panda.max_episode_steps(env_id)  # refuses an unknown id
+        if args.plot is not None:
+            files.prepare(args.plot)
+    except (ValueError, OSError) as error:
         sys.exit(str(error))
     if args.buffers:
         print(compare_buffers(args.rounds))
@@ -700,11 +585,13 @@ def run(arguments: Sequence[str] | None = None) -> None:
         for n in args.num_envs
     ]
     names = [OURS, *args.others]
-    results, obstacles = compare(settings, names, rounds=args.rounds, steps=args.steps)
+    if args.render_size is not None:
+        names = [name for name in names if name in RENDERING]
+    results, failures = compare(settings, names, rounds=args.rounds, steps=args.steps)
     if results:
         print(table(results))
-    for title, reason in obstacles:
-        print(f"not measured: {title}: {reason}")
+    for failure in failures:
+        print(f"not measured: {failure}")
     if results and args.plot is not None:
         plot(args.plot, results)
     if any((setting, OURS) not in results for setting in settings):
