@@ -1,21 +1,12 @@
-"""The distributed example, on a Ray cluster of two nodes on this machine."""
+"""The distributed command, on a Ray cluster of two nodes on this machine."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
-import uuid
-from pathlib import Path
 
 import pytest
 import torch
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torch_panda.commands import plot
 from torch_panda.learning import curve
-from torch_panda.transforms import HindsightRelabel
 
 ray = pytest.importorskip("ray")
 distributed = pytest.importorskip("torch_panda.commands.distributed")
@@ -113,14 +104,6 @@ def test_workers_fill_one_buffer(start, tmp_path):
     others = goals_of_others(learner.buffer, stored[IDS])
     assert len(others) > 512
     assert not others.any()
-    # The workers' own numbers collide: with them, goals do get mixed.
-    colliding = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(800),
-        transform=HindsightRelabel(learner.env.compute_reward),
-    )
-    copy = stored.select(*stored.keys(True, True)).exclude("index", "hindsight_serial")
-    colliding.extend(copy.set(IDS, copy[IDS] // 2))
-    assert goals_of_others(colliding, stored[IDS]).any()
 
 
 def same(weights, other):
@@ -142,22 +125,18 @@ def test_too_small_a_cluster_is_an_error(address):
     ray.shutdown()
 
 
-@pytest.mark.parametrize("name", ["curve.csv", "checkpoint.pt"])
-def test_another_run_is_not_overwritten(tmp_path, monkeypatch, name):
+def test_another_run_is_not_overwritten(tmp_path, monkeypatch):
     monkeypatch.setattr(distributed, "connect", pytest.fail)
-    (tmp_path / name).write_text("theirs")
+    (tmp_path / "curve.csv").write_text("theirs")
     with pytest.raises(SystemExit, match=f"^{tmp_path} holds a run: "):
         distributed.main(distributed.Args(out=tmp_path))
-    assert (tmp_path / name).read_text() == "theirs"
+    assert (tmp_path / "curve.csv").read_text() == "theirs"
 
 
-@pytest.mark.parametrize("algo", ["ddpg", "td3"])
-def test_something_must_explore(tmp_path, monkeypatch, algo):
+def test_something_must_explore(tmp_path, monkeypatch):
     monkeypatch.setattr(distributed, "connect", pytest.fail)
-    args = distributed.Args(
-        algo=algo, noise_eps=0.0, random_eps=(0.0, 0.0), out=tmp_path / "run"
-    )
-    with pytest.raises(SystemExit, match=f"^algo {algo} explores by noise_eps and "):
+    args = distributed.Args(noise_eps=0.0, random_eps=(0.0, 0.0), out=tmp_path / "run")
+    with pytest.raises(SystemExit, match=r"^algo ddpg explores by noise_eps and "):
         distributed.main(args)
     assert not args.out.exists()
 
@@ -180,45 +159,3 @@ def test_a_run_is_drawn(address, tmp_path):
     assert line == "distributed, num envs 4, steps per batch 5, updates per step 0.25"
     (drawn,) = runs["PandaReach-v1"]["DDPG"][line]
     assert [row["step"] for row in drawn] == [0, 40]
-
-
-@pytest.mark.slow
-def test_interrupt_leaves_nothing_running(tmp_path):
-    mark = str(uuid.uuid4())
-    arguments = (
-        *("--total-steps", "1000000", "--eval-interval", "200", "--num-envs", "4"),
-        *("--updates-per-step", "0.1", "--out", tmp_path),
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-m", "torch_panda", "distributed", *arguments],
-        env={**os.environ, **QUIET, "TEST_MARK": mark},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "checkpoint.pt").exists():
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    assert len(marked(mark)) > 3  # Ray's own processes and the workers
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    output, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
-    assert "stopping after this iteration" in output
-    while marked(mark):
-        assert time.monotonic() < deadline, marked(mark)
-        time.sleep(0.1)
-
-
-def marked(mark):
-    """Commands of the running processes with this in their environment."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if f"TEST_MARK={mark}".encode() in (folder / "environ").read_bytes():
-                found.append((folder / "cmdline").read_text())
-        except OSError:
-            continue
-    return found

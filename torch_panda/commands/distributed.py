@@ -45,7 +45,7 @@ from torch_panda.learning.checkpoint import (
     lock_folder,
     write_options,
 )
-from torch_panda.learning.curve import Curve
+from torch_panda.learning.curve import Curve, draw_seed
 from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
 from torch_panda.learning.options import check_exploration
 from torch_panda.learning.user_modules import (
@@ -102,9 +102,6 @@ class Learner:
     Attributes:
         collector: Iterator over the batches [num_envs, steps_per_batch] of all workers,
             in the order in which they arrive.
-        buffer: The replay buffer.
-        agent: The agent.
-        progress: Number of steps so far, and the evaluations.
     """
 
     def __init__(self, args: Args, out: Path) -> None:
@@ -132,7 +129,9 @@ class Learner:
             for data in self.collector:
                 before, progress.steps = progress.steps, progress.steps + data.numel()
                 self.learn(data)
-                self.send_weights(worker_of(data, args.num_workers))
+                # See `make_unique`.
+                worker = int(data[TRAJECTORY_KEY].flatten()[0]) % args.num_workers
+                self.send_weights(worker)
                 bar.update(data.numel())
                 last = progress.steps >= args.total_steps or bool(stop)
                 if last or crossed(args.eval_interval, before, progress.steps):
@@ -164,31 +163,17 @@ class Learner:
         self.env.close()
 
 
-@dataclass
-class UniqueTrajectories:
-    """Gives the trajectories of all workers different ids, and drops unneeded entries.
+def make_unique(
+    data: TensorDictBase, *, worker: int, num_workers: int
+) -> TensorDictBase:
+    """Give the trajectories of all workers different ids, and drop unneeded entries.
 
     Each worker counts its trajectories from 0. In a buffer of several workers,
     hindsight would take two trajectories with the same id for one, and mix their goals.
-
-    Attributes:
-        worker: Index of the worker.
-        num_workers: Number of workers.
+    So trajectory t of worker w gets the id t * num_workers + w.
     """
-
-    worker: int
-    num_workers: int
-
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        """Give trajectory t of worker w the id t * num_workers + w."""
-        data = data.select(*STORED_KEYS)
-        number = data[TRAJECTORY_KEY] * self.num_workers + self.worker
-        return data.set(TRAJECTORY_KEY, number)
-
-
-def worker_of(data: TensorDictBase, num_workers: int) -> int:
-    """Return the index of the worker that collected a batch."""
-    return int(data[TRAJECTORY_KEY].flatten()[0]) % num_workers
+    data = data.select(*STORED_KEYS)
+    return data.set(TRAJECTORY_KEY, data[TRAJECTORY_KEY] * num_workers + worker)
 
 
 def make_env(
@@ -198,14 +183,9 @@ def make_env(
     num_threads: int,
     seed: int,
 ) -> torch_panda.RobotTaskEnv:
-    """Make a worker's environments, and seed its exploration noise.
+    """Make a worker's environments, and seed them and its exploration noise.
 
-    Args:
-        modules: Modules of the user that register ids.
-        env_id: The task.
-        num_envs: Number of environments.
-        num_threads: Number of threads that step them.
-        seed: Seed of the environments and of the noise.
+    ``modules`` are modules of the user that register ids.
     """
     import_modules(modules)
     torch.manual_seed(seed)
@@ -236,7 +216,9 @@ def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
         exploration_type=ExplorationType.RANDOM,
         collector_kwargs=[
             {
-                "postproc": UniqueTrajectories(worker, args.num_workers),
+                "postproc": partial(
+                    make_unique, worker=worker, num_workers=args.num_workers
+                ),
                 "auto_register_policy_transforms": True,
             }
             for worker in workers
@@ -247,11 +229,6 @@ def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
         },
         weight_sync_schemes={},
     )
-
-
-def draw_seed() -> int:
-    """Draw a seed from the random state of torch."""
-    return int(torch.randint(2**62, ()))
 
 
 def connect(args: Args) -> None:

@@ -88,9 +88,8 @@ class Curve:
             "seconds": round(progress.seconds, 2),
         }
         if self.tasks:
-            seed = int(torch.randint(2**62, ()))
             fixed = evaluate_fixed_starts(
-                self.env, self.agent.policy, EPISODES, self.tasks, seed=seed
+                self.env, self.agent.policy, EPISODES, self.tasks, seed=draw_seed()
             )
             row["fixed_success"] = fixed.success_rate
             row |= {name: task.success_rate for name, task in fixed.tasks.items()}
@@ -114,10 +113,15 @@ class Curve:
             close_logger(self.logger)
 
 
+def draw_seed() -> int:
+    """Draw a seed from torch's global generator."""
+    return int(torch.randint(2**62, ()))
+
+
 def reseed(env: RobotTaskEnv) -> None:
     """Seed the next episodes from torch's global generator.
 
     A checkpoint saves the state of this generator. So a resumed run has the same
     episodes.
     """
-    env.set_seed(int(torch.randint(2**62, ())))
+    env.set_seed(draw_seed())
