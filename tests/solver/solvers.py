@@ -34,8 +34,7 @@ def simulate(build, num_steps, name):
         name: The solver.
 
     Returns:
-        The state after every step, and the number of groups that the packed solver
-        solved and left to Bullet.
+        The state after every step, and the library's counts.
     """
     with solver(name) as library:
         step, state = build()
@@ -44,7 +43,7 @@ def simulate(build, num_steps, name):
             step(k)
             states.append(state())
         counts = library.counts()
-    return states, counts.groups, counts.bullet_groups
+    return states, counts
 
 
 def assert_same(build, num_steps, *, leaves_groups=False):
@@ -55,11 +54,15 @@ def assert_same(build, num_steps, *, leaves_groups=False):
         num_steps: Number of steps.
         leaves_groups: Whether the packed solver leaves groups to Bullet; None if both
             may happen.
+
+    Returns:
+        The library's counts of the packed solver.
     """
-    expected, solved, left = simulate(build, num_steps, "bullet")
-    assert solved == left == 0
-    states, solved, left = simulate(build, num_steps, "packed")
+    expected, counts = simulate(build, num_steps, "bullet")
+    assert counts.groups == counts.bullet_groups == counts.bodies == 0
+    states, counts = simulate(build, num_steps, "packed")
     for step, (ours, theirs) in enumerate(zip(states, expected, strict=True)):
         assert ours == theirs, f"the states differ after step {step}"
-    assert solved > 0 or leaves_groups
-    assert leaves_groups is None or (left > 0) == leaves_groups
+    assert counts.groups > 0 or leaves_groups
+    assert leaves_groups is None or (counts.bullet_groups > 0) == leaves_groups
+    return counts

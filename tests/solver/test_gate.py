@@ -122,11 +122,17 @@ def test_function_that_is_not_in_the_table(closed, monkeypatch):
         ("masses", (0.3, 0.3), "btMultiBody.m_baseMass"),
         ("num_iterations", 50, "m_numIterations"),
         ("num_dofs", 9, "number of rows of motors and limits"),
-        ("num_links", 4, "btMultiBodyLinkCollider.m_link"),
+        ("num_links", 4, "btMultiBody.m_links"),
         ("kp", 0.1, "btMultiBodyJointMotor.m_kp"),
         ("kd", 0.5, "btMultiBodyJointMotor.m_kd"),
         ("motor_table", 0, "btMultiBodyConstraint"),
         ("limit_table", 0, "btMultiBodyConstraint"),
+        ("num_bodies", 5, "btMultiBodyDynamicsWorld.m_multiBodies"),
+        ("link_masses", (ctypes.c_double * 5)(0.7, 0.3), "btMultibodyLink.m_mass"),
+        ("gravity", -9.8, "btMultibodyLink.m_appliedForce"),
+        ("joint_damping", 0.1, "btMultibodyLink.m_jointTorque"),
+        ("damping", 0.05, "btMultiBody.m_linearDamping"),
+        ("max_velocity", 50.0, "btMultiBody.m_maxCoordinateVelocity"),
     ],
 )
 def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
@@ -169,16 +175,23 @@ def test_groups_that_are_left_to_bullet(closed, monkeypatch):
     assert reason() == "the packed solver did not solve all groups of the self-test"
 
 
-def test_rows_that_are_left_to_bullet(closed, monkeypatch):
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [
+        ("manifolds", "did not create the rows of the self-test"),
+        ("bodies", "did not accelerate the arm of the self-test"),
+    ],
+)
+def test_parts_that_are_left_to_bullet(closed, monkeypatch, field, wrong):
     counts = native.SolverLibrary.counts
 
-    def without_manifolds(self):
+    def without_field(self):
         result = counts(self)
-        result.manifolds = 0
+        setattr(result, field, 0)
         return result
 
-    monkeypatch.setattr(native.SolverLibrary, "counts", without_manifolds)
-    assert reason() == "the packed solver did not create the rows of the self-test"
+    monkeypatch.setattr(native.SolverLibrary, "counts", without_field)
+    assert reason() == f"the packed solver {wrong}"
 
 
 def test_decides_once(monkeypatch):

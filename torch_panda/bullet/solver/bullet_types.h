@@ -39,7 +39,8 @@ struct spatial {
 
 /* btMultibodyLink */
 struct link {
-    char pad0[40];
+    double mass;
+    struct vector3 inertia;
     int parent;
     char pad1[228];
     struct spatial axes[6];
@@ -47,9 +48,13 @@ struct link {
     char pad2[4];
     struct vector3 rotation; /* m_cachedRotParentToThis, a quaternion */
     struct vector3 r_vector; /* m_cachedRVector */
-    char pad3[192];
+    char pad3[64];
+    struct vector3 applied_force, applied_torque;
+    char pad4[64];
     double joint_position[7];
-    char pad4[112];
+    char pad5[56];
+    double joint_torque[6];
+    struct collision_object *collider;
     int flags;
     int num_dofs;
     int num_positions;
@@ -57,7 +62,7 @@ struct link {
     void *joint_feedback;
     struct matrix3 world_basis; /* m_cachedWorldTransform */
     struct vector3 world_origin;
-    char pad5[72];
+    char pad6[72];
 };
 
 /* btCollisionObject */
@@ -68,7 +73,9 @@ struct collision_object {
     int flags;
     char pad2[4];
     int companion_id;
-    char pad3[68];
+    char pad3[4];
+    int activation_state;
+    char pad4[60];
     int internal_type;
 };
 
@@ -125,10 +132,24 @@ struct multi_body {
     char fixed_base;
     char pad7[46];
     int companion_id;
-    char pad8[45];
+    char pad8[4];
+    double linear_damping, angular_damping;
+    char use_gyro_term;
+    char pad9[15];
+    double max_velocity; /* m_maxCoordinateVelocity */
+    char pad10[1];
     char pos_updated; /* __posUpdated */
-    char pad9[2];
+    char pad11[2];
     int num_dofs;
+    char pad12[4];
+    char use_rk4, use_global_velocities;
+    char needs_joint_feedback; /* m_internalNeedsJointFeedback */
+};
+
+/* btSoftMultiBodyDynamicsWorld */
+struct world {
+    char pad0[672];
+    struct array bodies; /* of pointers to struct multi_body */
 };
 
 /* btMultiBodySolverConstraint: one row */
@@ -242,6 +263,9 @@ enum { REVOLUTE = 0, PRISMATIC = 1, FIXED = 4 };
 /* enum btCollisionObject::CollisionFlags, and of CollisionObjectTypes */
 enum { STATIC = 1, KINEMATIC = 2, LINK_COLLIDER = 64 };
 
+/* Activation states: ACTIVE_TAG and ISLAND_SLEEPING */
+enum { ACTIVE = 1, ASLEEP = 2 };
+
 /* enum btSolverMode */
 enum {
     TWO_FRICTION_DIRECTIONS = 16,
@@ -272,7 +296,11 @@ AT(link, axes, 272);
 AT(link, dof_offset, 656);
 AT(link, rotation, 664);
 AT(link, r_vector, 696);
+AT(link, applied_force, 792);
+AT(link, applied_torque, 824);
 AT(link, joint_position, 920);
+AT(link, joint_torque, 1032);
+AT(link, collider, 1080);
 AT(link, flags, 1088);
 AT(link, num_dofs, 1092);
 AT(link, joint_type, 1100);
@@ -283,6 +311,7 @@ SIZE(link, 1312);
 AT(collision_object, has_anisotropic_friction, 360);
 AT(collision_object, flags, 408);
 AT(collision_object, companion_id, 416);
+AT(collision_object, activation_state, 424);
 AT(collision_object, internal_type, 488);
 AT(link_collider, body, 624);
 AT(link_collider, link, 632);
@@ -314,8 +343,14 @@ AT(multi_body, vector_buffer, 448);
 AT(multi_body, matrix_buffer, 480);
 AT(multi_body, fixed_base, 897);
 AT(multi_body, companion_id, 944);
+AT(multi_body, linear_damping, 952);
+AT(multi_body, use_gyro_term, 968);
+AT(multi_body, max_velocity, 984);
 AT(multi_body, pos_updated, 993);
 AT(multi_body, num_dofs, 996);
+AT(multi_body, use_rk4, 1004);
+AT(multi_body, needs_joint_feedback, 1006);
+AT(world, bodies, 672);
 AT(constraint_row, relpos1_cross_normal, 16);
 AT(constraint_row, applied_impulse, 216);
 AT(constraint_row, friction, 224);

@@ -48,6 +48,7 @@ _LIBRARY = "torch_panda.bullet.solver._solver"
 _SOLVER = "_ZTV27btMultiBodyConstraintSolver"
 _MOTOR = "_ZTV21btMultiBodyJointMotor"
 _LIMIT = "_ZTV31btMultiBodyJointLimitConstraint"
+_WORLD = "_ZTV28btSoftMultiBodyDynamicsWorld"
 _CREATE_ROWS = (
     "20createConstraintRowsER20btAlignedObjectArrayI27btMultiBodySolverConstraint"
     "ER23btMultiBodyJacobianDataRK19btContactSolverInfo"
@@ -68,6 +69,10 @@ _REPLACED = (
     ),
     (_MOTOR, "_ZN21btMultiBodyJointMotor" + _CREATE_ROWS),
     (_LIMIT, "_ZN31btMultiBodyJointLimitConstraint" + _CREATE_ROWS),
+    (
+        _WORLD,
+        "_ZN24btMultiBodyDynamicsWorld19solveExternalForcesER19btContactSolverInfo",
+    ),
 )
 # ctypes knows the address of an exported function. Comparing it with the address in the
 # file gives the load address of the library.

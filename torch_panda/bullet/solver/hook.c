@@ -12,10 +12,13 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { VERSION = 4 }; /* native.py refuses a library of another version */
+enum { VERSION = 5 }; /* native.py refuses a library of another version */
 
 /* The functions that are replaced, in the order of gate.py. */
-enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, NUM_FUNCTIONS };
+enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, EXTERNAL_FORCES,
+       NUM_FUNCTIONS };
+
+enum { MAX_BODIES = 16 }; /* of a world that are accelerated here */
 
 /* btSequentialImpulseConstraintSolver::solveGroupCacheFriendlyIterations */
 typedef double iterations_function(struct solver *, struct collision_object **, int,
@@ -27,6 +30,9 @@ typedef void convert_function(struct solver *, struct manifold **, int,
 /* btMultiBodyConstraint::createConstraintRows */
 typedef void rows_function(void *, struct array *, struct jacobian_data *,
                            const struct solver_info *);
+
+/* btMultiBodyDynamicsWorld::solveExternalForces */
+typedef void forces_function(struct world *, const struct solver_info *);
 
 /* The solver that solves the groups of a thread. */
 enum mode {
@@ -44,6 +50,8 @@ struct counts {
     int bullet_joints;    /* motors and limits whose rows Bullet created instead */
     int manifolds;        /* whose rows this solver created */
     int bullet_manifolds; /* whose rows Bullet created instead */
+    int bodies;           /* that `accelerate` accelerated */
+    int bullet_bodies;    /* for which it needed Bullet's function */
     int joint_rows;       /* that were probed */
     int contact_rows;     /* that were probed */
     int spinning_rows;    /* that were probed */
@@ -147,6 +155,53 @@ static void limit_rows(void *limit, struct array *rows, struct jacobian_data *da
     ((rows_function *)bullet[LIMIT_ROWS])(limit, rows, data, info);
 }
 
+/*
+ * Marks the bodies that `accelerate` can accelerate as asleep.
+ *
+ * Returns their number, and stores them and their activation states.
+ */
+static int put_to_sleep(const struct world *world, struct multi_body **sleepers,
+                        int *states) {
+    struct multi_body *const *bodies = world->bodies.data;
+    int count = 0;
+    for (int i = 0; i < world->bodies.size && count < MAX_BODIES; i++) {
+        if (!can_accelerate(bodies[i])) continue;
+        sleepers[count] = bodies[i];
+        states[count++] = bodies[i]->base_collider->activation_state;
+        bodies[i]->base_collider->activation_state = ASLEEP;
+    }
+    return count;
+}
+
+/*
+ * Accelerates all bodies by the forces on them.
+ *
+ * Bullet's function prepares the step and then accelerates all bodies that are awake.
+ * The bodies that `accelerate` can accelerate are therefore marked as asleep during the
+ * call.
+ */
+static void external_forces(struct world *world, const struct solver_info *info) {
+    forces_function *bullet_forces = (forces_function *)bullet[EXTERNAL_FORCES];
+    struct multi_body *sleepers[MAX_BODIES];
+    int states[MAX_BODIES];
+    if (mode == PROBE && counts.mismatch == NULL)
+        counts.mismatch = probe_world(world, info, &expectation);
+    const int count = is_active() ? put_to_sleep(world, sleepers, states) : 0;
+    bullet_forces(world, info);
+    for (int i = 0; i < count; i++)
+        sleepers[i]->base_collider->activation_state = states[i];
+    for (int i = 0; i < count; i++) {
+        const int accelerated = accelerate(sleepers[i], info->time_step);
+        if (mode == SOLVE) *(accelerated ? &counts.bodies : &counts.bullet_bodies) += 1;
+        if (accelerated) continue;
+        /* Bullet's function does it, in a world of this body alone. */
+        const struct array bodies = world->bodies;
+        world->bodies = (struct array){.size = 1, .capacity = 1, .data = &sleepers[i]};
+        bullet_forces(world, info);
+        world->bodies = bodies;
+    }
+}
+
 /* Stores a function in a slot of a vtable. Returns 0, or 1 if the system does not make
    the page writable. */
 static int store(void **slot, void *function) {
@@ -170,7 +225,8 @@ void solver_uninstall(void) {
    make a page writable. */
 int solver_install(void **const *new_slots, void *const *functions) {
     void *const replacements[] = {(void *)iterations, (void *)convert,
-                                  (void *)motor_rows, (void *)limit_rows};
+                                  (void *)motor_rows, (void *)limit_rows,
+                                  (void *)external_forces};
     for (int i = 0; i < NUM_FUNCTIONS; i++) {
         slots[i] = new_slots[i];
         bullet[i] = functions[i];

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 # Version of the C sources, as in hook.c: the library must have been compiled from
 # sources of this version.
-VERSION = 4
+VERSION = 5
 
 # ``enum mode`` in hook.c
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
@@ -52,6 +52,12 @@ class Expectation(Structure):
         ("joint_types", POINTER(c_int)),
         ("kp", c_double),
         ("kd", c_double),
+        ("num_bodies", c_int),
+        ("link_masses", POINTER(c_double)),
+        ("gravity", c_double),
+        ("joint_damping", c_double),
+        ("damping", c_double),
+        ("max_velocity", c_double),
     )
 
 
@@ -65,6 +71,8 @@ class Counts(Structure):
         ("bullet_joints", c_int),
         ("manifolds", c_int),
         ("bullet_manifolds", c_int),
+        ("bodies", c_int),
+        ("bullet_bodies", c_int),
         ("joint_rows", c_int),
         ("contact_rows", c_int),
         ("spinning_rows", c_int),

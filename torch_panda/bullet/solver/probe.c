@@ -111,6 +111,69 @@ static const char *probe_base(const struct multi_body *body,
     return NULL;
 }
 
+/* The body that has joints, before Bullet accelerates it. */
+static const char *probe_forces(const struct multi_body *body,
+                                const struct expectation *expected) {
+    CHECK("btMultiBody.m_links",
+          is_array(&body->links) && body->links.size == expected->num_links);
+    CHECK("btMultiBody.m_realBuf",
+          is_array(&body->real_buffer) &&
+              body->real_buffer.size >= 6 + expected->num_dofs);
+    const double *velocities = (const double *)body->real_buffer.data + 6;
+    const struct link *link = body->links.data;
+    for (int i = 0; i < expected->num_links; i++, link++) {
+        const double mass = expected->link_masses[i];
+        const struct vector3 *inertia = &link->inertia;
+        CHECK("btMultibodyLink.m_mass", link->mass == mass);
+        CHECK("btMultibodyLink.m_inertiaLocal",
+              inertia->x >= 0.0 && inertia->y >= 0.0 && inertia->z >= 0.0 &&
+                  inertia->x + inertia->y + inertia->z < mass);
+        const struct vector3 weight = {0.0, 0.0, expected->gravity * mass, 0.0};
+        const struct vector3 none = {0.0, 0.0, 0.0, 0.0};
+        CHECK("btMultibodyLink.m_appliedForce", is_same(&link->applied_force, &weight));
+        CHECK("btMultibodyLink.m_appliedTorque", is_same(&link->applied_torque, &none));
+        CHECK("btMultibodyLink.m_jointFeedback", link->joint_feedback == NULL);
+        if (expected->joint_types[i] == FIXED) continue;
+        CHECK("btMultibodyLink.m_dofOffset",
+              link->dof_offset >= 0 && link->dof_offset < expected->num_dofs);
+        CHECK("btMultibodyLink.m_jointTorque",
+              link->joint_torque[0] ==
+                  -expected->joint_damping * velocities[link->dof_offset]);
+    }
+    return NULL;
+}
+
+const char *probe_world(const struct world *world, const struct solver_info *info,
+                        const struct expectation *expected) {
+    CHECK("m_timeStep", info->time_step == expected->time_step);
+    CHECK("btMultiBodyDynamicsWorld.m_multiBodies",
+          is_array(&world->bodies) && world->bodies.size == expected->num_bodies);
+    struct multi_body *const *bodies = world->bodies.data;
+    for (int i = 0; i < world->bodies.size; i++) {
+        const struct multi_body *body = bodies[i];
+        CHECK("btMultiBodyDynamicsWorld.m_multiBodies",
+              body != NULL && (uintptr_t)body % 16 == 0);
+        CHECK("btMultiBody.m_linearDamping",
+              body->linear_damping == expected->damping &&
+                  body->angular_damping == expected->damping);
+        CHECK("btMultiBody.m_maxCoordinateVelocity",
+              body->max_velocity == expected->max_velocity);
+        CHECK("btMultiBody.m_useGyroTerm", body->use_gyro_term == 1);
+        CHECK("btMultiBody.m_useRK4", body->use_rk4 == 0);
+        CHECK("btMultiBody.m_useGlobalVelocities", body->use_global_velocities == 0);
+        CHECK("btMultiBody.m_internalNeedsJointFeedback",
+              body->needs_joint_feedback == 0);
+        CHECK("btMultiBody.m_baseCollider", body->base_collider != NULL);
+        CHECK("btMultiBodyLinkCollider.m_multiBody",
+              ((const struct link_collider *)body->base_collider)->body == body);
+        const int state = body->base_collider->activation_state;
+        CHECK("btCollisionObject.m_activationState1", state == ACTIVE);
+        const char *mismatch = body->num_dofs ? probe_forces(body, expected) : NULL;
+        if (mismatch != NULL) return mismatch;
+    }
+    return NULL;
+}
+
 const char *probe_manifolds(const struct solver *solver,
                             struct manifold *const *manifolds, int num_manifolds,
                             const struct solver_info *info,

@@ -6,7 +6,7 @@ replacement steps the same scene in a new client. After every step, both states 
 equal bit for bit.
 """
 
-from ctypes import c_double, c_int
+from ctypes import c_double, c_float, c_int
 from pathlib import Path
 
 from torch_panda.bullet import capi
@@ -38,7 +38,12 @@ _RESTITUTION = 0.3
 _MASSES = (0.2, 0.1)  # of the boxes
 _KP = 0.3
 _KD = 1.0
+_GRAVITY = -9.81
+_JOINT_DAMPING = 0.2
+_DAMPING = c_float(0.04).value  # Bullet's default, linear and angular
+_MAX_VELOCITY = 100.0  # Bullet's default
 _JOINT_TYPES = (REVOLUTE, REVOLUTE, FIXED, PRISMATIC, PRISMATIC)  # of the arm's links
+_LINK_MASSES = (0.7, 0.4, 0.1, 0.05, 0.05)
 _NUM_JOINTS = 4
 _JOINT_TARGET = 0.8  # lies beyond the limits of all joints
 
@@ -69,6 +74,12 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         (c_int * len(_JOINT_TYPES))(*_JOINT_TYPES),
         _KP,
         _KD,
+        len(_MASSES) + 2,  # the boxes, the arm and the table
+        (c_double * len(_LINK_MASSES))(*_LINK_MASSES),
+        _GRAVITY,
+        _JOINT_DAMPING,
+        _DAMPING,
+        _MAX_VELOCITY,
     )
     try:
         solver.set_mode(PROBE, expectation)
@@ -92,6 +103,8 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
     # must enlarge an array.
     if counts.joints <= counts.bullet_joints or not counts.manifolds:
         raise GateError("the packed solver did not create the rows of the self-test")
+    if counts.bodies != _NUM_STEPS:
+        raise GateError("the packed solver did not accelerate the arm of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
             raise GateError(f"the self-test differs from Bullet in step {step}")
@@ -124,7 +137,7 @@ def _build(connection: Connection) -> list[int]:
     handle = connection.handle
     command = capi.physics_init(handle)
     capi.physics_set_timestep(command, _TIME_STEP)
-    capi.physics_set_gravity(command, 0.0, 0.0, -9.81)
+    capi.physics_set_gravity(command, 0.0, 0.0, _GRAVITY)
     capi.physics_set_solver_iterations(command, _NUM_ITERATIONS)
     capi.physics_set_residual_threshold(command, _RESIDUAL_THRESHOLD)
     connection.submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
@@ -147,6 +160,8 @@ def _build(connection: Connection) -> list[int]:
             capi.dynamics_set_lateral_friction(command, body, link, _FRICTION)
             capi.dynamics_set_spinning_friction(command, body, link, 0.1)
             capi.dynamics_set_restitution(command, body, link, _RESTITUTION)
+            if body == arm:
+                capi.dynamics_set_joint_damping(command, body, link, _JOINT_DAMPING)
             connection.submit(
                 command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
             )

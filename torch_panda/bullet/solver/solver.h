@@ -68,6 +68,17 @@ int create_limit_rows(struct responses **responses, struct limit *limit,
 int convert_manifold(struct responses **responses, struct solver *solver,
                      struct manifold *manifold, const struct solver_info *info);
 
+/* Whether Bullet would accelerate a body in this step, and `accelerate` can do it. */
+int can_accelerate(const struct multi_body *body);
+
+/*
+ * Accelerate the joints of a body by the forces and torques on it.
+ *
+ * Returns 1 if the joint velocities have changed. Returns 0 if Bullet's own function has
+ * to compute them, because a number is not finite.
+ */
+int accelerate(struct multi_body *body, double time_step);
+
 /* Numbers of the self-test's scene, for the layout probe. */
 struct expectation {
     void **motor_table, **limit_table; /* of virtual functions */
@@ -82,15 +93,24 @@ struct expectation {
     int num_links;
     const int *joint_types; /* of its links */
     double kp, kd; /* of all motors */
+    int num_bodies;
+    const double *link_masses; /* of the body that has joints */
+    double gravity;            /* along z */
+    double joint_damping;      /* of all joints */
+    double damping;            /* linear and angular, of all bodies */
+    double max_velocity;       /* of all coordinates */
 };
 
 /*
  * Compare the fields of Bullet's structs with the known numbers of the scene.
  *
- * probe_manifolds does this before Bullet creates the rows of a group, probe_rows before
- * it solves the group, and probe_result after it. Each function returns NULL, or the
- * name of the first field that does not have the expected number.
+ * probe_world does this before Bullet accelerates the bodies. probe_manifolds does it
+ * before Bullet creates the rows of a group, probe_rows before it solves the group, and
+ * probe_result after it. Each function returns NULL, or the name of the first field that
+ * does not have the expected number.
  */
+const char *probe_world(const struct world *world, const struct solver_info *info,
+                        const struct expectation *expected);
 const char *probe_manifolds(const struct solver *solver,
                             struct manifold *const *manifolds, int num_manifolds,
                             const struct solver_info *info,
