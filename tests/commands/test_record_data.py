@@ -67,7 +67,7 @@ def test_a_stopped_data_set_continues_bit_for_bit(tmp_path, capsys, monkeypatch)
     assert not out.exists()
     with pytest.raises(SystemExit, match="holds a part of a data set: continue with"):
         record.main(make_args(out))
-    with pytest.raises(SystemExit, match="kind was 'noisy', is 'random'"):
+    with pytest.raises(SystemExit, match="kind was 'noisy' and is now 'random'"):
         record.main(make_args(out, "random", resume=True))
     played = []
     play = record.generate_parts

@@ -1,10 +1,10 @@
-"""LeRobot data sets: its package reads them back, pictures too, and policies learn."""
+"""LeRobot data sets: its package reads them back, pictures too."""
 
 import pytest
 import torch
 
 import torch_panda
-from tests.datasets.imitation import imitate, record
+from tests.datasets.recording import record
 from torch_panda import datasets
 from torch_panda.commands import record as record_data
 from torch_panda.datasets import generation
@@ -17,7 +17,7 @@ lerobot_dataset = pytest.importorskip(
 EPISODES = 16
 
 
-def test_round_trip_and_a_policy_of_it(tmp_path):
+def test_round_trip(tmp_path):
     folder = tmp_path / "reach"
     record("lerobot", folder, "PandaReach-v1", EPISODES, image_size=96)
     dataset = lerobot_dataset.LeRobotDataset("torch_panda/reach", root=folder)
@@ -34,10 +34,8 @@ def test_round_trip_and_a_policy_of_it(tmp_path):
     assert torch.equal(first["observation.environment_state"], goals)
     seen = 255 * first["observation.images.scene"].permute(1, 2, 0)
     assert (seen - picture.float()).abs().mean() < 3  # a video is not exact
-    with torch_panda.make("PandaReach-v1", num_envs=16, seed=100) as env:
-        demos = read_demos(folder, env)
-        assert len(demos) == EPISODES * 49
-        assert imitate(env, demos) > 0.9
+    with torch_panda.make("PandaReach-v1") as env:
+        assert len(read_demos(folder, env)) == EPISODES * 49
     with pytest.raises(SystemExit, match="already"):
         record("lerobot", folder, "PandaReach-v1", 1)
 

@@ -1,12 +1,11 @@
-"""Minari data sets: others read them, episodes start again, policies learn."""
+"""Minari data sets: others read them, and episodes start again."""
 
 import numpy as np
 import pytest
 import torch
 
 import torch_panda
-from tests.datasets.imitation import imitate, record
-from torch_panda.datasets.demonstrations import read_demos
+from tests.datasets.recording import record
 
 minari = pytest.importorskip(
     "minari", reason="needs the extra minari, which takes Python 3.11 or newer"
@@ -59,16 +58,6 @@ def test_torchrl_reads_it_offline(recorded, tmp_path):
     goals = [batch["next", "observation", f"{x}_goal"] for x in ("achieved", "desired")]
     reward = torch_panda.Push().compute_reward(*goals)
     assert torch.equal(reward, batch["next", "reward"].float())
-
-
-def test_a_policy_learns_from_it(recorded):
-    root, _ = recorded
-    record("minari", "panda/reach-expert-v0", "PandaReach-v1", 24)
-    folder = root / "panda/reach-expert-v0"
-    with torch_panda.make("PandaReach-v1", num_envs=16, seed=100) as env:
-        demos = read_demos(folder, env)
-        assert demos["next", "done"].sum() == 24
-        assert imitate(env, demos) > 0.9
 
 
 def test_bad_names_are_one_line(recorded):

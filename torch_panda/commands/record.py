@@ -85,9 +85,7 @@ class Args:
 def print_success(env_id: str, success: list[Tensor]) -> None:
     """Print how many episodes succeeded, with 95 % intervals.
 
-    Args:
-        env_id: the task.
-        success: of each episode, after each step, (steps, 1).
+    ``success`` has the success of each episode after each step, (steps, 1).
     """
     for when, count in (
         ("at the end", sum(bool(flags[-1]) for flags in success)),
@@ -109,7 +107,7 @@ def open_writer(args: Args, out: Path, env: torch_panda.RobotTaskEnv) -> Writer:
     """
     if args.format == "tensors":
         return TensorWriter(out)
-    return load_format(args.format).open_writer(out, args.env_id, env, args.kind)
+    return load_format(args.format).Writer(out, args.env_id, env, args.kind)
 
 
 def check(args: Args) -> None:

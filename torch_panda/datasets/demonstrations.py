@@ -45,8 +45,8 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             # (n,), or [episodes, steps] of the kinds other than expert.
             shape = content["action"].shape[:-1]
             demos = TensorDict(content, shape).select(*STORED_KEYS)
-        # Lengths or types differ.
         except (AttributeError, RuntimeError, TypeError) as error:
+            # Lengths or types differ.
             raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")

@@ -4,6 +4,7 @@ These formats store the seed of each episode. ``reset(seed=...)`` of
 `torch_panda.gymnasium_envs.GoalEnv` starts the episode again.
 """
 
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,17 +42,10 @@ class Writer(Protocol):
 class FormatModule(Protocol):
     """Interface of the modules ``minari_format`` and ``lerobot_format``."""
 
-    def open_writer(
-        self, out: Path, env_id: str, env: RobotTaskEnv, kind: str = "expert"
-    ) -> Writer:
-        """Start a data set of transitions of this environment.
-
-        Args:
-            out: Folder or id of the data set.
-            env_id: Id of the environment.
-            env: The environment.
-            kind: What acts: "expert", or a kind of `torch_panda.datasets.generate`.
-        """
+    Writer: Callable[[Path, str, RobotTaskEnv, str], Writer]
+    """Starts a data set of transitions. Arguments: folder or id of the data set, id of
+    the environment, the environment, and "expert" or a kind of
+    `torch_panda.datasets.generate`."""
 
     def find_folder(self, out: Path) -> Path:
         """The folder that a new data set will have.

@@ -179,13 +179,8 @@ def _spawn(seed: int, number: int) -> tuple[int, np.random.Generator]:
 class _Episodes:
     """One episode in every environment of a batch.
 
-    Args:
-        env: The environments.
-        expert: Scripted expert; None for random actions.
-        kind: How actions are chosen; see `generate`.
-        seed: Seed of the data set.
-        first: Number of the episode in the first environment. The episodes of the next
-            environments have the following numbers.
+    ``first`` is the number of the episode in the first environment. The episodes of the
+    next environments have the following numbers.
     """
 
     def __init__(

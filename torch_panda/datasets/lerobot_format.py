@@ -22,20 +22,21 @@ PICTURE = "observation.images.scene"
 FPS = 25  # steps per second
 
 
-class LeRobotWriter:
+class Writer:
     """Writes episodes as they come.
 
     Args:
         folder: Folder to create.
         env_id: Id of the environment that is recorded.
         env: The environment; it must observe ``pixels``.
+        kind: Not stored.
 
     Raises:
         ValueError: The folder exists already.
         OSError: The folder cannot be created.
     """
 
-    def __init__(self, folder: Path, env_id: str, env: RobotTaskEnv) -> None:
+    def __init__(self, folder: Path, env_id: str, env: RobotTaskEnv, kind: str) -> None:
         find_folder(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.folder = folder
@@ -102,13 +103,6 @@ def features(env: RobotTaskEnv) -> dict[str, dict[str, object]]:
     return result
 
 
-def open_writer(
-    out: Path, env_id: str, env: RobotTaskEnv, kind: str = "expert"
-) -> LeRobotWriter:
-    """Start a data set; ``out`` is its folder, and its ``kind`` is not stored."""
-    return LeRobotWriter(out, env_id, env)
-
-
 def find_folder(out: Path) -> Path:
     """The folder of a new data set, which is ``out``.
 
@@ -135,9 +129,8 @@ def read(path: Path) -> TensorDict:
 
     achieved, desired = column(GOALS, torch.float32).chunk(2, dim=-1)
     number = column("episode_index", torch.int64).squeeze(-1)
-    kept = (
-        number[:-1] == number[1:]
-    )  # transitions whose next observation is the next frame
+    # Keep transitions whose next observation is the next frame.
+    kept = number[:-1] == number[1:]
     observed = {
         "observation": column(STATE, torch.float32),
         "achieved_goal": achieved,

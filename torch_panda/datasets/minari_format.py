@@ -26,11 +26,11 @@ ALGORITHMS = {
 }
 
 
-class MinariWriter:
+class Writer:
     """Collects episodes, and writes the data set when it is closed.
 
     Args:
-        dataset_id: Id of the data set, such as "panda/push-expert-v0".
+        out: Id of the data set, such as "panda/push-expert-v0".
         env_id: Id of the environment that was recorded.
         env: The environment, for the options that its id does not fix.
         kind: "expert", or a kind of `torch_panda.datasets.generate`.
@@ -39,11 +39,9 @@ class MinariWriter:
         ValueError: The id is invalid, or a data set with this id exists.
     """
 
-    def __init__(
-        self, dataset_id: str, env_id: str, env: RobotTaskEnv, kind: str
-    ) -> None:
-        self.folder = find_folder(Path(dataset_id))
-        self.dataset_id, self.env_id, self.kind = dataset_id, env_id, kind
+    def __init__(self, out: Path, env_id: str, env: RobotTaskEnv, kind: str) -> None:
+        self.folder = find_folder(out)
+        self.dataset_id, self.env_id, self.kind = out.as_posix(), env_id, kind
         self.spec = deepcopy(gymnasium.spec(f"torch_panda/{env_id}"))
         self.spec.max_episode_steps = env.max_episode_steps
         self.spec.kwargs["terminate_on_success"] = env.terminate_on_success
@@ -84,13 +82,6 @@ class MinariWriter:
                 data_format="hdf5",
             )
         return f"minari.load_dataset({self.dataset_id!r}), in {self.folder}"
-
-
-def open_writer(
-    out: Path, env_id: str, env: RobotTaskEnv, kind: str = "expert"
-) -> MinariWriter:
-    """Start a data set; ``out`` is its id."""
-    return MinariWriter(out.as_posix(), env_id, env, kind)
 
 
 def find_folder(out: Path) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 from tensordict import TensorDict, TensorDictBase
 
 from torch_panda.learning import files
+from torch_panda.learning.checkpoint import check_same
 
 RECIPE = "recipe.json"  # file of the options that determine the data
 
@@ -35,22 +36,13 @@ class Parts:
                 f"{folder} holds a part of a data set: continue with --resume, or "
                 "remove the folder"
             )
-        if resume and not file.exists():
+        if not resume:
+            return
+        if not file.exists():
             raise ValueError(
                 f"there is no data set to resume in {folder}: start without --resume"
             )
-        if not resume:
-            return
-        saved = json.loads(file.read_text())
-        differing = [
-            f"{key} was {saved.get(key)!r}, is {value!r}"
-            for key, value in recipe.items()
-            if saved.get(key) != value
-        ]
-        if differing:
-            raise ValueError(
-                f"cannot resume {folder} with other options: {'; '.join(differing)}"
-            )
+        check_same(folder, json.loads(file.read_text()), recipe)
 
     @property
     def num_episodes(self) -> int:

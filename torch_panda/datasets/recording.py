@@ -34,7 +34,10 @@ class TensorWriter:
 
     def close(self) -> str:
         """Write the file. If Ctrl-C interrupts this, there is no incomplete file."""
-        demos = join(self.episodes)
+        demos = TensorDict.cat(self.episodes)
+        lengths = torch.tensor([len(episode) for episode in self.episodes])
+        numbers = torch.arange(len(lengths)).repeat_interleave(lengths)
+        demos["collector", "traj_ids"] = numbers
         save(self.path, demos.to_dict())
         return str(self.path)
 
@@ -79,12 +82,3 @@ def play(
     """
     rollout, lengths = play_episodes(env, expert, exploration)
     return [row[:length] for row, length in zip(rollout, lengths.tolist(), strict=True)]
-
-
-def join(episodes: list[TensorDictBase]) -> TensorDictBase:
-    """Concatenate episodes, with their numbers in ``("collector", "traj_ids")``."""
-    transitions = TensorDict.cat(episodes)
-    lengths = torch.tensor([len(episode) for episode in episodes])
-    numbers = torch.arange(len(episodes)).repeat_interleave(lengths)
-    transitions["collector", "traj_ids"] = numbers
-    return transitions

@@ -4,7 +4,7 @@ import json
 import os
 import signal
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -66,18 +66,10 @@ class Stored(Protocol):
 
 @dataclass
 class Checkpoint:
-    """The complete state of a run between two iterations.
-
-    Attributes:
-        path: File of the state.
-        args: Options of the run, a dataclass.
-        agent: Agent with its optimizer.
-        buffer: Transitions of the run.
-        progress: Progress of the run.
-    """
+    """The complete state of a run between two iterations, and its file ``path``."""
 
     path: Path
-    args: Any
+    args: Any  # options of the run, a dataclass
     agent: AnyAgent
     buffer: Stored
     progress: Progress
@@ -111,17 +103,7 @@ class Checkpoint:
         keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
         finite = ("agent", "optimizer")
         state = files.read(self.path, "the state of a run", keys, finite=finite)
-        saved = state["args"]
-        differing = [
-            f"{key} was {saved.get(key)!r} and is now {value!r}"
-            for key, value in fixed_options(self.args).items()
-            if saved.get(key) != value
-        ]
-        if differing:
-            raise ValueError(
-                f"cannot resume {self.path.parent} with other options "
-                f"({'; '.join(differing)}): repeat the options of the run"
-            )
+        check_same(self.path.parent, state["args"], fixed_options(self.args))
         self.agent.load_state_dict(state["agent"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]
@@ -144,6 +126,26 @@ def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
     return {key: value for key, value in options.items() if key not in FREE_OPTIONS}
 
 
+def check_same(
+    folder: Path, saved: Mapping[str, object], options: Mapping[str, object]
+) -> None:
+    """Check that a run or a data set is resumed with the options that it had.
+
+    Raises:
+        ValueError: An option differs from the saved one.
+    """
+    differing = [
+        f"{key} was {saved.get(key)!r} and is now {value!r}"
+        for key, value in options.items()
+        if saved.get(key) != value
+    ]
+    if differing:
+        raise ValueError(
+            f"cannot resume {folder} with other options ({'; '.join(differing)}): "
+            "repeat the former options"
+        )
+
+
 def write_options(
     out: Path,
     args: Any,  # noqa: ANN401 (a dataclass)
@@ -152,12 +154,8 @@ def write_options(
 ) -> None:
     """Make the folder of a run, and write its options into args.json.
 
-    Args:
-        out: Folder of the run.
-        args: Options of the run.
-        default: Default options. The file lists the options that differ from them under
-            ``changed``, for the legends of plots.
-        **more: Further entries of the file.
+    The file also lists the options that differ from ``default`` under ``changed``, for
+    the legends of plots, and has the entries ``more``.
 
     Raises:
         OSError: The file cannot be written.
