@@ -105,9 +105,8 @@ class HindsightRelabel(SampleTimeTransform):
         if units is None:
             return chosen_units, goals
         rows = is_chosen[units].nonzero()[0]
-        goal_index = (
-            is_chosen.cumsum() - 1
-        )  # goals[goal_index[i]] is for the chosen unit i
+        # The goal of the chosen unit i is goals[goal_index[i]].
+        goal_index = is_chosen.cumsum() - 1
         return rows, goals[goal_index[units[rows]]]
 
     def _write(

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import torch_panda
-from torch_panda.learning.augmentation import SHIFT, Augmentation, mirror, shift
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.augmentation import SHIFT, augment, mirror, shift
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.learning.transitions import Transitions
 
@@ -62,7 +63,7 @@ def test_shift(env):
 def test_modes(env, mode):
     geometry, rows = read_geometry(env), transitions(env)
     torch.manual_seed(0)
-    result = Augmentation(geometry, mode)(rows)
+    result = augment(rows, geometry, mode)
     expected = rows if mode == "none" else mirror(rows, geometry)
     torch.manual_seed(0)
     if mode == "mirror-shift":
@@ -72,7 +73,6 @@ def test_modes(env, mode):
 
 def test_joint_control_has_no_mirror():
     with torch_panda.make("PandaPushJoints-v1", num_envs=1) as env:
-        geometry = read_geometry(env)
-    with pytest.raises(ValueError, match="pass --augmentation none"):
-        Augmentation(geometry, "mirror")
-    Augmentation(geometry, "none")
+        with pytest.raises(ValueError, match="pass --augmentation none"):
+            make_agent(env, Hyperparameters(augmentation="mirror"))
+        make_agent(env, Hyperparameters())

@@ -76,9 +76,6 @@ class Args:
 class Refinement:
     """A refinement with its agent, its played episodes and its progress.
 
-    Args:
-        args: The options.
-
     Raises:
         ValueError: There is no such policy, or no such run to resume.
     """

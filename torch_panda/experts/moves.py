@@ -35,11 +35,6 @@ def move(offset: Tensor, limit: float = 1.0) -> Tensor:
     return action / (norm(action) / limit).clamp(min=1.0)
 
 
-def go_to(position: Tensor, point: Tensor, limit: float = 1.0) -> Tensor:
-    """Move straight to a point."""
-    return move(point - position, limit)
-
-
 def go_over(
     position: Tensor, point: Tensor, clearance: float, limit: float = 1.0
 ) -> Tensor:

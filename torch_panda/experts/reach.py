@@ -2,9 +2,9 @@
 
 from torch import Tensor
 
-from torch_panda.experts.moves import go_to
+from torch_panda.experts.moves import move
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Go straight to the goal."""
-    return go_to(achieved_goal, desired_goal)
+    return move(desired_goal - achieved_goal)

@@ -15,32 +15,22 @@ from torch_panda.learning.transitions import Transitions
 SHIFT = 0.15  # largest shift along x and y [m]
 
 
-class Augmentation:
-    """Augments some rows of a batch.
+def augment(
+    rows: Transitions, geometry: Geometry | None, mode: AugmentationKind
+) -> Transitions:
+    """Return an augmented copy of a batch.
 
     Args:
-        geometry: Layout of observations, goals and actions; None if it is unknown.
+        rows: The batch.
+        geometry: Layout of observations, goals and actions; None only without
+            augmentation.
         mode: "none", "mirror", or "mirror-shift" for both augmentations.
-
-    Raises:
-        ValueError: The robot is not under end-effector control.
     """
-
-    def __init__(self, geometry: Geometry | None, mode: AugmentationKind) -> None:
-        if geometry is not None and geometry.action is None and mode != "none":
-            raise ValueError(
-                f"augmentation {mode!r} needs end-effector control: for joint control "
-                "pass --augmentation none"
-            )
-        self.geometry, self.mode = geometry, mode
-
-    def __call__(self, rows: Transitions) -> Transitions:
-        """Return an augmented copy of a batch."""
-        if self.geometry is not None and self.mode != "none":
-            rows = mirror(rows, self.geometry)
-            if self.mode == "mirror-shift":
-                rows = shift(rows, self.geometry, SHIFT)
+    if mode == "none":
         return rows
+    assert geometry is not None
+    rows = mirror(rows, geometry)
+    return shift(rows, geometry, SHIFT) if mode == "mirror-shift" else rows
 
 
 def mirror(rows: Transitions, geometry: Geometry) -> Transitions:

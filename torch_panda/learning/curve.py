@@ -15,7 +15,7 @@ from torch_panda.learning.evaluation import (
     evaluate_fixed_starts,
 )
 from torch_panda.learning.evaluation_tasks import evaluation_tasks
-from torch_panda.learning.logger import close_logger, log_row
+from torch_panda.learning.logger import close_logger
 from torch_panda.learning.plots import plot_curve
 from torch_panda.learning.policy_files import AnyAgent, save_policy
 from torch_panda.registry import make
@@ -95,7 +95,9 @@ class Curve:
             row |= {name: task.success_rate for name, task in fixed.tasks.items()}
         progress.curve.append({**row, **(losses or {})})
         if self.logger is not None:
-            log_row(self.logger, progress.curve[-1])
+            for key, value in progress.curve[-1].items():
+                if key != "step":
+                    self.logger.log_scalar(key, value, step=progress.steps)
         fields = {key: None for row in progress.curve for key in row}
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, fieldnames=list(fields))

@@ -180,12 +180,7 @@ def evaluate_fixed_starts(
 
 
 class _RandomStart(TensorDictModuleBase):
-    """Replaces the first actions of a policy by given ones.
-
-    Args:
-        policy: The policy.
-        actions: Actions of the first steps, (num_envs, steps, action_dim).
-    """
+    """Replaces the first actions of a policy, by actions (num_envs, steps, n)."""
 
     def __init__(self, policy: TensorDictModuleBase, actions: Tensor) -> None:
         super().__init__()
@@ -201,12 +196,7 @@ class _RandomStart(TensorDictModuleBase):
 
 
 def _summarize(rollout: TensorDictBase, lengths: Tensor) -> Evaluation:
-    """Return the results of episodes [num_envs, steps].
-
-    Args:
-        rollout: Transitions of the episodes.
-        lengths: Number of steps of each episode, (num_envs,).
-    """
+    """Return the results of episodes [num_envs, steps] with lengths (num_envs,)."""
     success = rollout["next", "success"].squeeze(-1)
     reward = rollout["next", "reward"].squeeze(-1)
     steps = torch.arange(rollout.shape[1], device=lengths.device)
@@ -225,13 +215,7 @@ def _join(
     episodes: range,
     tasks: Mapping[str, Evaluation] | None = None,
 ) -> Evaluation:
-    """Concatenate results, and select some episodes.
-
-    Args:
-        parts: Results of successive batches of episodes.
-        episodes: Indices of the selected episodes in the concatenation.
-        tasks: Results of each fixed task by its name.
-    """
+    """Concatenate results, and select the episodes with these indices."""
     names = ("success", "ever", "at_start", "returns", "lengths")
     joined = {
         name: torch.cat([getattr(part, name) for part in parts]) for name in names
@@ -241,12 +225,9 @@ def _join(
 
 
 def wilson_interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Confidence interval of a proportion (Wilson, 1927).
+    """Confidence interval of a proportion after n trials (Wilson, 1927).
 
-    Args:
-        successes: Number of successes.
-        n: Number of trials.
-        z: Quantile of the normal distribution; 1.96 gives the 95 % interval.
+    The quantile z of the normal distribution is 1.96 for the 95 % interval.
     """
     p = successes / n
     center = (p + z * z / (2 * n)) / (1 + z * z / n)

@@ -55,13 +55,6 @@ def make_logger(
     return None
 
 
-def log_row(logger: Logger, row: Mapping[str, float]) -> None:
-    """Log a row of a success curve under the names of its columns."""
-    for key, value in row.items():
-        if key != "step":
-            logger.log_scalar(key, value, step=int(row["step"]))
-
-
 def close_logger(logger: Logger) -> None:
     """Write all remaining values and close the log."""
     if isinstance(logger, WandbLogger):

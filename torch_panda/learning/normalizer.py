@@ -12,7 +12,7 @@ FINE_LIMIT = 0.03  # "fine" inputs are differences that are clipped at this limi
 
 
 class Normalizer(nn.Module):
-    """Subtracts the running mean and divides by the deviation, as OpenAI Baselines.
+    """Subtracts the running mean and divides by the deviation, like OpenAI Baselines.
 
     Args:
         spaces: Sizes and layout of observations and goals.

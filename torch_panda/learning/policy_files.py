@@ -1,7 +1,7 @@
 """Files of trained policies: their weights, and the numbers to build the networks."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -179,13 +179,7 @@ def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> AnyHyperpara
 
 
 def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
-    """Write a policy into a file that `load_policy` reads.
-
-    Args:
-        path: The file to write.
-        agent: The agent with the policy.
-        env_id: Id of the environment that it was trained on.
-    """
+    """Write the policy of an agent into a file that `load_policy` reads."""
     cls: type[AnyHyperparameters] = Hyperparameters
     if isinstance(agent, OfflineAgent):
         cls = agent.Hyperparameters
@@ -194,7 +188,7 @@ def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
     content = {
         "env_id": env_id,
         "hyperparameters": hp,
-        "spaces": agent.spaces.to_dict(),
+        "spaces": asdict(agent.spaces),
         "policy": agent.policy.state_dict(),
     }
     files.save(path, content)

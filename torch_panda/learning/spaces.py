@@ -5,7 +5,7 @@ again.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -54,15 +54,11 @@ class Spaces:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the object from the return value of `to_dict`."""
+        """Make the object from the nested dict that `asdict` returned."""
         geometry = values["geometry"]
         if geometry is not None:
             geometry = Geometry(**geometry)
         return cls(**{**values, "geometry": geometry})
-
-    def to_dict(self) -> dict[str, Any]:
-        """Convert to nested dicts of numbers and tuples, for `torch.save`."""
-        return asdict(self)
 
     def action_spec(self, *batch_size: int) -> TensorSpec:
         """Make the spec of actions on the default device."""

@@ -17,11 +17,7 @@ __all__ = ["AGENTS", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
 
 
 def make_agent(env: RobotTaskEnv, hp: Hyperparameters) -> Agent:
-    """Make an untrained agent on the device of the environments.
-
-    Args:
-        env: Environments in which the agent will explore.
-        hp: Hyperparameters.
+    """Make an untrained agent on the device of the environments that it will explore.
 
     Raises:
         ValueError: The hyperparameters do not fit the environment.

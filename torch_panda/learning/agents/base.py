@@ -10,9 +10,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torch_panda.learning.augmentation import Augmentation
+from torch_panda.learning.augmentation import augment
 from torch_panda.learning.exploration import RandomPointModule
-from torch_panda.learning.fingers import from_fine, to_fine
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.normalizer import Normalizer
 from torch_panda.learning.spaces import Spaces
@@ -30,15 +29,10 @@ class Agent(nn.Module, ABC):
     defines `backward` and `move_targets`. The input of the networks is the "state": the
     tensor that the normaliser computes from observations and goals.
 
-    Args:
-        spaces: Sizes and layout of observations, goals and actions.
-        hp: Hyperparameters.
-
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
         hp: Hyperparameters.
         normalizer: Computes states from observations and goals.
-        augmentation: Augments the batches of gradient steps.
         state_size: Size of a state.
         gamma: Discount factor.
         policy: Module from ``observation`` and ``desired_goal`` to ``action``, which is
@@ -60,7 +54,6 @@ class Agent(nn.Module, ABC):
         self.spaces, self.hp = spaces, hp
         check_spaces(spaces, hp)
         self.normalizer = Normalizer(spaces, hp.relative_inputs)
-        self.augmentation = Augmentation(spaces.geometry, hp.augmentation)
         self.state_size = len(self.normalizer.mean)
         self.gamma = hp.gamma or 1 - 1 / spaces.max_episode_steps
         self.min_return = min_return(self.gamma) if spaces.has_sparse_reward else None
@@ -181,7 +174,7 @@ class Agent(nn.Module, ABC):
 
     def _prepare(self, rows: Transitions) -> Transitions:
         """Augment a batch, and convert its actions to those of the networks."""
-        rows = self.augmentation(rows)
+        rows = augment(rows, self.spaces.geometry, self.hp.augmentation)
         if self.min_return is not None and self.min_return > -math.inf:
             # A failure that ends an episode is as bad as never reaching the goal.
             # Otherwise an agent would fail on purpose, to save the rewards of -1.
@@ -196,6 +189,22 @@ class Agent(nn.Module, ABC):
         """Use factor * LEARNING_RATE as learning rate of the next gradient steps."""
         for group in self.optimizer.param_groups:
             group["lr"] = factor * LEARNING_RATE
+
+
+# How firmly the fingers hold a cube depends on tenths of a millimetre. Such a distance
+# is 0.001 of the fingers' action, which is less than the error of a network. The cube
+# root of 0.001 is 0.1, which a network can learn. So networks output cube roots.
+
+
+def to_fine(action: Tensor) -> Tensor:
+    """Replace the finger entry of actions (..., n) by its cube root."""
+    rest, fingers = action[..., :-1], action[..., -1:]
+    return torch.cat((rest, fingers.sign() * fingers.abs() ** (1 / 3)), -1)
+
+
+def from_fine(action: Tensor) -> Tensor:
+    """Undo `to_fine` for actions (..., n)."""
+    return torch.cat((action[..., :-1], action[..., -1:] ** 3), -1)
 
 
 def min_return(gamma: float) -> float:
@@ -220,4 +229,10 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
             "relative inputs and augmentation need a task whose observation_layout "
             "and goal_entries name all entries of its observations and goals: declare "
             "them, or pass --relative-inputs none --augmentation none"
+        )
+    has_mirror = spaces.geometry is None or spaces.geometry.action is not None
+    if hp.augmentation != "none" and not has_mirror:
+        raise ValueError(
+            f"augmentation {hp.augmentation!r} needs end-effector control: for joint "
+            "control pass --augmentation none"
         )
