@@ -138,11 +138,6 @@ def test_a_missing_urdf_is_named():
         client.step()
 
 
-def test_unknown_body_raises():
-    with PhysicsClient() as client, pytest.raises(BulletError, match="report a state"):
-        client.state(7)
-
-
 def test_missing_symbol_names_the_version_that_works():
     with pytest.raises(ImportError, match=r"b3NoSuch.*pybullet==3\.2\.7"):
         library.bind(library.WORK, "b3NoSuch", None)
@@ -199,21 +194,6 @@ def test_urdf_with_a_collision_filter_is_refused():
         with pytest.raises(ValueError, match=r"cube_collisionfilter\.urdf"):
             client.load_urdf("cube_collisionfilter.urdf")
         assert client.bodies == ()
-
-
-def test_bodies_and_detections_are_counted():
-    with PhysicsClient() as client:
-        before = client.num_detections
-        bodies = tuple(
-            client.create_sphere(0.1, mass=1.0, position=(0.0, 0.0, height))
-            for height in (1.0, 2.0)
-        )
-        assert client.bodies == bodies
-        client.step(3)
-        client.detect_collisions()
-        client.detect_collisions(5)
-        client.detect_collisions(0)
-        assert client.num_detections == before + 9
 
 
 def test_contact_forces_carry_a_box():

@@ -43,11 +43,6 @@ def test_the_version_belongs_to_the_sources():
 
 
 @pytest.mark.skipif(native.LIBRARY is None, reason="there is no compiled loop")
-def test_the_library_has_the_version_of_the_sources():
-    assert native.LIBRARY.version == native.VERSION
-
-
-@pytest.mark.skipif(native.LIBRARY is None, reason="there is no compiled loop")
 @pytest.mark.parametrize("variable", [None, "", "native"])
 def test_a_library_of_another_version_is_refused(unset, monkeypatch, variable):
     if variable is not None:
@@ -100,12 +95,6 @@ def test_a_missing_loop_that_was_asked_for_is_refused(unset, monkeypatch):
     monkeypatch.setenv(native.LOOP_VARIABLE, "native")
     with pytest.raises(ValueError, match="=native, but torch_panda has no compiled"):
         torch_panda.make("PandaReach-v1")
-
-
-def test_an_empty_variable_means_unset(unset, monkeypatch):
-    expected = native.loop_name()
-    monkeypatch.setenv(native.LOOP_VARIABLE, "")
-    assert native.loop_name() == expected
 
 
 def test_an_unknown_loop_is_refused(monkeypatch):

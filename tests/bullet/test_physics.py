@@ -1,16 +1,11 @@
 """Physics parameters: their effect, and the values that are refused."""
 
-import pickle
-
-import numpy as np
 import pytest
 import torch
 
 import torch_panda
-from tests.bullet.test_client import JOINTS, NEUTRAL
 from torch_panda import PhysicsParams
 from torch_panda.bullet import EXACT, FAST, PhysicsClient
-from torch_panda.robots.panda import EE_LINK
 
 
 def rollout(physics, env_id="PandaPush-v1", steps=20):
@@ -24,11 +19,13 @@ def rollout(physics, env_id="PandaPush-v1", steps=20):
         return env.rollout(steps, towards_cube)["next", "observation"]
 
 
-def test_exact_physics_are_the_default():
+def test_exact_physics_are_the_default_and_fast_physics_a_preset():
     assert PhysicsParams() == EXACT
     assert PhysicsParams(1 / 500, 20, 50, 1e-7, 0.1, -9.81) == EXACT
     with torch_panda.make("PandaReach-v1") as env:
         assert env.physics == EXACT
+    with torch_panda.make("PandaReach-v1", physics="fast") as env:
+        assert env.physics == FAST
     explicit = rollout(PhysicsParams(timestep=0.002, n_substeps=20))
     assert torch.equal(rollout("exact"), explicit)
 
@@ -39,43 +36,6 @@ def test_fast_physics_move_the_arm_like_exact_physics():
     assert not torch.equal(exact, fast)
     distance = (exact - fast)[..., :3].norm(dim=-1)
     assert distance.max() < 5e-3  # [m]
-
-
-def test_a_preset_by_name_equals_its_parameters():
-    assert torch.equal(rollout("fast"), rollout(FAST))
-
-
-def reach(physics, poses, offsets):
-    """Solutions of the inverse kinematics, and their mean distance from the target.
-
-    Args:
-        physics: Parameters of the client.
-        poses: Joint positions at the start (n, 9) [rad] and [m].
-        offsets: Offsets of the targets from the hand (n, 3) [m].
-    """
-    solutions, distances = np.zeros_like(poses), []
-    with PhysicsClient(physics=physics) as client:
-        arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
-        for pose, offset, joints in zip(poses, offsets, solutions, strict=True):
-            client.set_joints(arm, JOINTS, pose, np.zeros(9))
-            target = client.state(arm).link_poses[EE_LINK][:3] + offset
-            client.inverse_kinematics(arm, EE_LINK, target, (1, 0, 0, 0), joints)
-            client.set_joints(arm, JOINTS, joints, np.zeros(9))
-            hand = client.state(arm).link_poses[EE_LINK][:3]
-            distances.append(np.linalg.norm(hand - target))
-    return solutions, np.mean(distances)
-
-
-def test_few_iterations_of_the_inverse_kinematics_reach_as_far():
-    rng = np.random.default_rng(0)
-    poses = np.tile(NEUTRAL, (200, 1))
-    poses[:, :7] += rng.normal(0, 0.1, (200, 7))
-    offsets = rng.uniform(-0.05, 0.05, (200, 3))
-    exact, exact_distance = reach(EXACT, poses, offsets)
-    fast, fast_distance = reach(FAST, poses, offsets)
-    assert np.abs(exact - fast).max(1).mean() < 3e-3  # [rad]
-    assert exact_distance == pytest.approx(12.6e-3, abs=0.1e-3)  # [m], of 48 on average
-    assert fast_distance == pytest.approx(exact_distance, abs=0.1e-3)
 
 
 def fall(physics, seconds=0.2):
@@ -106,13 +66,6 @@ def test_timestep_and_gravity_reach_bullet():
 )
 def test_every_parameter_reaches_bullet(change):
     assert not torch.equal(rollout("exact"), rollout(PhysicsParams(**change)))
-
-
-def test_environments_are_pickled_with_their_physics():
-    with torch_panda.make("PandaReach-v1", num_envs=2, physics="fast") as env:
-        pickled = pickle.dumps(env)
-    with pickle.loads(pickled) as copy:
-        assert copy.physics == FAST
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from torch_panda import (
     XArm6,
     XArm6Gripper,
 )
-from torch_panda.bullet import native
 from torch_panda.robots import ControlType
 from torch_panda.rotations import (
     quaternion_product,
@@ -57,20 +56,6 @@ def test_the_control_type_determines_the_size_of_actions(control_type):
         assert env.action_spec.shape == (1, DIMS[control_type] + 1)
     with make("PandaPush-v1", control_type=control_type) as env:
         assert env.action_spec.shape == (1, DIMS[control_type])
-
-
-@pytest.mark.parametrize("control_type", TYPES)
-def test_both_loops_agree_bit_for_bit(control_type, monkeypatch):
-    if native.LIBRARY is None:
-        pytest.skip("installed where there was no C compiler")
-    rollouts = []
-    for loop in ("native", "ctypes"):
-        monkeypatch.setenv(native.LOOP_VARIABLE, loop)
-        torch.manual_seed(0)
-        with make(control_type=control_type, num_envs=2) as env:
-            rollouts.append(env.rollout(30, break_when_any_done=False))
-            assert rollouts[-1].shape == (2, 30)
-    assert (rollouts[0] == rollouts[1]).all()
 
 
 def test_a_joint_moves_at_the_velocity_of_the_action(loop):
