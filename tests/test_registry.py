@@ -121,9 +121,14 @@ def test_wrong_registrations(arguments, error, message):
         torch_panda.register(**(accepted | arguments))
 
 
-def test_an_unknown_id_is_named_with_the_accepted_ones(env_id):
-    with pytest.raises(
-        ValueError, match=r"accepted are Panda\{Reach,.*: .*Unversioned"
-    ):
-        torch_panda.make("PandaShove-v1")
+def test_an_unknown_id_is_named_with_a_similar_one_and_the_accepted_ones(env_id):
+    message = (
+        r"'PandaPsh-v1'; did you mean PandaPush-v1.*accepted are Panda\{Reach,.*: "
+        ".*Unversioned"
+    )
+    with pytest.raises(ValueError, match=message):
+        torch_panda.make("PandaPsh-v1")
+    for unknown in (None, ["PandaPush-v1"]):
+        with pytest.raises(ValueError, match="unknown environment id"):
+            torch_panda.make(unknown)
     assert torch_panda.max_episode_steps(env_id) == 30

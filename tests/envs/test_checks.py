@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 import torch_panda
-from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv, Task
+from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv
 from torch_panda.bullet import VectorSimulation
 from torch_panda.tasks import Bodies, create_table
 
@@ -34,9 +33,6 @@ def test_a_robot_or_task_of_a_wrong_type_is_refused(robot, task, message):
 def test_objects_that_are_not_sensors_are_refused():
     with pytest.raises(TypeError, match="must be a Sensor or a name, got 3"):
         make(Reach(), sensors=(3,))
-    twice = (torch_panda.CameraSensor(), torch_panda.CameraSensor(depth=True))
-    with pytest.raises(ValueError, match=r"two sensors observe \['pixels'\]"):
-        make(Reach(), sensors=twice)
 
 
 # ---- scenes ------------------------------------------------------------------
@@ -264,25 +260,6 @@ def test_a_state_beside_observations_needs_set_state(env):
     assert not torch.equal(goals[:, 0], goals[:, 1])
 
 
-def test_an_empty_task():
-    class Nothing(Task):
-        goal_dim, observation_dim = 3, 0
-
-        def build(self, client):
-            return Bodies()
-
-        def sample_goal(self, rng):
-            return (0.0, 0.0, 0.0)
-
-        def achieved_goal(self, simulation):
-            return simulation.ee_position
-
-    with make(Nothing(), num_envs=2) as env:
-        td = env.reset()
-        env.step(td.set("action", torch.zeros(2, 3)))
-        assert isinstance(env.get_state(), TensorDict)
-
-
 # ---- numbers of the first steps ------------------------------------------------
 
 
@@ -344,14 +321,6 @@ def test_nan_of_an_observation_is_named():
         pytest.raises(ValueError, match=r"Own\.extra_observation\['a'\] must return"),
     ):
         env.reset()
-
-
-def test_later_steps_are_not_checked():
-    """Checks of every step would take too long, so only the first steps are checked."""
-    with make(Reach()) as env:
-        env.rollout(30)
-        env.episodes._observer._check_numbers = None
-        env.rollout(3)
 
 
 def test_more_environments_than_memory_are_refused_at_once():

@@ -131,11 +131,6 @@ class FarPush(Push):
         return self.distance(achieved_goal, desired_goal + 1.0)
 
 
-class OwnSuccess(Push):
-    def is_success(self, achieved_goal, desired_goal):
-        return ~super().is_success(achieved_goal, desired_goal)
-
-
 class OwnRobot(Panda):
     def arm_setpoint(self, action, simulation):
         return super().arm_setpoint(-action, simulation)
@@ -151,16 +146,13 @@ def make(task=None, robot=None):
 
 def test_functions_of_the_user_are_called():
     action = torch.ones(N, 3)
-    with make() as env, make(FarPush()) as far, make(OwnSuccess()) as own:
-        td, td_far, td_own = (e.reset().set("action", action) for e in (env, far, own))
-        step, step_far, step_own = (
-            e.step(start)["next"]
-            for e, start in ((env, td), (far, td_far), (own, td_own))
+    with make() as env, make(FarPush()) as far:
+        step, step_far = (
+            e.step(e.reset().set("action", action))["next"] for e in (env, far)
         )
         moved = step["achieved_goal"].double() + 1.0
         assert step_far["achieved_goal"].allclose(moved.float())
         assert step_far["success"].equal(step["success"])
-        assert step_own["success"].equal(~step["success"])
 
 
 def test_setpoints_and_observations_of_a_users_robot():
@@ -188,19 +180,6 @@ def test_a_wrong_declaration_is_refused():
         assert simulation.state.rows.equal(rows)
 
 
-def test_outputs_are_not_reused_and_do_not_show_the_present():
-    with make() as env:
-        td = env.reset()
-        steps = []
-        for _ in range(3):
-            td = env.step(td.copy().set("action", torch.ones(N, 3)))["next"]
-            steps.append((td, td.clone()))
-        pointers = {value.data_ptr() for step, _ in steps for value in step.values()}
-        assert len(pointers) == sum(len(step.keys()) for step, _ in steps)
-        for step, copy in steps:
-            assert (step == copy).all()
-
-
 def test_the_callers_action_is_kept_and_not_changed():
     with make() as env:
         start = env.reset()
@@ -210,19 +189,6 @@ def test_the_callers_action_is_kept_and_not_changed():
         action.zero_()
         state = env.get_state(exact=True)
         assert (state["actions"] == 1.0).all()
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_bad_action_changes_nothing(bad):
-    with make() as env:
-        start = env.reset()
-        action = torch.zeros(N, 3)
-        action[1, 2] = bad
-        with pytest.raises(ValueError, match="environment 1 is not finite"):
-            env.step(start.set("action", action))
-        state = env.get_state(exact=True)
-        assert (state["num_actions"] == 0).all()
-        assert (state["step_count"] == 0).all()
 
 
 # ---- the next root of a rollout ------------------------------------------------------

@@ -7,7 +7,6 @@ import torch
 import torch_panda
 from tests.envs.test_parity import choose_action
 from torch_panda.envs import history
-from torch_panda.gymnasium_envs import GoalEnv
 
 NUM_ENVS = 4
 
@@ -96,19 +95,6 @@ def test_a_partial_reset_restores_only_its_own():
         env.step(td.clone().set("action", action).set("_step", state["_reset"][:, 0]))
         pose = env.get_state()["object_pose"][1, 0, :3].float()
         assert torch.equal(pose, expected["achieved_goal"][1])
-
-
-def test_gymnasium_passes_exact_states_on():
-    env = GoalEnv("PandaPush-v1")
-    env.reset(seed=0)
-    for _ in range(8):
-        env.step([0.3, 0.0, -1.0])
-    state = env.torch_env.get_state(exact=True)
-    expected = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
-    env.reset(options={"state": {key: x.numpy() for key, x in state.items()}})
-    actual = [env.step([1.0, 0.2, 0.0])[0]["observation"] for _ in range(5)]
-    env.close()
-    np.testing.assert_array_equal(expected, actual)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
 """Episodes with hard contacts do not depend on earlier episodes.
 
 The arm is sent at the objects, often out of range, and presses on the table: then the
-order in which Bullet solves contacts shows. `test_history_changes_nothing` covers every
-id with lighter episodes.
+order in which Bullet solves contacts shows. `test_suite.test_same_seed_same_trajectory`
+covers every id with lighter episodes.
 """
 
 import numpy as np

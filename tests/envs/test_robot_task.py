@@ -1,13 +1,9 @@
 """The contract of `RobotTaskEnv` that does not depend on the id."""
 
-import gc
-import io
 import pickle
 import subprocess
 import sys
-import threading
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -25,14 +21,11 @@ def push_towards(td, generator):
     return towards + noise
 
 
-def run(env, steps=50, seed=0, td=None):
-    generator = torch.Generator().manual_seed(seed)
-    td, observations = env.reset() if td is None else td, []
+def run(env, steps):
+    """Reset the environments and push the objects for some steps."""
+    generator, td = torch.Generator().manual_seed(0), env.reset()
     for _ in range(steps):
-        td["action"] = push_towards(td, generator)
-        td = env.step(td)["next"]
-        observations.append(td["observation"])
-    return torch.stack(observations)
+        td = env.step(td.set("action", push_towards(td, generator)))["next"]
 
 
 @pytest.fixture
@@ -56,18 +49,6 @@ def test_episodes_do_not_depend_on_the_number_of_environments():
             td = few.step(td.set("action", action[:3]))
             others = many.step(others.set("action", action))
             assert (td["next"] == others["next"][:3]).all()
-
-
-@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaSlide-v1"])
-def test_earlier_episodes_do_not_change_later_ones(env_id):
-    with torch_panda.make(env_id, num_envs=4, seed=0) as env:
-        start = env.reset()
-        state = env.get_state()
-        first = run(env, td=start)
-        for seed in range(3):
-            run(env, steps=20 + 11 * seed, seed=seed + 1)
-        again = run(env, td=env.reset(state.clone(), set_state=True))
-        assert torch.equal(first, again)
 
 
 def test_seed_restarts_the_episodes(env):
@@ -108,22 +89,6 @@ def test_global_random_state_is_untouched(env):
     env.reset()
     env.step(TensorDict({"action": torch.zeros(3, 3)}, batch_size=[3]))
     assert torch.equal(before, torch.get_rng_state())
-
-
-def test_a_pickle_keeps_the_last_seed(env):
-    env.set_seed(5)
-    with pickle.loads(pickle.dumps(env)) as copy:
-        assert torch.equal(env.reset()["desired_goal"], copy.reset()["desired_goal"])
-
-
-@pytest.mark.parametrize("integer_type", [np.int64, torch.tensor])
-def test_a_state_dict_holds_plain_numbers(integer_type):
-    file = io.BytesIO()
-    with torch_panda.make("PandaReach-v1", seed=integer_type(5)) as env:
-        torch.save(env.state_dict(), file)
-        file.seek(0)
-        env.load_state_dict(torch.load(file, weights_only=True))
-        assert env.state_dict()["_extra_state"]["seed"] == 5
 
 
 def test_default_dtype_and_device_change_nothing():
@@ -325,14 +290,6 @@ def test_an_episode_can_start_from_the_last_state_of_another(env_id, end):
         assert td[end].all()
 
 
-def test_unbatched():
-    with torch_panda.make("PandaStack-v1", seed=0) as env:
-        assert env.batch_size == torch.Size([])
-        td = env.rollout(3)
-        assert td["next", "reward"].shape == (3, 1)
-        assert env.get_state()["object_pose"].shape == (2, 7)
-
-
 # ---- bad input ---------------------------------------------------------------
 
 
@@ -341,6 +298,7 @@ def test_unbatched():
     [
         (torch.tensor([[0.0] * 3, [0.0, float("nan"), 0.0], [0.0] * 3]), 0, "ment 1"),
         (torch.tensor([[0.0] * 3, [0.0] * 3, [float("inf")] * 3]), 0, "ment 2"),
+        (torch.tensor([[-float("inf")] * 3, [0.0] * 3, [0.0] * 3]), 0, "ment 0"),
         (torch.zeros(3, 4), 0, r"shape \(3, 3\), got \(3, 4\)"),
         (torch.zeros(3, 3, dtype=torch.int64), 1, "float32, got torch.int64"),
         (torch.zeros(3, 3, device="meta"), 0, "device cpu, got meta"),
@@ -348,10 +306,10 @@ def test_unbatched():
 )
 def test_bad_action_changes_nothing(env, action, error, message):
     td = env.reset()
-    state = env.get_state()
+    state = env.get_state(exact=True)
     with pytest.raises((ValueError, TypeError)[error], match=message):
         env.step(TensorDict({"action": action}, batch_size=[3]))
-    assert (env.get_state() == state).all()
+    assert (env.get_state(exact=True) == state).all()
     env.step(td.set("action", torch.zeros(3, 3)))
 
 
@@ -390,24 +348,6 @@ def test_a_bad_render_size_is_refused(size):
         torch_panda.make("PandaReach-v1", from_pixels=True, render_size=size)
 
 
-@pytest.mark.parametrize("env_id", [None, 3, ["PandaPush-v1"]])
-def test_ids_that_are_not_strings_are_refused(env_id):
-    with pytest.raises(ValueError, match="unknown environment id"):
-        torch_panda.make(env_id)
-
-
-def test_an_unknown_id_suggests_a_similar_one():
-    with pytest.raises(ValueError, match=r"did you mean PandaPush-v1.*Panda{Reach,"):
-        torch_panda.make("PandaPsh-v1")
-
-
-def test_unknown_options_are_refused():
-    with pytest.raises(ValueError, match="control_type must be one of"):
-        torch_panda.Panda(control_type="torque")
-    with pytest.raises(ValueError, match="reward_type must be one of"):
-        torch_panda.Reach(reward_type="shaped")
-
-
 def test_goals_of_a_wrong_shape_are_refused(env):
     with pytest.raises(ValueError, match=r"\(\.\.\., 3\), got \(5, 4\)"):
         env.compute_reward(torch.zeros(5, 4), torch.zeros(5, 4))
@@ -429,16 +369,6 @@ def test_use_after_close_is_refused():
     for use in (env.reset, env.get_state, lambda: env.step(td)):
         with pytest.raises(torch_panda.BulletError, match="closed"):
             use()
-
-
-def test_nothing_is_left_behind():
-    before = threading.active_count()
-    for _ in range(3):
-        env = torch_panda.make("PandaReach-v1", num_envs=3, num_threads=3)
-        env.rollout(2)
-        del env  # a forgotten environment closes itself
-    gc.collect()
-    assert threading.active_count() == before
 
 
 def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):

@@ -162,14 +162,3 @@ def test_every_call_is_refused_while_another_thread_is_inside(monkeypatch, call)
         may_leave.set()
         thread.join()
         calls[call]()
-
-
-def test_threads_one_after_the_other():
-    results = []
-    with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
-        for _ in range(3):
-            thread = threading.Thread(target=lambda: results.append(env.rollout(3)))
-            thread.start()
-            thread.join()
-        results.append(env.rollout(3))
-    assert len(results) == 4

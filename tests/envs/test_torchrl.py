@@ -191,24 +191,6 @@ def test_a_state_transform_wraps_one_environment():
     env.close()
 
 
-def test_workers_of_one_seed_repeat_each_other():
-    """Each worker needs its own seed, as the docstring of ``seed`` says."""
-    goals = [make_env(seed=seed).reset()["desired_goal"] for seed in (0, 0, 1)]
-    assert torch.equal(goals[0], goals[1])
-    assert not torch.isin(goals[2], goals[0]).any()
-
-
-def test_batched_environments():
-    """A SerialEnv. `test_multi_process` compares it with a ParallelEnv."""
-    env = SerialEnv(2, make_env)
-    env.set_seed(0)
-    rollout = env.rollout(5)
-    env.close()
-    assert rollout.batch_size == (2, 2, 5)
-    # Workers draw different goals.
-    assert len(rollout["desired_goal"][:, :, 0].reshape(4, 3).unique(dim=0)) == 4
-
-
 def test_collector():
     collector = Collector(
         make_env(seed=0), RandomPolicy(make_env().action_spec), frames_per_batch=120

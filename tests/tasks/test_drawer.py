@@ -10,14 +10,6 @@ import torch_panda
 from torch_panda import Drawer
 
 
-def test_sizes():
-    with torch_panda.make("PandaDrawer-v1") as env:
-        assert env.observation_spec["observation"].shape == (11,)
-        assert env.observation_spec["desired_goal"].shape == (3,)
-        assert env.action_spec.shape == (3,)
-        assert env.max_episode_steps == 50
-
-
 def test_goals_are_within_the_slide_and_far_enough_from_the_start():
     task, rng = Drawer(), np.random.default_rng(0)
     for _ in range(200):

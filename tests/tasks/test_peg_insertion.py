@@ -33,14 +33,6 @@ def release_over_hole(env, offset, height, steps=25):
     return hold_still(env, env.reset(state, set_state=True), steps)
 
 
-def test_sizes():
-    with torch_panda.make("PandaPegInsertion-v1") as env:
-        assert env.observation_spec["observation"].shape == (21,)
-        assert env.observation_spec["desired_goal"].shape == (3,)
-        assert env.action_spec.shape == (3,)
-        assert env.max_episode_steps == 50
-
-
 def test_the_hand_holds_the_peg():
     with torch_panda.make("PandaPegInsertion-v1", num_envs=N, seed=0) as env:
         td = env.reset()
