@@ -1,8 +1,6 @@
 """A task and a robot that a user defines."""
 
-import numpy as np
 import pytest
-import torch
 from torchrl.envs.utils import check_env_specs
 
 from torch_panda import Panda, Reach, Robot, RobotTaskEnv, Task
@@ -86,29 +84,6 @@ def test_draws_of_a_wrong_shape_or_not_finite_are_refused(
         pytest.raises(ValueError, match=f"{function} must return finite numbers"),
     ):
         env.reset()
-
-
-def test_a_robot_of_a_user_reaches():
-    with RobotTaskEnv(robot=make_kuka(), task=Reach(), num_envs=4, seed=0) as env:
-        check_env_specs(env)
-        assert env.action_spec.shape == (4, 3)
-        td = env.reset()
-        for _ in range(40):
-            error = td["desired_goal"] - td["achieved_goal"]
-            td = env.step(td.set("action", error * 10))["next"]
-        assert td["success"].all()
-
-
-def test_a_robot_of_a_user_moves_the_joint_of_an_action():
-    robot = make_kuka(control_type="joints")
-    with RobotTaskEnv(robot=robot, task=Reach(), seed=0) as env:
-        assert env.action_spec.shape == (7,)
-        td = env.reset()
-        before = env.get_state()["joint_position"]
-        env.step(td.set("action", torch.eye(7)[1]))
-        moved = (env.get_state()["joint_position"] - before).abs()
-        assert moved.argmax() == 1
-        assert np.isclose(moved[1], 0.05, atol=0.02)
 
 
 @pytest.mark.parametrize(

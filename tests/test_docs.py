@@ -73,8 +73,3 @@ def test_every_documented_class_and_function_has_a_docstring():
 def test_every_page_is_in_the_navigation():
     navigation = (DOCS / "mkdocs.yml").read_text()
     assert [page for page in read_pages() if f": {page}\n" not in navigation] == []
-
-
-def test_the_registered_classes_have_entries():
-    names = {name for name, _ in documented()}
-    assert {"Push", "PegInsertion", "XArm6", "JointTorque"} <= names

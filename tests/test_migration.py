@@ -82,21 +82,23 @@ def described(value):
     return array.dtype.kind, array.shape
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("theirs", "ours"), rows("From panda-gym 3"))
-def test_from_panda_gym(theirs, ours):
-    def make():
-        return make_reference("PandaPush-v3", render_mode="rgb_array")
-
-    options = {"render_mode": "rgb_array"}
-    env = gymnasium.make("torch_panda/PandaPush-v3", **options)
+def check_row(theirs, ours, env, make, *, is_fetch):
+    """Run both columns of a row, theirs in the environment that a function makes."""
     reference = make()
     for environment in (env, reference):
         environment.reset(seed=0)
     results = [run(theirs, reference, make), run(ours, env, make)]
-    check_alike(*results, is_fetch=False)
+    check_alike(*results, is_fetch=is_fetch)
     for environment in (env, reference):
         environment.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("theirs", "ours"), rows("From panda-gym 3"))
+def test_from_panda_gym(theirs, ours):
+    env = gymnasium.make("torch_panda/PandaPush-v3", render_mode="rgb_array")
+    make = functools.partial(make_reference, "PandaPush-v3", render_mode="rgb_array")
+    check_row(theirs, ours, env, make, is_fetch=False)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -106,30 +108,9 @@ def test_from_fetch(theirs, ours):
         "gymnasium_robotics", reason="needs gymnasium-robotics, which brings MuJoCo"
     )
     gymnasium.register_envs(robotics)
-
-    def make():
-        return gymnasium.make("FetchPush-v4")
-
-    env, reference = gymnasium.make("torch_panda/PandaPush-v1"), make()
-    for environment in (env, reference):
-        environment.reset(seed=0)
-    results = [run(theirs, reference, make), run(ours, env, make)]
-    check_alike(*results, is_fetch=True)
-    for environment in (env, reference):
-        environment.close()
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_fetch_has_the_same_clock_and_scale():
-    robotics = pytest.importorskip(
-        "gymnasium_robotics", reason="needs gymnasium-robotics, which brings MuJoCo"
-    )
-    gymnasium.register_envs(robotics)
-    fetch = gymnasium.make("FetchReach-v4")
-    assert fetch.spec.max_episode_steps == 50
-    assert fetch.unwrapped.dt == pytest.approx(0.04)
-    assert fetch.action_space.shape == (4,)
-    fetch.close()
+    env = gymnasium.make("torch_panda/PandaPush-v1")
+    make = functools.partial(gymnasium.make, "FetchPush-v4")
+    check_row(theirs, ours, env, make, is_fetch=True)
 
 
 def test_an_exact_state_goes_on():

@@ -4,8 +4,8 @@ import pytest
 
 import torch_panda
 from tests.test_custom import PushBall
-from torch_panda import Panda, PickAndPlace, Push, XArm6Gripper
-from torch_panda.registry import Family, find_registration
+from torch_panda import Panda, Push
+from torch_panda.registry import Family
 
 
 @pytest.fixture
@@ -52,17 +52,6 @@ def test_a_family_with_changes_for_v3_has_ids_of_both_versions():
     assert second.make_task().distance_threshold == 0.1
     assert second.make_robot().finger_friction == 2.0
     assert first.make_task().distance_threshold == 0.05
-
-
-def test_a_registration_makes_robot_and_task(env_id):
-    registration = find_registration("XArm6GripperPickAndPlaceDense-v1")
-    assert type(registration.make_robot()) is XArm6Gripper
-    task = registration.make_task({"distance_threshold": 0.02})
-    assert type(task) is PickAndPlace
-    assert (task.reward_type, task.distance_threshold) == ("dense", 0.02)
-    registration = find_registration(env_id)
-    assert registration.make_robot().control_type == "joints"
-    assert type(registration.make_task()) is PushBall
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import pytest
-import torch
 
 import torch_panda
 from tests.ids import PHYSICS_IDS
@@ -81,41 +80,6 @@ def test_both_versions_share_what_the_page_says(version, task, name, value):
 def test_the_defaults_of_a_task_are_those_of_v1(task):
     made = find_registration(f"Panda{task}-v1").make_task()
     assert vars(made) == vars(type(made)())
-
-
-def test_flip_has_the_fingers_of_panda_gym_3():
-    for version in ("v1", "v3"):
-        robot = find_registration(f"PandaFlip-{version}").make_robot()
-        assert (robot.finger_friction, robot.finger_spinning_friction) == (1.0, 0.001)
-
-
-# Friction brakes a sliding body by mu g, where mu is the product of both values.
-@pytest.mark.parametrize(
-    ("env_id", "friction"),
-    [
-        ("PandaPush-v1", 0.5 * 0.1),
-        ("PandaPush-v3", 0.5 * 0.5),
-        ("PandaPickAndPlace-v1", 5.0 * 0.1),
-        ("PandaSlide-v1", 0.5 * 0.1),
-        ("PandaSlide-v3", 0.04 * 0.5),
-    ],
-)
-def test_friction_brakes_sliding_objects_by_mu_g(env_id, friction):
-    speed = 0.3
-    with torch_panda.make(env_id) as env:
-        state = env.reset().update(env.get_state())
-        height = 0.015 if "Slide" in env_id else 0.02
-        state["object_pose"][..., :3] = torch.tensor([0.0, 0.1, height])
-        state["object_velocity"][..., 1] = speed
-        td = env.reset(state, set_state=True)
-        steps = int(0.8 * speed / (friction * 9.81) / 0.04)
-        steps = min(steps, env.max_episode_steps)
-        for _ in range(steps):
-            td = env.step(td.set("action", env.action_spec.zero()))["next"]
-        index = env.robot.observation_dim + 7
-        final_speed = td["observation"][index].item()
-    expected = speed - friction * 9.81 * 0.04 * steps
-    assert final_speed == pytest.approx(expected, abs=0.1 * (speed - expected))
 
 
 @pytest.mark.parametrize(

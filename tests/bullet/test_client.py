@@ -11,7 +11,6 @@ from torch_panda.bullet import BulletError, PhysicsClient, capi, library
 JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
 NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
-EE_LINK = 11
 
 
 @pytest.fixture
@@ -75,52 +74,6 @@ def test_falling_bodies_equal_those_of_pybullet(reference, shape):
         assert [tuple(c.position_on_b) for c in ours] == [c[6] for c in theirs]
         assert [c.normal_force for c in ours] == [c[9] for c in theirs]
         assert [c.distance for c in ours] == [c[8] for c in theirs]
-
-
-def test_an_arm_with_kinematics_and_motors_equals_that_of_pybullet(reference):
-    rng = np.random.default_rng(0)
-    with PhysicsClient() as client:
-        urdf, base = "franka_panda/panda.urdf", (-0.6, 0.0, 0.0)
-        arm = reference.loadURDF(urdf, basePosition=base, useFixedBase=True)
-        assert client.load_urdf(urdf, position=base, fixed_base=True) == arm
-        movable = [joint.index for joint in client.joints(arm) if joint.is_movable]
-        assert movable == list(JOINTS)
-        create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
-        body = create(reference, client, "box", 1.0, (0.0, 0.0, 0.04))
-        for joint, position in zip(JOINTS, NEUTRAL, strict=True):
-            reference.resetJointState(arm, joint, position)
-            client.set_joint(arm, joint, position, 0.0)
-        target, joints = np.zeros(3), np.zeros(9)
-        rotation = (1.0, 0.0, 0.0, 0.0)
-        for _ in range(40):
-            ee = np.array(reference.getLinkState(arm, EE_LINK)[0])
-            goal = np.array(reference.getBasePositionAndOrientation(body)[0])
-            step = np.clip((goal - ee) * 20 + rng.normal(size=3) * 0.3, -1, 1)
-            target[:] = ee + step * 0.05
-            theirs = reference.calculateInverseKinematics(
-                arm, EE_LINK, target.tolist(), rotation
-            )
-            client.inverse_kinematics(arm, EE_LINK, target, rotation, joints)
-            assert joints.tolist() == list(theirs)
-            reference.setJointMotorControlArray(
-                arm,
-                JOINTS,
-                pybullet.POSITION_CONTROL,
-                targetPositions=joints.tolist(),
-                forces=FORCES,
-            )
-            client.control_joints(arm, joints, FORCES)
-            client.step(20)
-            for _ in range(20):
-                reference.stepSimulation()
-            state = client.state(arm, link_velocities=True)
-            states = reference.getJointStates(arm, JOINTS)
-            assert state.joint_positions.tolist() == [s[0] for s in states]
-            assert state.joint_velocities.tolist() == [s[1] for s in states]
-            link = reference.getLinkState(arm, EE_LINK, computeLinkVelocity=True)
-            assert state.link_pose(EE_LINK).tolist() == [*link[0], *link[1]]
-            assert state.link_velocity(EE_LINK).tolist() == [*link[6], *link[7]]
-        assert reference.getContactPoints(arm, body), "the arm must touch the box"
 
 
 def test_a_closed_client_raises_and_may_be_closed_again():

@@ -5,22 +5,16 @@ import pytest
 import torch
 
 import torch_panda
-from tests.envs.test_parity import choose_action
+from tests.envs.test_parity import choose_actions
 from torch_panda.envs import history
 
 NUM_ENVS = 4
 
 
-def actions_of(env_id, observation, rngs, size):
-    rows = zip(observation.numpy(), rngs, strict=True)
-    actions = [choose_action(env_id, row, rng, size) for row, rng in rows]
-    return torch.from_numpy(np.stack(actions))
-
-
 def act(env, td, env_id, rngs, steps):
     size = env.action_spec.shape[-1]
     for _ in range(steps):
-        action = actions_of(env_id, td["observation"], rngs, size)
+        action = choose_actions(env_id, td["observation"], rngs, size)
         td = env.step(td.set("action", action))["next"]
     return td
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torch_panda
-from tests.envs.test_parity import choose_action
+from tests.envs.test_parity import choose_actions
 
 pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
@@ -34,13 +34,8 @@ def count_differences(env_id, episodes):
         state = env.get_state()
         rngs = [np.random.default_rng(k) for k in range(episodes)]
         for _ in range(STEPS):
-            observation = td["observation"].numpy()
             size = env.action_spec.shape[-1]
-            rows = [
-                choose_action(env_id, row, rng, size)
-                for row, rng in zip(observation, rngs, strict=True)
-            ]
-            actions.append(torch.from_numpy(np.stack(rows)))
+            actions.append(choose_actions(env_id, td["observation"], rngs, size))
             td = env.step(td.set("action", actions[-1]))["next"]
             first.append(td["observation"])
         again = act(env, env.reset(state.clone(), set_state=True), actions)

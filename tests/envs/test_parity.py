@@ -38,6 +38,13 @@ def choose_action(env_id, observation, rng, size):
     return action.astype(np.float32)
 
 
+def choose_actions(env_id, observation, rngs, size):
+    """Actions of all environments, each with its own random generator."""
+    rows = zip(observation.numpy(), rngs, strict=True)
+    actions = [choose_action(env_id, row, rng, size) for row, rng in rows]
+    return torch.from_numpy(np.stack(actions))
+
+
 def had_contact(reference):
     sim = reference.sim
     names = ("object", "object1", "object2", "table")

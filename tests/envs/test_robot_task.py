@@ -313,15 +313,6 @@ def test_bad_action_changes_nothing(env, action, error, message):
     env.step(td.set("action", torch.zeros(3, 3)))
 
 
-def test_large_actions_are_clipped(env):
-    td = env.reset()
-    state = env.get_state()
-    clipped = env.step(td.clone().set("action", torch.ones(3, 3)))["next"]
-    env.reset(state.clone(), set_state=True)
-    large = env.step(td.clone().set("action", torch.full((3, 3), 1e30)))["next"]
-    assert (clipped == large).all()
-
-
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [

@@ -47,33 +47,6 @@ env.close()
 print("fine")
 """
 
-COLLECTOR = """
-import os, sys, time, torch, torch_panda
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs.utils import RandomPolicy
-
-env = torch_panda.make("PandaPush-v1", num_envs=4, num_threads=2, seed=0)
-rb = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=4)
-policy = RandomPolicy(env.action_spec)
-collector = Collector(
-    env, policy, frames_per_batch=80, total_frames=10**9, replay_buffer=rb
-)
-collector.start()
-while len(rb) < 80:
-    time.sleep(0.01)
-for _ in range(50):
-    try:
-        env.rollout(20)
-    except torch_panda.BulletError as error:
-        print(error, file=sys.stderr)  # or the collector's thread prints it
-        break
-sys.stderr.flush()
-print("fine", flush=True)
-os._exit(0)
-"""
-
-
 OWN_ENVIRONMENTS = """
 import threading, torch_panda
 
@@ -107,10 +80,6 @@ def run(code):
 
 def test_three_threads_that_step():
     run(THREE_THREADS)
-
-
-def test_a_collectors_thread_and_a_rollout():
-    assert "it serves one thread at a time" in run(COLLECTOR)
 
 
 def test_threads_may_build_environments_of_their_own_at_the_same_time():

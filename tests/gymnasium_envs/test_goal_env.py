@@ -10,7 +10,6 @@ from torchrl.envs import GymEnv, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from tests.gymnasium_envs.equal import assert_equal
 from torch_panda.gymnasium_envs import GoalEnv
 
 # check_env advises against spaces without bounds; positions have none.
@@ -31,24 +30,6 @@ def test_all_ids_are_registered(env_id):
     spec = gymnasium.spec(f"torch_panda/{env_id}")
     assert spec.max_episode_steps == torch_panda.max_episode_steps(env_id)
     assert spec.vector_entry_point is not None
-
-
-@pytest.mark.filterwarnings(NO_BOUNDS)
-@pytest.mark.filterwarnings(NOT_OLD)
-@pytest.mark.filterwarnings("error")
-def test_goals_that_are_observations():
-    env = gymnasium.make("torch_panda/PandaPush-v1", goal="observation")
-    try:
-        check_env(env.unwrapped, skip_render_check=True)
-        for key in ("achieved_goal", "desired_goal"):
-            assert env.observation_space[key].shape == (18,)
-        env.reset(seed=0)
-        observation, reward, *_ = env.step(env.action_space.sample())
-        goals = observation["achieved_goal"], observation["desired_goal"]
-        assert np.array_equal(goals[0], observation["observation"])
-        assert env.unwrapped.compute_reward(*goals, {}) == reward
-    finally:
-        env.close()
 
 
 # Each task, control type, reward and version once; other tests cover all ids.
@@ -102,25 +83,6 @@ def test_same_episodes_as_the_torch_environment(env):
                 assert reward == after["reward"].item()
                 assert terminated == after["terminated"].item()
                 assert info["is_success"] == after["success"].item()
-
-
-def test_an_episode_starts_from_a_given_state(env):
-    env.reset(seed=1)
-    before = env.step(np.ones(3))[0]
-    state = env.unwrapped.torch_env.get_state()
-    options = {"state": {key: x.numpy() for key, x in state.items()}}
-    steps = []
-    for _ in range(2):
-        observation, _ = env.reset(options=options)
-        assert env.unwrapped.torch_env.get_state()["step_count"] == 1
-        for key in ("achieved_goal", "desired_goal"):
-            assert np.array_equal(observation[key], before[key])
-        steps.append(env.step(-np.ones(3)))
-    assert_equal(*steps)
-    with pytest.raises(ValueError, match=r"accepted option is 'state', got .*speed"):
-        env.reset(options={"speed": 1})
-    with pytest.raises(ValueError, match="must have entries, got none"):
-        env.reset(options={"state": TensorDict()})
 
 
 @pytest.mark.filterwarnings(NO_BOUNDS)
@@ -189,15 +151,6 @@ def test_goal_functions(env_id):
     env.close()
 
 
-def test_step_agrees_with_the_goal_functions(env):
-    observation, _ = env.reset(seed=0)
-    for _ in range(5):
-        observation, reward, terminated, _, info = env.step(env.action_space.sample())
-        goals = observation["achieved_goal"], observation["desired_goal"]
-        assert reward == env.unwrapped.compute_reward(*goals, info)
-        assert terminated == env.unwrapped.compute_terminated(*goals, info)
-
-
 def test_an_environment_of_an_own_task_is_accepted():
     task = torch_panda.Reach(distance_threshold=0.2)
     torch_env = torch_panda.RobotTaskEnv(
@@ -205,6 +158,7 @@ def test_an_environment_of_an_own_task_is_accepted():
     )
     env = GoalEnv(torch_env)
     env.reset(seed=0)
+    assert env.render() is None
     assert [env.step(np.zeros(3))[3] for _ in range(4)] == [False] * 3 + [True]
     env.close()
     assert torch_env.is_closed
@@ -220,19 +174,6 @@ def test_an_environment_of_an_own_task_is_accepted():
         ),
     ):
         GoalEnv(made, sed=3, from_pixels=True, render_width=8)
-
-
-def test_render(monkeypatch):
-    image = torch.arange(24, dtype=torch.uint8).reshape(2, 4, 3)
-    monkeypatch.setattr(
-        torch_panda.RobotTaskEnv, "render", lambda self: image, raising=False
-    )
-    for mode in ("rgb_array", None):
-        env = gymnasium.make("torch_panda/PandaReach-v1", render_mode=mode)
-        env.reset()
-        frame = env.render() if mode else env.unwrapped.render()
-        env.close()
-        assert frame is None if mode is None else np.array_equal(frame, image)
 
 
 def test_bad_actions_are_refused(env):

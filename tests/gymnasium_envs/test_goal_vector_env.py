@@ -1,7 +1,6 @@
 """`GoalVectorEnv` returns the same values as SyncVectorEnv."""
 
 import gc
-import itertools
 
 import gymnasium
 import numpy as np
@@ -9,8 +8,6 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from torchrl.envs import GymWrapper
-from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from tests.gymnasium_envs.equal import assert_equal
@@ -76,31 +73,6 @@ def test_values_equal_those_of_sync_vector_env(env_id, limit, mode):
     assert np.sum(ends, axis=0).min() >= 3
 
 
-def test_torchrl_wraps_it_as_sync_vector_env():
-    rollouts = []
-    for env in make_pair("PandaReach-v3", AutoresetMode.DISABLED, None):
-        wrapped = GymWrapper(env)
-        check_env_specs(wrapped)
-        wrapped.set_seed(0)
-        torch.manual_seed(0)
-        rollouts.append(wrapped.rollout(60, break_when_any_done=False))
-        wrapped.close()
-    ours, theirs = rollouts
-    assert ours["next", "done"].any()
-    for key in ("observation", "desired_goal", "action", "done"):
-        assert torch.equal(ours[key], theirs[key])
-
-
-def test_environments_draw_as_the_torch_environment_of_their_seed():
-    env = GoalVectorEnv("PandaPush-v1", num_envs=2)
-    observation, _ = env.reset(seed=8)
-    env.close()
-    for index in range(2):
-        with torch_panda.make("PandaPush-v1", seed=8 + index) as other:
-            goal = other.reset()["desired_goal"]
-        assert np.array_equal(observation["desired_goal"][index], goal)
-
-
 def test_start_from_a_state():
     env = GoalVectorEnv("PandaPush-v1", num_envs=2)
     env.reset(seed=0)
@@ -114,14 +86,6 @@ def test_start_from_a_state():
     pose = slice(6, 9)
     assert np.array_equal(again["observation"][1, pose], first["observation"][1, pose])
     assert not np.array_equal(again["observation"][0], first["observation"][0])
-
-
-def test_outputs_are_not_overwritten():
-    env = GoalVectorEnv("PandaReach-v1", num_envs=2)
-    results = [env.reset(seed=0)[0], *(env.step(np.ones((2, 3)))[0] for _ in range(3))]
-    env.close()
-    for first, second in itertools.pairwise(results):
-        assert not np.array_equal(first["observation"], second["observation"])
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
@@ -182,15 +146,3 @@ def test_bad_arguments_are_refused():
             with pytest.raises(TypeError, match=f"{name}.* are accepted with an id"):
                 GoalVectorEnv(batched, **arguments)
     gc.collect()
-
-
-def test_render(monkeypatch):
-    images = torch.arange(48, dtype=torch.uint8).reshape(2, 2, 4, 3)
-    monkeypatch.setattr(
-        torch_panda.RobotTaskEnv, "render", lambda self: images, raising=False
-    )
-    env = GoalVectorEnv("PandaReach-v1", num_envs=2, render_mode="rgb_array")
-    frames = env.render()
-    env.close()
-    assert isinstance(frames, tuple)
-    assert np.array_equal(np.stack(frames), images)

@@ -1,7 +1,6 @@
 """Coarse meshes: fewer triangles, the same picture."""
 
 import numpy as np
-import pytest
 
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import find_urdf
@@ -27,8 +26,8 @@ def make_ball(n=40):
     return vertices, np.zeros((1, 2)), corners
 
 
-@pytest.mark.parametrize("cell", [0.1, 0.25, 0.5])
-def test_merged_vertices_stay_close_and_faces_keep_their_side(cell):
+def test_merged_vertices_stay_close_and_faces_keep_their_side():
+    cell = 0.25
     vertices, coordinates, corners = make_ball()
     positions, texture, faces = merge_vertices(
         vertices, coordinates, corners, np.full(3, cell)
@@ -42,18 +41,6 @@ def test_merged_vertices_stay_close_and_faces_keep_their_side(cell):
     assert (outward > 0).mean() > 0.98
     # Nearly every triangle is unique, whichever vertex it starts with.
     assert len(np.unique(np.sort(faces, axis=1), axis=0)) >= 0.98 * len(faces)
-
-
-def test_fine_cells_change_nothing():
-    vertices, coordinates, corners = make_ball(12)
-    positions, _, faces = merge_vertices(
-        vertices, coordinates, corners, np.full(3, 1e-6)
-    )
-    before = np.sort(np.linalg.norm(np.diff(vertices[corners[..., 0]], axis=1), axis=2))
-    after = np.sort(np.linalg.norm(np.diff(positions[faces], axis=1), axis=2))
-    kept = (before > 1e-9).all(axis=1) & (len(faces) <= len(corners))
-    assert len(faces) <= kept.sum()
-    assert after.max() == pytest.approx(before[kept].max(), abs=1e-6)
 
 
 def test_colors_stay_apart():

@@ -5,9 +5,8 @@ import pybullet
 import pytest
 
 from torch_panda.bullet import BulletError, PhysicsClient, Visual
-from torch_panda.bullet.shapes import Box, Cylinder, Sphere
+from torch_panda.bullet.shapes import Box
 from torch_panda.rendering.camera import Camera, resized, to_metres
-from torch_panda.rendering.egl import check_renderer
 from torch_panda.rendering.visual_client import VisualClient
 from torch_panda.tasks.flip import VISUAL
 
@@ -160,13 +159,3 @@ def test_missing_texture_is_named(tmp_path):
 
     with pytest.raises(BulletError, match=r"none\.png"):
         visual_client(build_box)
-
-
-def test_unknown_renderer_is_named():
-    with pytest.raises(ValueError, match=r"'tiny', 'egl'.*'opengl'"):
-        check_renderer("opengl")
-
-
-def test_shapes_are_plain_values():
-    assert Box((1, 2, 3)) == ((1, 2, 3),)
-    assert Cylinder(0.1, 0.2) != Sphere(0.1)

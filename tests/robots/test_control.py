@@ -5,8 +5,10 @@ from itertools import product
 from typing import get_args
 
 import pybullet
+import pybullet_data
 import pytest
 import torch
+from pybullet_utils.bullet_client import BulletClient
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
@@ -76,42 +78,24 @@ def test_torques_move_the_arm_as_in_pybullet(loop):
         found = simulation.joint_position[0, :7].tolist()
         torques = action * 0.1 * torch.tensor(env.robot.joint_forces[:7])
         start = env.robot.neutral_joint_position
-    client = pybullet.connect(pybullet.DIRECT)
-    try:
-        import pybullet_data
-
-        pybullet.setTimeStep(1 / 500, physicsClientId=client)
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-        body = pybullet.loadURDF(
-            f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf",
-            useFixedBase=True,
-            physicsClientId=client,
+    reference = BulletClient(pybullet.DIRECT)
+    reference.setAdditionalSearchPath(pybullet_data.getDataPath())
+    reference.setTimeStep(1 / 500)
+    reference.setGravity(0, 0, -9.81)
+    body = reference.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
+    joints = [0, 1, 2, 3, 4, 5, 6, 9, 10]
+    for joint, position in zip(joints, start, strict=True):
+        reference.resetJointState(body, joint, position)
+    reference.setJointMotorControlArray(
+        body, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 7 + [170.0] * 2
+    )
+    for _ in range(60):
+        reference.setJointMotorControlArray(
+            body, joints[:7], pybullet.TORQUE_CONTROL, forces=torques.double().tolist()
         )
-        joints = [0, 1, 2, 3, 4, 5, 6, 9, 10]
-        for joint, position in zip(joints, start, strict=True):
-            pybullet.resetJointState(body, joint, position, physicsClientId=client)
-        pybullet.setJointMotorControlArray(
-            body,
-            joints,
-            pybullet.VELOCITY_CONTROL,
-            forces=[0.0] * 7 + [170.0] * 2,
-            physicsClientId=client,
-        )
-        for _ in range(60):
-            pybullet.setJointMotorControlArray(
-                body,
-                joints[:7],
-                pybullet.TORQUE_CONTROL,
-                forces=torques.double().tolist(),
-                physicsClientId=client,
-            )
-            pybullet.stepSimulation(physicsClientId=client)
-        expected = [
-            pybullet.getJointState(body, joint, physicsClientId=client)[0]
-            for joint in joints[:7]
-        ]
-    finally:
-        pybullet.disconnect(client)
+        reference.stepSimulation()
+    expected = [reference.getJointState(body, joint)[0] for joint in joints[:7]]
+    reference.disconnect()
     assert found == pytest.approx(expected, abs=1e-3)
     moved = torch.tensor(found) - torch.tensor(start[:7])
     assert moved.abs().max() > 0.02
