@@ -1,8 +1,7 @@
 """Robots: their URDFs, the meaning of actions, and observations."""
 
 from torch_panda.bullet.urdf import Tool
-from torch_panda.robots.base import Robot
-from torch_panda.robots.control_type import ControlType
+from torch_panda.robots.base import ControlType, Robot
 from torch_panda.robots.gripper import Gripper
 from torch_panda.robots.kuka import Kuka
 from torch_panda.robots.panda import Panda

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -17,15 +17,31 @@ from torch_panda.bullet import (
     PhysicsClient,
     VectorSimulation,
 )
+from torch_panda.bullet.control import ArmMode
 from torch_panda.bullet.urdf import Tool
 from torch_panda.checks import check_choice, check_quaternion
-from torch_panda.robots.control_type import ACTION_SCALES, ARM_MODES, ControlType
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
     NO_ROTATION,
     quaternion_product,
     rotation_vector_to_quaternion,
 )
+
+ControlType = Literal["ee", "ee_pose", "joints", "joint_velocity", "joint_torque"]
+
+# Displacement [m] or [rad], velocity [rad/s], or share of the motor's largest force for
+# an action of 1. At 1.25 rad/s a joint moves 0.05 rad in a step of 40 ms.
+_ACTION_SCALES: dict[ControlType, float] = {
+    "ee": 0.05,
+    "ee_pose": 0.05,
+    "joints": 0.05,
+    "joint_velocity": 1.25,
+    "joint_torque": 1.0,
+}
+_ARM_MODES: dict[ControlType, ArmMode] = {
+    "joint_velocity": "velocity",
+    "joint_torque": "torque",
+}
 
 Workspace = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest (x, y, z) of a box, world frame [m]."""
@@ -113,7 +129,7 @@ class Robot(Configured):
         check_quaternion("ee_orientation", ee_orientation)
         check_quaternion("base_orientation", base_orientation)
         if action_scale is None:
-            action_scale = ACTION_SCALES[control_type]
+            action_scale = _ACTION_SCALES[control_type]
         if not 0 < action_scale < math.inf:
             raise ValueError(f"action_scale must be above 0, got {action_scale}")
         self.urdf = urdf
@@ -293,7 +309,7 @@ class Robot(Configured):
             return MotorControl(forces, self.ee_link, self.ee_orientation, arm)
         if self.control_type == "ee_pose":
             return MotorControl(forces, self.ee_link, num_arm_joints=arm)
-        mode = ARM_MODES.get(self.control_type, "position")
+        mode = _ARM_MODES.get(self.control_type, "position")
         return MotorControl(forces, num_arm_joints=arm, arm_mode=mode)
 
     @property

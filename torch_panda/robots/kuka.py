@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from torch_panda.robots.base import ABOVE_THE_TABLE, Robot, Workspace
-from torch_panda.robots.control_type import ControlType
+from torch_panda.robots.base import ABOVE_THE_TABLE, ControlType, Robot, Workspace
 from torch_panda.rotations import NO_ROTATION
 
 # The hand is above the table and points down [rad].
@@ -16,12 +15,7 @@ EE_LINK = 6
 class Kuka(Robot):
     """The KUKA LBR iiwa 14 arm: 7 joints and no gripper.
 
-    Args:
-        control_type: Meaning of an action; see `Robot`.
-        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
-        base_position: Position of the base, world frame [m].
-        base_orientation: Orientation of the base, quaternion xyzw.
-        workspace: Box in which actions can send the end-effector; see `Robot`.
+    `Robot` explains the arguments.
     """
 
     def __init__(

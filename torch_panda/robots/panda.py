@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 
 from torch_panda.bullet import PhysicsClient
-from torch_panda.robots.base import ABOVE_THE_TABLE, Robot, Workspace
-from torch_panda.robots.control_type import ControlType
+from torch_panda.robots.base import ABOVE_THE_TABLE, ControlType, Robot, Workspace
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import NO_ROTATION
 
@@ -21,13 +20,9 @@ GRIPPER = Gripper(closed=(0.0, 0.0), opened=(0.04, 0.04), width=0.08)
 class Panda(Robot):
     """The Franka Emika Panda arm: 7 joints and two fingers.
 
+    `Robot` explains the arguments that are not listed here.
+
     Args:
-        control_type: Meaning of an action; see `Robot`.
-        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
-        block_gripper: Keep the fingers at their start positions, by default closed.
-        base_position: Position of the base, world frame [m].
-        base_orientation: Orientation of the base, quaternion xyzw.
-        workspace: Box in which actions can send the end-effector; see `Robot`.
         fingers_width: Distance between the fingers at the start of an episode [m].
         finger_friction: Lateral friction of the fingers.
         finger_spinning_friction: Spinning friction of the fingers; None means the

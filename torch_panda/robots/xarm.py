@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import Tool
-from torch_panda.robots.base import ABOVE_THE_TABLE, Robot, Workspace
-from torch_panda.robots.control_type import ControlType
+from torch_panda.robots.base import ABOVE_THE_TABLE, ControlType, Robot, Workspace
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import NO_ROTATION
 
@@ -30,12 +29,7 @@ FINGER_LINKS = (9, 12)
 class XArm6(Robot):
     """The xArm 6: 6 joints and no gripper.
 
-    Args:
-        control_type: Meaning of an action; see `Robot`.
-        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
-        base_position: Position of the base, world frame [m].
-        base_orientation: Orientation of the base, quaternion xyzw.
-        workspace: Box in which actions can send the end-effector; see `Robot`.
+    `Robot` explains the arguments.
     """
 
     def __init__(
@@ -63,14 +57,8 @@ class XArm6(Robot):
 class XArm6Gripper(Robot):
     """The xArm 6 with its gripper: 6 joints of the arm and 6 of the fingers.
 
-    Args:
-        control_type: Meaning of an action; see `Robot`.
-        action_scale: Displacement, velocity or torque of an action of 1; see `Robot`.
-        block_gripper: Keep the fingers closed.
-        base_position: Position of the base, world frame [m].
-        base_orientation: Orientation of the base, quaternion xyzw.
-        workspace: Box in which actions can send the end-effector; see `Robot`.
-        finger_friction: Lateral friction of the fingers.
+    ``finger_friction`` is the lateral friction of the fingers. `Robot` explains the
+    other arguments.
     """
 
     def __init__(
