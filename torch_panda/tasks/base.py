@@ -13,21 +13,6 @@ from torch_panda.arguments import Configured
 from torch_panda.bullet import PhysicsClient, VectorSimulation, selects_state
 from torch_panda.checks import check_choice, check_not_negative
 from torch_panda.rotations import NO_ROTATION
-from torch_panda.tasks.table import create_table
-
-# A task of a user needs these names.
-__all__ = [
-    "NO_ROTATION",
-    "OBJECT_LAYOUT",
-    "Bodies",
-    "GoalEntries",
-    "ObjectState",
-    "Quantity",
-    "Start",
-    "Task",
-    "create_table",
-    "object_observation",
-]
 
 RewardType = Literal["sparse", "dense"]
 Quantity = Literal[
