@@ -1,7 +1,6 @@
 """Goals that are full observations, for ``RobotTaskEnv(goal="observation")``."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -46,44 +45,37 @@ def _is_up_to_date(task: Task) -> bool:
     return declared <= observation and declared <= achieved_goal
 
 
-@dataclass(frozen=True)
-class ObservationGoalFunction:
-    """A function of two goals, applied to goals that are full observations.
-
-    It is pure, works on any device, and can be pickled.
+def apply_to_observations(
+    function: RewardFunction,
+    goal_indices: tuple[int, ...],
+    observation_dim: int,
+    achieved_goal: Tensor,
+    desired_goal: Tensor,
+) -> Tensor:
+    """Apply a function of the task's goals to goals that are full observations.
 
     Args:
-        function: The function of the task's goals.
+        function: The function of two goals, (..., goal_dim) each.
         goal_indices: The entries of an observation that are the task's goal.
         observation_dim: Number of entries of an observation.
+        achieved_goal: (..., observation_dim).
+        desired_goal: (..., observation_dim).
+
+    Returns:
+        The result of the function, (..., 1).
+
+    Raises:
+        ValueError: A goal is not a full observation.
     """
-
-    function: RewardFunction
-    goal_indices: tuple[int, ...]
-    observation_dim: int
-
-    def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Call the function with the task's goals, taken from the observations.
-
-        Args:
-            achieved_goal: (..., observation_dim).
-            desired_goal: (..., observation_dim).
-
-        Returns:
-            (..., 1).
-
-        Raises:
-            ValueError: A goal is not a full observation.
-        """
-        sizes = (self.observation_dim,)
-        if achieved_goal.shape[-1:] != sizes or desired_goal.shape[-1:] != sizes:
-            raise ValueError(
-                f"achieved_goal and desired_goal must be full observations of shape "
-                f"(..., {self.observation_dim}), got {tuple(achieved_goal.shape)} and "
-                f"{tuple(desired_goal.shape)}"
-            )
-        indices = list(self.goal_indices)
-        return self.function(achieved_goal[..., indices], desired_goal[..., indices])
+    sizes = (observation_dim,)
+    if achieved_goal.shape[-1:] != sizes or desired_goal.shape[-1:] != sizes:
+        raise ValueError(
+            f"achieved_goal and desired_goal must be full observations of shape "
+            f"(..., {observation_dim}), got {tuple(achieved_goal.shape)} and "
+            f"{tuple(desired_goal.shape)}"
+        )
+    indices = list(goal_indices)
+    return function(achieved_goal[..., indices], desired_goal[..., indices])
 
 
 class GoalObserver:
@@ -94,14 +86,6 @@ class GoalObserver:
 
     `update` writes these states into the tensors of the simulation, observes them, and
     restores the tensors. It does not change Bullet's clients.
-
-    Args:
-        robot: The robot.
-        task: The task.
-        simulation: The environments.
-        build_scene: Builds the scene in a client.
-        physics: The integration parameters of the clients.
-        goal_indices: The entries of an observation that are the task's goal.
 
     Attributes:
         desired: Observations of the present episodes' goals, (n, observation_dim)

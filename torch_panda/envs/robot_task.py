@@ -19,7 +19,7 @@ from typing_extensions import Self
 from torch_panda.bullet import PhysicsName, PhysicsParams, native
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
-from torch_panda.envs.goal_observation import GoalName, ObservationGoalFunction
+from torch_panda.envs.goal_observation import GoalName, apply_to_observations
 from torch_panda.envs.next_root import NextRoot
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
@@ -211,8 +211,8 @@ class RobotTaskEnv(EnvBase):
         episodes = self.episodes
         if self.goal == "task" or episodes.goal_indices is None:
             return function
-        return ObservationGoalFunction(
-            function, episodes.goal_indices, episodes.goal_dim
+        return functools.partial(
+            apply_to_observations, function, episodes.goal_indices, episodes.goal_dim
         )
 
     def __repr__(self) -> str:

@@ -1,8 +1,7 @@
 """Reads and checks the state from which a reset starts."""
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,8 +32,7 @@ NESTED_STATE = "state"
 EXACT_KEYS = (*(START + key for key in ALL_KEYS), ACTIONS, NUM_ACTIONS)
 
 
-@dataclass
-class StartState:
+class StartState(NamedTuple):
     """A state to start from, in k environments.
 
     Attributes:
@@ -48,7 +46,7 @@ class StartState:
     """
 
     values: dict[str, Tensor]
-    start: dict[str, Tensor] = field(default_factory=dict)
+    start: dict[str, Tensor]
     actions: Tensor | None = None
     num_actions: Tensor | None = None
 
@@ -188,10 +186,9 @@ def read_state(
             if state.get(prefix + key, None) is not None
         }
 
-    start_state = StartState(read())
     exact_keys = set(EXACT_KEYS).intersection(state.keys())
     if not exact_keys:
-        return start_state
+        return StartState(read(), start={})
     required = {START + key for key in present} | {ACTIONS, NUM_ACTIONS}
     if missing := (required | present.keys()).difference(state.keys()):
         raise ValueError(
@@ -199,15 +196,14 @@ def read_state(
             f"leave out {sorted(exact_keys)} to start from the other entries"
         )
     n, length = len(next(iter(present.values()))), state[ACTIONS].shape[-2]
-    start_state.start = read(START)
+    values, start = read(), read(START)
     like = torch.zeros(n, length, action_dim, dtype=torch.float32, device="cpu")
     actions = _read_entry(ACTIONS, state[ACTIONS], batch_shape, like, envs)
     check_rows(ACTIONS, actions.abs() <= 1, envs, "in [-1, 1]")
     like = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
     count = _read_entry(NUM_ACTIONS, state[NUM_ACTIONS], batch_shape, like, envs)
     check_rows(NUM_ACTIONS, count <= length, envs, f"at most {length}")
-    start_state.actions, start_state.num_actions = actions, count
-    return start_state
+    return StartState(values, start, actions, count)
 
 
 def _read_entry(

@@ -1,7 +1,6 @@
 """Refuses states that torchrl's wrappers would drop on their way to an environment."""
 
 import sys
-from dataclasses import dataclass
 
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
@@ -11,7 +10,6 @@ from torch_panda.envs.state import BODY_KEYS, NESTED_STATE, unpack_state
 _RESOLVE_CODE = EnvBase._resolve_set_state.__code__
 
 
-@dataclass(frozen=True)
 class StateSupport:
     """The answer of ``_supports_set_state``. Its truth test is true or raises an error.
 
@@ -24,11 +22,12 @@ class StateSupport:
     state of this reset would not reach the environment. torchrl does not pass the
     arguments of the reset, so `__bool__` reads them from the calling function.
 
-    Attributes:
+    Args:
         observed: Keys of `BODY_KEYS` under which the environment has observations.
     """
 
-    observed: frozenset[str]
+    def __init__(self, observed: frozenset[str]) -> None:
+        self._observed = observed
 
     def __bool__(self) -> bool:
         """Whether torchrl should look for a state in this reset.
@@ -53,7 +52,7 @@ class StateSupport:
             # A SerialEnv passes all entries on, so its environments check them.
             return bool(set_state or arrives)
         keys = set() if entries is None else set(entries.keys())
-        has_state = has_nested or keys & set(BODY_KEYS) - self.observed
+        has_state = has_nested or keys & set(BODY_KEYS) - self._observed
         if not arrives and (set_state or has_state):
             name = type(env).__name__
             raise ValueError(

@@ -1,6 +1,6 @@
 """Pictures of several environments, and blending of layers."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +10,7 @@ from torch import Tensor
 from torch_panda.rendering.camera import Camera
 
 
-@dataclass
-class Frames:
+class Frames(NamedTuple):
     """Pictures of n environments.
 
     Attributes:
