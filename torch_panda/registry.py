@@ -43,10 +43,7 @@ class Registration(NamedTuple):
     terminate_on_success: bool = False
 
     def make_robot(self, options: Options | None = None) -> Robot:
-        """Make the robot of the id.
-
-        Args:
-            options: Arguments that replace those of the id.
+        """Make the robot of the id, with options that replace its arguments.
 
         Raises:
             TypeError: The robot does not have one of these arguments.

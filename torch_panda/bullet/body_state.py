@@ -22,13 +22,7 @@ _DOUBLE = 8  # bytes
 
 
 def _view(address: int | None, first: int, *shape: int) -> Doubles:
-    """A view of doubles in Bullet's memory.
-
-    Args:
-        address: Address of an array of doubles.
-        first: Index of the first double of the view.
-        *shape: Shape of the view, of one or two dimensions.
-    """
+    """A view of an array of doubles in Bullet's memory, from index ``first`` on."""
     assert address is not None  # the status was checked
     count = shape[0] if len(shape) == 1 else shape[0] * shape[1]
     array = (c_double * count).from_address(address + _DOUBLE * first)

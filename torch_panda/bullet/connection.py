@@ -80,11 +80,7 @@ class Connection:
 
 
 def connect() -> Connection:
-    """Create a client without a window (pybullet's ``DIRECT``).
-
-    Raises:
-        BulletError: Bullet could not create the client.
-    """
+    """Create a client without a window (pybullet's ``DIRECT``)."""
     return Connection(capi.connect_direct())
 
 

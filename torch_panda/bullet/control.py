@@ -66,12 +66,7 @@ class MotorControl:
         return 7 if self.ik_orientation is None else 3
 
     def check(self, setpoint: Doubles, num_envs: int, num_joints: int) -> None:
-        """Make sure that setpoints and robots fit this control.
-
-        Args:
-            setpoint: Setpoints of all robots.
-            num_envs: Number of robots.
-            num_joints: Number of movable joints of a robot.
+        """Make sure that this control fits the setpoints and joints of the robots.
 
         Raises:
             ValueError: The number of forces or the shape of the setpoints is wrong, or

@@ -93,20 +93,10 @@ class NativeLoop:
         setpoint: Doubles,
         envs: Sequence[int] | None = None,
     ) -> list[int]:
-        """Set the motors, advance time and read the state.
+        """Set the motors, advance time and read the state; see `VectorSimulation.step`.
 
-        Ctrl-C raises when the step is done.
-
-        Args:
-            control: Control of the robots.
-            setpoint: Setpoints (num_envs, setpoint_dim), float64 and contiguous.
-            envs: Indices of the clients to step, without duplicates; None means all.
-
-        Returns:
-            Indices of the clients whose state is not finite.
-
-        Raises:
-            WorkerError: Bullet failed in at least one client. All others took the step.
+        Ctrl-C raises when the step is done. ``setpoint`` must be contiguous float64,
+        and ``envs`` must have no duplicates.
         """
         self._start()
         if control is not self._motor_control:
@@ -125,11 +115,7 @@ class NativeLoop:
         return [e for e in chosen if failures[e].expected == native.DIVERGED]
 
     def reset(self, envs: Sequence[int]) -> None:
-        """Move bodies to the start of an episode; see `VectorSimulation.reset`.
-
-        Raises:
-            WorkerError: Bullet failed in at least one client. All others were reset.
-        """
+        """Move bodies to the start of an episode; see `VectorSimulation.reset`."""
         self._start()
         queue = (c_int * len(envs))(*envs)
         if self._library.reset(self._loop, queue, len(queue)):

@@ -84,9 +84,6 @@ class WorkerPool:
 
     A thread that finishes an index takes the next one, so that a slow client does not
     delay the others.
-
-    Args:
-        num_threads: Number of threads.
     """
 
     def __init__(self, num_threads: int) -> None:

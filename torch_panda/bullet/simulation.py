@@ -241,11 +241,7 @@ class VectorSimulation:
             client.close()
 
     def _build_same_scene(self, client: PhysicsClient) -> BroadPhase:
-        """Build the scene in a further client.
-
-        Raises:
-            BulletError: The scene differs from that of the first client.
-        """
+        """Build the scene in a further client, and refuse another scene."""
         scene = _build_scene(self._scene_builder, client)
         first, other = (self.scene, *self._blueprint), (scene, *client.blueprint)
         for expected, actual in zip(first, other, strict=False):

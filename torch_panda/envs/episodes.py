@@ -340,11 +340,7 @@ class Episodes:
         return observed
 
     def _begin_step(self, action: Tensor | None, step_mask: Tensor | None) -> Tensor:
-        """Check and clip an action, and count a step.
-
-        Returns:
-            The action, (n, action_dim) float32, in a new tensor.
-        """
+        """Check an action and count a step; return the clipped action, a new tensor."""
         step_count = self._starts.step_count
         # For float32 actions on the CPU, C code is faster than torch. It returns 0 if a
         # number is not finite. Then `check_action` raises the error.

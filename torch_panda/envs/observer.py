@@ -23,17 +23,6 @@ _NUM_CHECKED = 20
 class EpisodeObserver:
     """Observes n environments of one robot and one task.
 
-    Args:
-        robot: The robot.
-        task: The task.
-        simulation: The environments.
-        renderer: Draws the pictures of camera sensors.
-        sensors: The sensors.
-        randomizer: Draws the physics, whose parameters may be observed.
-        goal_indices: Entries of the observation that are the achieved goal, or None.
-        max_episode_steps: Number of steps after which an episode is ``truncated``.
-        terminate_on_success: Whether success ends an episode.
-
     Raises:
         ValueError: A function of the robot or the task returns a wrong shape or dtype,
             or two sensors observe the same entry.
@@ -137,11 +126,7 @@ class EpisodeObserver:
         return observed
 
     def _observe_goals(self, goal: Tensor) -> Observed:
-        """Compute observation and goals with torch.
-
-        Args:
-            goal: Desired goals, (n, goal_dim).
-        """
+        """Compute observation and goals with torch, for goals (n, goal_dim)."""
         task, simulation = self._task, self._simulation
         observation = torch.cat(
             (self._robot.observation(simulation), task.observation(simulation)), dim=1
@@ -287,10 +272,6 @@ class EpisodeObserver:
 
 class ExtraObserver:
     """Observes the entries of `Task.extra_observation`.
-
-    Args:
-        task: The task.
-        simulation: The environments.
 
     Raises:
         ValueError: An entry does not have n rows.

@@ -186,13 +186,6 @@ class DomainRandomizer:
     The drawn factors, and the seed for the hook, are part of the state of an
     environment. A reset to a state therefore restores the physics too.
 
-    Args:
-        randomization: Ranges of the factors; None draws no factors.
-        robot: The robot.
-        task: The task.
-        simulation: The environments.
-        physics: The integration parameters of the clients.
-
     Attributes:
         state: Entries of the state that determine the physics of the present episodes,
             (n, ...) by key.
@@ -278,11 +271,7 @@ class DomainRandomizer:
         return {PHYSICS_PARAMETERS: self.state[PHYSICS_PARAMETERS].float()}
 
     def check_state(self, values: dict[str, Tensor], envs: Sequence[int]) -> None:
-        """Check the physics of a state to start from.
-
-        Args:
-            values: Entries of the state, (len(envs), ...) by key.
-            envs: The environments of the rows.
+        """Check the physics of a state to start from, (len(envs), ...) by key.
 
         Raises:
             ValueError: A factor is negative, or the factor of a mass is 0: Bullet

@@ -12,12 +12,9 @@ from torch_panda.checks import check_seed
 class EpisodeSeeds:
     """Random generators by (seed, environment, episode number).
 
-    Args:
-        num_envs: Number of environments.
-        seed: Seed of all environments. None draws one from the operating system.
-
     Attributes:
-        seed: The last seed of all environments, or None.
+        seed: The last seed of all environments. None means one that was drawn from the
+            operating system.
     """
 
     def __init__(self, num_envs: int, seed: int | None) -> None:

@@ -16,12 +16,6 @@ class Specs:
         episodes: The environments.
         device: Device of the tensors.
         observe_state: Whether the observed entries include ``observation``.
-
-    Attributes:
-        observation: Spec of the observed entries.
-        action: Spec of the action.
-        reward: Spec of the reward.
-        done: Spec of ``done``, ``terminated`` and ``truncated``.
     """
 
     def __init__(
@@ -55,16 +49,13 @@ class Specs:
             device=device,
         )
 
-    def _numbers(self, size: int) -> Unbounded:
-        shape = torch.Size((*self._batch, size))
-        return Unbounded(shape, device=self._device, dtype=torch.float32)
+    def _numbers(self, size: int) -> TensorSpec:
+        return self._entry(Entry((size,), torch.float32))
 
-    def _flag(self) -> Binary:
-        shape = torch.Size((*self._batch, 1))
-        return Binary(shape=shape, device=self._device, dtype=torch.bool)
+    def _flag(self) -> TensorSpec:
+        return self._entry(Entry((1,), torch.bool))
 
     def _entry(self, entry: Entry) -> TensorSpec:
-        """Spec of an entry of a sensor or of `Task.extra_observation`."""
         shape, dtype = torch.Size((*self._batch, *entry.shape)), entry.dtype
         if dtype == torch.bool:
             return Binary(shape=shape, device=self._device, dtype=dtype)

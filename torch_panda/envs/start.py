@@ -22,12 +22,8 @@ from torch_panda.tasks import Task
 class EpisodeStarts:
     """Draws the starts of n environments' episodes and resets the simulation to them.
 
-    Args:
-        robot: The robot, which starts in its neutral pose.
-        task: The task, which draws the goal, the objects and their joints.
-        simulation: The environments.
-        randomizer: Draws the physics.
-        seeds: Seeds of the episodes.
+    The robot starts in its neutral pose. The task draws the goal, the objects and their
+    joints, and the randomizer draws the physics.
 
     Attributes:
         goal: Desired goals of the present episodes, (n, goal_dim) float64.
@@ -108,14 +104,7 @@ class EpisodeStarts:
             self._randomizer.draw(env, self._seeds.physics_seed(env))
 
     def marker_pose(self, goal: Tensor, envs: list[int]) -> Tensor:
-        """Poses of the markers that show goals.
-
-        Args:
-            goal: Goals of these environments, (len(envs), goal_dim).
-            envs: The environments of the rows.
-
-        Returns:
-            (len(envs), n_markers, 7).
+        """Poses (len(envs), n_markers, 7) of the markers for goals of environments.
 
         Raises:
             ValueError: `Task.marker_pose` returns a quaternion that is not a unit
@@ -147,21 +136,14 @@ class EpisodeStarts:
         )
 
     def _error_name(self, name: str) -> str:
-        """Name of the task's function that draws an entry, for errors.
-
-        It is ``sample_start`` if the task overrides this, and ``name`` otherwise.
-        """
+        """``sample_start`` if the task overrides it, otherwise ``name``; for errors."""
         if type(self._task).sample_start is not Task.sample_start:
             return "sample_start"
         return name
 
 
 def _fill(row: Doubles, values: object, name: str) -> None:
-    """Check the numbers that the task drew and write them into a state tensor's row.
-
-    Raises:
-        ValueError: The numbers have a wrong shape or are not finite.
-    """
+    """Check the numbers that the task drew and write them into a state tensor's row."""
     drawn = np.asarray(values, dtype=np.float64)
     if drawn.shape != row.shape or not np.isfinite(drawn).all():
         raise ValueError(

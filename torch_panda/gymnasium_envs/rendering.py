@@ -40,9 +40,7 @@ def take_camera(
     Args:
         camera: The camera that these arguments change; None means a `Camera` with
             panda-gym's defaults.
-        arguments: Keyword arguments, among them ``render_width``, ``render_height``,
-            ``render_target_position``, ``render_distance``, ``render_yaw``,
-            ``render_pitch`` or ``render_roll``.
+        arguments: Keyword arguments of a Gymnasium environment.
 
     Returns:
         The changed camera, or ``camera`` itself if there are no such arguments; and the

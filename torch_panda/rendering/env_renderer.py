@@ -16,14 +16,8 @@ class EnvRenderer:
     """Draws one environment at a time, in a copy of the scene with visual shapes.
 
     The physics clients therefore need no visual shapes, and one renderer serves many
-    environments.
-
-    Args:
-        simulation: The simulation whose scene and state are drawn.
-        renderer: Renderer of the solid bodies, "tiny" or "egl". Markers are always
-            drawn by "tiny".
-        mesh_cell: Edge length of the cubes in which the vertices of a mesh are merged
-            [m]; see `VisualClient`.
+    environments. The renderer "tiny" always draws the markers. For ``renderer`` and
+    ``mesh_cell``, see `VisualClient`.
     """
 
     def __init__(
@@ -60,16 +54,10 @@ class EnvRenderer:
             self._markers.close()
 
     def draw(self, env: int, camera: Camera, frames: Frames, row: int) -> None:
-        """Draw an environment in its current state.
+        """Draw an environment in its current state into a row of ``frames``.
 
         Depth and segmentation contain the robot and the solid bodies only. Markers
         appear only in the pixels, because they show the goal and are not real bodies.
-
-        Args:
-            env: Index of the environment.
-            camera: The camera.
-            frames: The pictures to write into, in the size of the camera.
-            row: Row of ``frames`` that receives the picture.
         """
         scene, state = self._simulation.scene, self._simulation.state
         hand = [*state.ee_position[env].tolist(), *state.ee_orientation[env].tolist()]

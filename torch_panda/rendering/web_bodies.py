@@ -108,14 +108,8 @@ class WebBodies:
         """Add a node for each link of a body, as a child of its parent link's node.
 
         The browser then computes the poses of the links from those of the joints.
-
-        Args:
-            root: Name of the body's node.
-            file: Path of the URDF.
-            movable: Names of the movable joints.
-
-        Returns:
-            The movable joints, by name.
+        ``root`` is the name of the body's node. The result holds the movable joints, by
+        name.
         """
         source = decimated_urdf(file, MESH_CELL)
         tree = ElementTree.parse(source)

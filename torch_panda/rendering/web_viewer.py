@@ -58,11 +58,7 @@ class WebViewer:
             ``achieved_goal`` and ``desired_goal`` (num_envs, goal_dim).
         max_episode_steps: Maximum of the slider.
         title: Title of the page.
-        camera: Camera with which the view starts.
-        host: Address at which the server listens.
-        port: First port to try; the viewer takes the next free one.
-        allowed_hosts: Names of this machine under which browsers may open the page,
-            beside ``host`` and the loopback names.
+        camera, host, port, allowed_hosts: See `RobotTaskEnv.open_viewer`.
     """
 
     def __init__(
@@ -75,7 +71,7 @@ class WebViewer:
         camera: Camera,
         host: str,
         port: int,
-        allowed_hosts: Sequence[str] = (),
+        allowed_hosts: Sequence[str],
     ) -> None:
         self._simulation, self._observe, self._title = simulation, observe, title
         self._episodes: list[list[Frame]] = [[] for _ in range(simulation.num_envs)]

@@ -50,9 +50,6 @@ class Window:
     def show(self, env: int = 0) -> None:
         """Show an environment in its current state.
 
-        Args:
-            env: Index of the environment.
-
         Raises:
             BulletError: the window is closed.
         """

@@ -16,10 +16,7 @@ from torch_panda.robots import Robot
 class Entry(NamedTuple):
     """An observed entry of one environment.
 
-    Attributes:
-        shape: Its shape.
-        dtype: Its dtype.
-        high: Its largest value, if its smallest is 0; None means no bounds.
+    If its smallest value is 0, ``high`` is its largest value. None means no bounds.
     """
 
     shape: tuple[int, ...]
@@ -64,25 +61,13 @@ class Sensor(Configured, ABC):
         """
 
     def build(self, client: PhysicsClient, body: int, robot: Robot) -> None:
-        """Prepare one client for the sensor.
-
-        Args:
-            client: The client, in which the robot was built.
-            body: Body id of the robot.
-            robot: The robot.
-        """
+        """Prepare one client, in which the robot was built, for the sensor."""
 
     @abstractmethod
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Read the sensor in all environments of a simulation.
-
-        Args:
-            simulation: The environments.
-            renderer: Draws pictures of them.
-            robot: The robot.
-        """
+        """Read the sensor in all environments of a simulation."""
 
 
 # Keys of an environment's outputs, and keys that torchrl uses.

@@ -40,7 +40,7 @@ class CameraSensor(Sensor):
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Take pictures of all environments; see `Sensor.attach`."""
+        """Take pictures of all environments."""
         return _CameraReading(self, simulation.num_envs, renderer)
 
 
@@ -71,15 +71,11 @@ class _CameraReading:
         self.entries = {prefix + image: entry for image, entry in images.items()}
 
     def after_reset(self, envs: Sequence[int]) -> None:
-        """Draw these environments."""
         self._renderer.draw(envs, self._camera, self._frames, envs)
 
-    def after_step(self, envs: Sequence[int]) -> None:
-        """Draw these environments."""
-        self._renderer.draw(envs, self._camera, self._frames, envs)
+    after_step = after_reset
 
     def observe(self) -> dict[str, Tensor]:
-        """The latest pictures of all environments, (n, ...) by key, in new tensors."""
         return {
             key: getattr(self._frames, image).clone()
             for key, image in self._image_of_key.items()

@@ -52,7 +52,7 @@ class ForceSensor(Sensor):
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Read the sensor in all environments; see `Sensor.attach`."""
+        """Read the sensor in all environments."""
         return _ForceReading(self, simulation, robot)
 
 
@@ -146,15 +146,12 @@ class _ForceReading:
         self._values = torch.zeros(simulation.num_envs, *shape, device="cpu").float()
 
     def after_reset(self, envs: Sequence[int]) -> None:
-        """Set the values of these environments to zero."""
         self._values[envs] = 0.0
 
     def after_step(self, envs: Sequence[int]) -> None:
-        """Read the sensor in these environments."""
         self._simulation.run(self._read, envs)
 
     def observe(self) -> dict[str, Tensor]:
-        """The latest values of all environments, (n, ...) float32, in a new tensor."""
         return {self._sensor.name: self._values.clone()}
 
     def _read(self, env: int) -> None:

@@ -22,7 +22,7 @@ class JointState(Sensor):
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Read the joints of all environments; see `Sensor.attach`."""
+        """Read the joints of all environments."""
         return _JointReading(simulation)
 
 
@@ -37,11 +37,9 @@ class _JointReading:
     def after_reset(self, envs: Sequence[int]) -> None:
         """Do nothing: the simulation has read the joints."""
 
-    def after_step(self, envs: Sequence[int]) -> None:
-        """Do nothing: the simulation has read the joints."""
+    after_step = after_reset
 
     def observe(self) -> dict[str, Tensor]:
-        """Positions and velocities, (n, n_joints) float32 each, in new tensors."""
         return {
             "joint_position": self._simulation.joint_position.float(),
             "joint_velocity": self._simulation.joint_velocity.float(),

@@ -36,12 +36,12 @@ def sensors_of(robot: Robot) -> tuple[str, ...]:
 
 def read_keywords(
     *,
-    from_pixels: bool = False,
-    depth: bool = False,
-    segmentation: bool = False,
-    camera: Camera | None = None,
-    render_size: int | tuple[int, int] | None = None,
-    sensors: Sequence[Sensor | str] = (),
+    from_pixels: bool,
+    depth: bool,
+    segmentation: bool,
+    camera: Camera | None,
+    render_size: int | tuple[int, int] | None,
+    sensors: Sequence[Sensor | str],
 ) -> Sequence[Sensor | str]:
     """Turn keywords of `torch_panda.make` into sensors.
 
