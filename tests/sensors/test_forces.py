@@ -114,6 +114,7 @@ def test_specs(num_envs):
         "PandaStack-v1", num_envs=num_envs, seed=0, sensors=SENSORS
     ) as env:
         check_env_specs(env)
+        torch.manual_seed(0)
         td = env.rollout(3)["next"]
         assert td["wrist_force_torque"].shape == (*batch, 3, 6)
         assert td["finger_contact"].shape == (*batch, 3, 2, 3)

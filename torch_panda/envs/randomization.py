@@ -271,7 +271,7 @@ class DomainRandomizer:
         return {PHYSICS_PARAMETERS: self.state[PHYSICS_PARAMETERS].float()}
 
     def check_state(self, values: dict[str, Tensor], envs: Sequence[int]) -> None:
-        """Check the physics of a state to start from, (len(envs), ...) by key.
+        """Check the physics in a state to start from, with entries (len(envs), ...).
 
         Raises:
             ValueError: A factor is negative, or the factor of a mass is 0: Bullet

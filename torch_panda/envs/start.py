@@ -104,7 +104,7 @@ class EpisodeStarts:
             self._randomizer.draw(env, self._seeds.physics_seed(env))
 
     def marker_pose(self, goal: Tensor, envs: list[int]) -> Tensor:
-        """Poses (len(envs), n_markers, 7) of the markers for goals of environments.
+        """Poses of the markers for some environments, (len(envs), n_markers, 7).
 
         Raises:
             ValueError: `Task.marker_pose` returns a quaternion that is not a unit

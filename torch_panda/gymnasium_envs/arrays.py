@@ -93,7 +93,7 @@ class GoalFunctions:
         desired_goal: ArrayLike,
         info: Any = None,  # noqa: ANN401 (unused, as in Gymnasium-Robotics)
     ) -> NDArray[np.float32]:
-        """Reward (...) float32 of goals (..., goal_dim). ``info`` is ignored.
+        """Rewards, (...) float32, for goals (..., goal_dim). ``info`` is ignored.
 
         Raises:
             ValueError: A last dimension is not ``goal_dim``.

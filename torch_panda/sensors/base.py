@@ -16,7 +16,8 @@ from torch_panda.robots import Robot
 class Entry(NamedTuple):
     """An observed entry of one environment.
 
-    If its smallest value is 0, ``high`` is its largest value. None means no bounds.
+    ``high`` is the largest value of an entry whose smallest value is 0; None means that
+    the entry has no bounds.
     """
 
     shape: tuple[int, ...]
