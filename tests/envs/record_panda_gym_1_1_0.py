@@ -59,9 +59,8 @@ def choose_action(task, observation, item, rng):
     ee, width = observation[:3], observation[6]
     offset = observation[7 + 12 * item :][:3] - ee
     near = np.abs(offset).max() < 0.015
-    if (
-        near and width < 0.045
-    ):  # the object is grasped: carry it around and sometimes let go
+    if near and width < 0.045:
+        # The object is grasped: carry it around and sometimes let go.
         grip = 1.0 if rng.random() < 0.05 else -1.0
         return np.append(noise[:3] * 0.5 + (0.0, 0.0, 0.5), grip)
     over = np.linalg.norm(offset[:2]) > 0.012

@@ -81,9 +81,8 @@ def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
             if step == diverges:
                 assert ours["done"][1] and not ours["success"][1]
                 ours = env.reset(ours.set("_reset", only_1)).exclude("_reset")
-                for _ in range(
-                    2
-                ):  # the first of these episodes began after the divergence
+                # The first of these episodes began after the divergence.
+                for _ in range(2):
                     theirs = other.reset(theirs.set("_reset", only_1))
                 theirs = theirs.exclude("_reset")
 

@@ -135,10 +135,9 @@ def test_as_many_threads_as_environments_give_the_same_numbers(loop):
     assert (rollout(1) == rollout(16)).all()
 
 
+# Fewer substeps than in a piece, and a number that is not a multiple of a piece.
 @needs_native
-@pytest.mark.parametrize(
-    "n_substeps", [1, 7]
-)  # fewer substeps than in a piece; a number that is not a multiple of a piece
+@pytest.mark.parametrize("n_substeps", [1, 7])
 def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
     def rollout(num_threads):
         physics = PhysicsParams(n_substeps=n_substeps)

@@ -159,7 +159,7 @@ class PhysicsClient:
         """Load a URDF and return its body id.
 
         Args:
-            path: Path of a file, or of a file that pybullet ships.
+            path: Path of the file, or its path among the files that pybullet ships.
             position: Position of the base, world frame [m].
             orientation: Orientation of the base, quaternion xyzw.
             fixed_base: Whether the base cannot move.

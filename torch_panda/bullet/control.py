@@ -34,7 +34,7 @@ class MotorControl:
     Attributes:
         forces: Maximum force of every joint's motor [N m] or [N]. The torques of
             ``arm_mode="torque"`` are not limited.
-        ik_link: Link that inverse kinematics bring to the target; None means that
+        ik_link: Link that the inverse kinematics bring to its target; None means that
             setpoints contain the arm's joints. It needs ``arm_mode`` "position" and
             ``num_arm_joints``.
         ik_orientation: Orientation that this link keeps, quaternion xyzw in the world
