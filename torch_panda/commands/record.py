@@ -63,7 +63,8 @@ class Args:
     task_options: dict[str, Finite] = field(default_factory=dict)
     """arguments of the task to change, such as `clearance 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
-    """a file with a nested dict of tensors (transitions, ...), or a data set"""
+    """"tensors" writes one file with a nested dict of tensors; "minari" and "lerobot"
+    write a data set in the format of that library"""
     out: Path | None = None
     """file to write; for minari the id of the data set, for lerobot its folder; None
     measures the expert's success only"""
@@ -137,8 +138,9 @@ def check(args: Args) -> None:
         )
     if args.task_options and args.format != "tensors":
         raise ValueError(
-            f"task_options do not work with the format {args.format}, whose data "
-            "sets are recreated from an id; use the format tensors"
+            f"task_options do not work with the format {args.format}: its data sets "
+            "store the id of the environment, but not the task_options; use the "
+            "format tensors"
         )
 
 

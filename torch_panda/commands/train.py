@@ -59,8 +59,8 @@ class Mode:
 def parse(arguments: Sequence[str] | None = None) -> Args | OfflineArgs:
     """Read the command line.
 
-    The algorithm, or preset and task, determine the other options and their defaults,
-    so they are read first.
+    With ``--offline``, the algorithm determines the other options and their defaults.
+    Otherwise preset and task determine the defaults. So these options are read first.
 
     Raises:
         ValueError: A module of ``--import`` does not exist, or ``--offline`` and the

@@ -61,7 +61,8 @@ def serve(
         policies: One policy per episode.
         host: Network address that serves the page.
         port: Port of the page. If it is taken, the next free port is used.
-        allowed_hosts: Host names in the page's URL that are accepted.
+        allowed_hosts: Further names of this machine under which browsers may open the
+            page.
     """
     with env.open_viewer(
         CAMERA, host=host, port=port, allowed_hosts=allowed_hosts
@@ -117,7 +118,8 @@ class Args:
     port: Port = 8080
     """with --web, port of the page; if it is taken, the next free port"""
     allowed_hosts: tuple[str, ...] = ()
-    """with --web, host names in the page's URL that are accepted"""
+    """with --web, further names of this machine under which browsers may open the page;
+    needed with --host 0.0.0.0, if other machines open the page by its name"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 

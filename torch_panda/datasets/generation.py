@@ -50,7 +50,8 @@ def generate(
             noise whose standard deviation is drawn per episode from 0 to `MAX_NOISE`.
             "play": by the expert, which pursues one goal after another without reset,
             for `PLAY_STEPS` steps. It gets the next goal when it has stayed at a goal
-            for `HOLD_STEPS` steps, or after the number of steps of the task's episodes.
+            for `HOLD_STEPS` steps, or when it has pursued the goal for as many steps as
+            an episode of the task has.
             "random": uniformly.
         transitions: Number of transitions, rounded up to whole episodes.
         seed: Seed of the data set.

@@ -31,11 +31,12 @@ class Progress:
     """Progress of a run.
 
     Attributes:
-        steps: Environment steps so far.
+        steps: Environment steps so far, or gradient steps of an offline run.
         pretrained: Gradient steps of imitation so far.
         seconds: Time spent on stepping and learning, without evaluations.
         curve: One row for each evaluation.
-        loss_sums: Sums of the losses since the last evaluation, of offline learning.
+        loss_sums: In offline learning, the sum of each loss since the last evaluation.
+            Empty in other runs.
     """
 
     steps: int = 0

@@ -183,7 +183,8 @@ def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
     cls: type[AnyHyperparameters] = Hyperparameters
     if isinstance(agent, OfflineAgent):
         cls = agent.Hyperparameters
-    # The hyperparameters may be the options of a run, which has more of them.
+    # `agent.hp` may be the options of a run, which have further fields. The file does
+    # not need those.
     hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}
     content = {
         "env_id": env_id,

@@ -1,9 +1,9 @@
 """Base class of the agents that learn offline, and the losses that several share.
 
-The protocol of an agent: `fit` takes the statistics of the data, `update` takes one
-gradient step on a batch of `OfflineData`, and `policy` acts. Agents differ in their
-``goals``, which are strategies of `torch_panda.transforms.GoalSampler`, and in their
-`losses`, which name the equations of their paper.
+The protocol of an agent: `fit` computes the mean and deviation of the data, `update`
+takes one gradient step on a batch of `OfflineData`, and `policy` acts. Agents differ in
+their ``goals``, which are strategies of `torch_panda.transforms.GoalSampler`, and in
+their `losses`, which name the equations of their paper.
 
 In the papers a goal is a state g. Here a goal is the part of a state that the task
 cares about, such as the position of a cube, because the policy gets ``desired_goal``.
@@ -155,7 +155,12 @@ class OfflineAgent(nn.Module, ABC):
         self.optimizer = torch.optim.Adam(trained, lr=self.hp.learning_rate, fused=True)
 
     def fit(self, observation: Tensor, goal: Tensor) -> None:
-        """Take the statistics of observations and goals of the data, (n, size) each."""
+        """Compute the mean and deviation that standardise the networks' inputs.
+
+        Args:
+            observation: Observations of the data, (n, observation size).
+            goal: Goals of the data, (n, goal size).
+        """
         self.normalizer.update(observation, goal)
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
@@ -163,7 +168,7 @@ class OfflineAgent(nn.Module, ABC):
         return batch
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take one gradient step on a batch with the goals of ``goals``.
+        """Take one gradient step on a batch that has a goal for each key of ``goals``.
 
         Returns:
             The losses, scalars without gradients.
@@ -230,7 +235,7 @@ class Ensemble(nn.ModuleList):
     """Two value functions V(x) or Q(x) of the same inputs.
 
     Args:
-        inputs: Size of an input.
+        inputs: Total size of the inputs, which are concatenated.
         hidden_size: Units of each hidden layer.
     """
 

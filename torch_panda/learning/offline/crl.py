@@ -3,9 +3,10 @@
 The critic f(s, a, g) = phi(s, a)^T psi(g) is a classifier. Its positive goals are
 achieved k steps after (s, a), with probability proportional to discount**k. Its
 negative goals are those of other rows. As in OGBench, there are two critics, and f is
-divided by the square root of the size of phi. The optimum of f is the log ratio of the
-discounted probability of reaching g to the marginal one, which ranks actions like Q
-does. The policy ascends f and imitates the data.
+divided by the square root of the size of phi. At its optimum, f is
+log(p(g | s, a) / p(g)) plus a constant. Here p(g | s, a) is the discounted probability
+of reaching g after (s, a), and p(g) is the frequency of g among all rows. So f ranks
+actions as Q does. The policy ascends f and imitates the data.
 """
 
 from dataclasses import dataclass
@@ -40,8 +41,9 @@ class CRLHyperparameters(OfflineHyperparameters):
     algo: Literal["crl"] = "crl"
     """algorithm"""
     contrastive_loss: ContrastiveLoss = "binary"
-    """classify each pair of (s, a) and goal ("binary", the paper's), or classify which
-    of the batch's goals belongs to (s, a) and which (s, a) to the goal ("infonce")"""
+    """the paper's "binary" decides for each pair of (s, a) and goal whether they belong
+    together; "infonce" chooses the goal of each (s, a) among the goals of the batch,
+    and the (s, a) of each goal"""
     alpha: Weight = 0.1
     """weight of the imitation in the policy's loss"""
     latent_size: Positive = 128

@@ -17,13 +17,14 @@ class OfflineData:
 
     Rewards do not depend on those of the data: a transition has the reward 0 if it
     reaches its value goal and -1 if not, and reaching the goal ends the return.
-    All draws come from torch's global random generator. A run saves its state.
+    All draws come from torch's global random generator, whose state a run saves.
 
     Args:
         data: Transitions (n,) in the order of time, with ``observation``, ``action``,
             ``desired_goal``, ``("collector", "traj_ids")``, and under ``next``
             ``observation``, ``achieved_goal``, ``desired_goal``, ``reward``,
-            ``terminated`` and ``done``. An episode may not be split.
+            ``terminated`` and ``done``. All rows of an episode are
+            consecutive.
         env: Environment of the task.
         goals: Strategies of the goals; the first one is that of the values.
         discount: Discount of the strategy "geometric".
@@ -47,9 +48,9 @@ class OfflineData:
         def reward(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
             return env.is_success(achieved_goal, desired_goal).float() - 1.0
 
-        # Number the episodes 0, 1, ... in the order of the rows, so that the numbers
-        # index the rows where episodes end. `exclude` copies, so the caller's data stay
-        # as they are.
+        # Number the episodes 0, 1, ... in the order of the rows, so that entry i of the
+        # rows where episodes end belongs to episode i. `exclude` copies,
+        # so the caller's data stay as they are.
         ids = data["collector", "traj_ids"]
         ends = torch.ones_like(ids, dtype=torch.bool)
         ends[:-1] = ids[1:] != ids[:-1]

@@ -32,9 +32,9 @@ from torch_panda.learning.spaces import Spaces
 
 @dataclass
 class GCIQLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of GCIQL, by default OGBench's.
+    """Hyperparameters of GCIQL, by default those of OGBench's code.
 
-    For its cube tasks, OGBench takes an alpha of 0.03 (noisy) or 1 (play).
+    In its commands for cube tasks, OGBench sets alpha to 0.03 (noisy) or 1 (play).
     """
 
     algo: Literal["gciql"] = "gciql"

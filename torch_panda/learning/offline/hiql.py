@@ -1,13 +1,15 @@
 """Hierarchical implicit Q-learning, HIQL (arXiv 2307.11949).
 
-The high-level policy names a waypoint w, to be reached k steps later, by its
-representation z = phi(s, w). The low-level policy acts towards it. Both imitate the
-data in proportion to exp(alpha * advantage), with the action-free values of GCIVL.
+The high-level policy outputs z = phi(s, w), the representation of a waypoint w that is
+to be reached k steps later. The low-level policy acts towards the waypoint. Both
+imitate the data in proportion to exp(alpha * advantage), with the action-free values of
+GCIVL.
 
 The paper's goals are states, so one value function judges waypoints and goals. Here a
-goal is a part of a state, and a waypoint w is a whole observation, because the goals
-achieved while the hand approaches an object are all the same. So there are two value
-functions: V(s, phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
+goal is a part of a state, such as the position of a cube. It does not change while the
+hand approaches the cube, so it cannot tell the waypoints of the approach apart.
+Therefore a waypoint w is a whole observation, and there are two value functions:
+V(s, phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
 """
 
 import copy
@@ -92,7 +94,9 @@ class HIQL(OfflineAgent):
         """Draw the high level's goal, and waypoints of both policies and the values.
 
         Row t of the data leads to the state s_t+1, so the state k steps after s_t is
-        s' of row t + k - 1. No waypoint lies beyond its goal or the end of its episode.
+        s' of row t + k - 1. The high
+        level's waypoint does not lie beyond its goal, and the low level's waypoint does
+        not lie beyond the end of the episode.
         """
         t = batch["index"]
         last = data.last[t]
