@@ -92,9 +92,10 @@ class SolverLibrary:
 
     def __init__(self, path: str) -> None:
         functions = ctypes.PyDLL(path)  # the calls are cheap, so keep the GIL
-        version = (
-            functions.solver_version() if hasattr(functions, "solver_version") else 0
-        )
+        try:
+            version = functions.solver_version()
+        except AttributeError:
+            version = 0  # the library is older than the version numbers
         if version != VERSION:
             raise GateError(
                 f"the compiled solver {path} has version {version}, but the sources of "
