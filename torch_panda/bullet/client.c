@@ -44,7 +44,8 @@ static int find_joints(struct batch *batch, int env, double *joints) {
     }
     handle command = bullet->ik_init(batch->clients[env]->handle, batch->scene->robot);
     bullet->ik_set_target(command, control->ik_link, setpoint,
-                          control->turns ? setpoint + 3 : control->orientation);
+                          control->has_orientation ? setpoint + 3
+                                                   : control->orientation);
     bullet->ik_set_iterations(command, control->ik_iterations);
     bullet->ik_set_damping(command, num_joints, control->ik_damping);
     handle status =
@@ -53,7 +54,7 @@ static int find_joints(struct batch *batch, int env, double *joints) {
     if (!status) return 0;
     int body, count;
     bullet->ik_result(status, &body, &count, joints);
-    setpoint += control->turns ? 7 : 3;
+    setpoint += control->has_orientation ? 7 : 3;
     memcpy(joints + arm, setpoint, (num_joints - arm) * sizeof *joints);
     return 1;
 }

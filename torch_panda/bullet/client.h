@@ -1,8 +1,7 @@
 /* Structs and functions that the C files share.
 
    The library does not link to Bullet: the caller passes the addresses of Bullet's
-   functions. native.py declares the same structs in the same order. capi.py has the full
-   names of the functions. */
+   functions, whose full names are in capi.py. native.py declares the same structs. */
 
 #ifndef TORCH_PANDA_CLIENT_H
 #define TORCH_PANDA_CLIENT_H
@@ -10,7 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { LOOP_VERSION = 3 }; /* native.py refuses a library of another version */
+enum { LOOP_VERSION = 4 }; /* native.py refuses a library of another version */
 
 typedef void *handle;          /* of a client, a command or a status */
 typedef const double *doubles; /* input */
@@ -60,10 +59,10 @@ struct link { /* _Link of broad_phase.py */
     int body, link, group, mask, snapshot;
 };
 
-/* BroadPhase of broad_phase.py. `num_detections` is the client's number after its scene
-   was built, and `cycle` the number modulo which it is restored. `away` and `built` are
-   snapshots with the bodies far away and as built. `pair` has the first bodies, whose
-   overlap brings the cursor back to the start. */
+/* BroadPhase of broad_phase.py, which explains the restoring. A restored client has as
+   many collision detections as after its scene was built, `num_detections`, modulo
+   `cycle`. `away` and `built` are snapshots with the bodies far away and as built. `pair`
+   has the first two bodies, whose overlap brings the cursor back to the start. */
 struct broad_phase {
     int64_t num_detections;
     int cycle, away, built, num_links, pair_size, pair[2];
@@ -91,8 +90,8 @@ enum arm_mode { POSITIONS, VELOCITIES, TORQUES };
 struct control { /* MotorControl of control.py */
     int ik_link; /* link whose target setpoints contain; -1 for joints */
     int num_arm_joints, setpoint_size;
-    int turns;    /* whether setpoints contain the orientation of ik_link */
-    int arm_mode; /* enum arm_mode */
+    int has_orientation; /* whether setpoints contain the orientation of ik_link */
+    int arm_mode;        /* enum arm_mode */
     int ik_iterations;
     double orientation[4], position_gain, velocity_gain;
     doubles forces, ik_damping; /* a number per joint */

@@ -1,4 +1,4 @@
-/* Computes setpoints from actions; and observations, goals, success, reward and the
+/* Computes setpoints from actions. Computes observations, goals, success, reward and the
    ends of episodes from states.
 
    Robot.setpoint and EpisodeObserver compute the same numbers with torch. They need
@@ -22,7 +22,7 @@ int environment_begin_step(const float *action, float *clipped, int num_actions,
     return 1;
 }
 
-/* Whether one of some flags is true. */
+/* Whether any flag is true. */
 int environment_any(const uint8_t *flags, size_t count) {
     for (size_t k = 0; k < count; k++)
         if (flags[k]) return 1;

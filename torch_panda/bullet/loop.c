@@ -51,9 +51,9 @@ static void take_part(struct loop *loop) {
         loop->first = (loop->first + 1) % loop->num_envs;
         loop->num_waiting--;
         pthread_mutex_unlock(&loop->mutex);
-        int goes_on = loop->work(loop->batch, env, piece);
+        int has_more = loop->work(loop->batch, env, piece);
         pthread_mutex_lock(&loop->mutex);
-        if (goes_on) {
+        if (has_more) {
             int last = (loop->first + loop->num_waiting++) % loop->num_envs;
             loop->queue[last] = env;
             continue;

@@ -31,7 +31,7 @@ from torch_panda.bullet.library import bind
 
 # Version of the C sources, as ``loop_version`` in client.h: the library must have been
 # compiled from sources of this version.
-VERSION = 3
+VERSION = 4
 
 # "native": threads of C. "ctypes": threads of Python that call Bullet through ctypes.
 LoopName = Literal["native", "ctypes"]
@@ -147,7 +147,7 @@ class Control(Structure):
         ("ik_link", c_int),
         ("num_arm_joints", c_int),
         ("setpoint_size", c_int),
-        ("turns", c_int),
+        ("has_orientation", c_int),
         ("arm_mode", c_int),
         ("ik_iterations", c_int),
         ("orientation", c_double * 4),

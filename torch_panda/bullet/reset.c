@@ -19,7 +19,7 @@ enum {
     DYNAMIC_MASK = -1
 };
 
-static int load(struct batch *batch, int env, int snapshot) {
+static int load_snapshot(struct batch *batch, int env, int snapshot) {
     handle command = batch->bullet->load_init(batch->clients[env]->handle);
     batch->bullet->load_set_snapshot(command, snapshot);
     return client_submit(batch, env, command, RESTORE_STATE_COMPLETED,
@@ -46,27 +46,29 @@ static int detect(struct batch *batch, int env, int count) {
 
 static int restore(struct batch *batch, int env) {
     const struct client *client = batch->clients[env];
-    const struct broad_phase *built = client->broad_phase;
-    if (!load(batch, env, built->away)) return 0;
-    for (int k = 0; k < built->num_links; k++) {
-        const struct link *link = &built->links[k];
+    const struct broad_phase *broad_phase = client->broad_phase;
+    if (!load_snapshot(batch, env, broad_phase->away)) return 0;
+    for (int k = 0; k < broad_phase->num_links; k++) {
+        const struct link *link = &broad_phase->links[k];
         if (!set_filter(batch, env, link->body, link->link, 0, 0)) return 0;
     }
-    for (int k = 0; k < built->pair_size; k++)
-        if (!set_filter(batch, env, built->pair[k], -1, DYNAMIC_GROUP, DYNAMIC_MASK))
+    for (int k = 0; k < broad_phase->pair_size; k++)
+        if (!set_filter(batch, env, broad_phase->pair[k], -1, DYNAMIC_GROUP,
+                        DYNAMIC_MASK))
             return 0;
     if (!detect(batch, env, 1)) return 0;
-    for (int k = 0; k < built->pair_size; k++)
-        if (!set_filter(batch, env, built->pair[k], -1, 0, 0)) return 0;
-    int past = (client->num_detections - built->num_detections) % built->cycle;
-    if (!detect(batch, env, (built->cycle - past) % built->cycle)) return 0;
-    for (int k = 0; k < built->num_links; k++) {
-        const struct link *link = &built->links[k];
-        if (!load(batch, env, link->snapshot)) return 0;
+    for (int k = 0; k < broad_phase->pair_size; k++)
+        if (!set_filter(batch, env, broad_phase->pair[k], -1, 0, 0)) return 0;
+    int cycle = broad_phase->cycle;
+    int past = (client->num_detections - broad_phase->num_detections) % cycle;
+    if (!detect(batch, env, (cycle - past) % cycle)) return 0;
+    for (int k = 0; k < broad_phase->num_links; k++) {
+        const struct link *link = &broad_phase->links[k];
+        if (!load_snapshot(batch, env, link->snapshot)) return 0;
         if (!set_filter(batch, env, link->body, link->link, link->group, link->mask))
             return 0;
     }
-    return load(batch, env, built->built);
+    return load_snapshot(batch, env, broad_phase->built);
 }
 
 static int set_joints(struct batch *batch, int env, int body, int count,
