@@ -184,11 +184,12 @@ class DataCheck:
         """Refuses entries that are affine functions of achieved and desired goal.
 
         The desired goal is constant in each episode. An affine function has 2 *
-        goal_dim + 1 coefficients per column. While no object moves, the
-        achieved goal is also constant within each episode. With at most 2 * goal_dim +
-        1 distinct desired goals, some affine function then fits any column that is
-        constant within each episode, so the check waits for more goals. Then it refuses
-        a column if an affine function fits it, with three exceptions:
+        goal_dim + 1 coefficients per column. If no object has moved
+        yet, the achieved goal is also constant in each episode, so an episode gives
+        only one equation. With at most 2 * goal_dim + 1 distinct desired goals, some
+        affine function fits any column that is constant in each episode, and the fit
+        proves nothing. So the check waits for more goals. From then on, it refuses a
+        column if an affine function fits it, with three exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.
@@ -243,9 +244,9 @@ class DataCheck:
     def _check_rewards(self, rows: TensorDictBase) -> None:
         """Checks that the stored rewards are those of `reward_fn`.
 
-        If they differ, the function looks for a factor and a constant that turn one
-        into the other. If it finds them, the rewards were scaled, which is an error.
-        Otherwise it warns.
+        If they differ, this check looks for a factor and a constant with stored =
+        factor * `reward_fn` + constant. If it finds them, the rewards were scaled,
+        which is an error. Otherwise it warns.
 
         Raises:
             ValueError: the rewards were scaled or shifted.

@@ -86,7 +86,8 @@ class PhysicsClient:
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
-        # Imported here: `import torch_panda` needs no solver.
+        # Imported here, because `import torch_panda` does not need this package. Only
+        # clients do.
         from torch_panda.bullet import solver
 
         solver.activate()
@@ -509,8 +510,9 @@ class PhysicsClient:
     def load(self, snapshot: int) -> None:
         """Restore a snapshot.
 
-        The snapshot must have been taken while there were no contacts. Otherwise Bullet
-        would run a collision detection to restore them.
+        Load only snapshots that were taken without contacts. To restore contacts,
+        Bullet would run a collision detection, which changes its broad phase and is
+        not counted in ``num_detections``.
 
         Unlike `set_base`, this does not update the bodies' AABBs in Bullet's broad
         phase. The next collision detection updates them.
@@ -621,10 +623,11 @@ class PhysicsClient:
         """Contacts of the last time step.
 
         Args:
-            body_a: Return only contacts of this body, as body a of each contact; None
-                returns contacts of all bodies.
-            body_b: Return only contacts with this body; None returns contacts with all
-                bodies.
+            body_a: Return only contacts in which this body takes part. They are
+                reversed where necessary, so that it is body a of each contact. None
+                returns the contacts of all bodies as Bullet stores them.
+            body_b: Of these contacts, return only those whose body b is this body; None
+                returns all.
         """
         # Filter in Python: Bullet's own filter exchanges bodies a and b where needed,
         # but does not reverse the friction forces.

@@ -65,7 +65,7 @@ void environment_setpoints(const struct actuation *actuation, doubles state,
 enum { REACHED, MISSED, UNKNOWN };
 /* Compare the distance of two goals with the threshold. How torch rounds a distance
    depends on the processor. Return UNKNOWN if the distance is so close to the threshold
-   that this rounding could decide. */
+   that this rounding could decide, and if it is huge or NaN. */
 static int compare(const struct observation *observed, const float *achieved_goal,
                    const float *desired_goal) {
     double sum = 0, threshold = observed->distance_threshold;
@@ -99,7 +99,7 @@ int environment_observe(const struct observation *observed, doubles state, int n
         }
         if (is_complete) {
             int answer = compare(observed, achieved_goal, desired_goal);
-            int has_begun = step_count[env] > 0; /* a start does not end an episode */
+            int has_begun = step_count[env] > 0; /* no episode ends before its first step */
             is_complete = answer != UNKNOWN;
             success[env] = answer == REACHED;
             if (reward) reward[env] = answer == REACHED ? -0.0f : -1;

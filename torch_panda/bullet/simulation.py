@@ -32,8 +32,9 @@ class VectorSimulation:
     Raises:
         BulletError: ``build`` built another scene in a later client.
         TypeError: ``build`` did not return a `Scene`.
-        ValueError: the environment variable ``TORCH_PANDA_LOOP`` names a loop that
-            does not exist or that was not compiled.
+        ValueError: the environment variable ``TORCH_PANDA_LOOP`` is neither "native"
+            (threads of C step the clients) nor "ctypes" (Python threads step them),
+            or it is "native" and the C library is missing.
 
     Attributes:
         scene: Body ids of the scene.
@@ -133,7 +134,7 @@ class VectorSimulation:
     ) -> list[int]:
         """Set the motors, advance time and read the state.
 
-        If the native loop is compiled and ``control`` is a `MotorControl`, threads of C
+        If the native loop is in use and ``control`` is a `MotorControl`, threads of C
         do this. Otherwise Python threads do it. They compute the same numbers.
 
         Args:
@@ -145,8 +146,8 @@ class VectorSimulation:
             Indices of the clients whose state is not finite.
 
         Raises:
-            WorkerError: Bullet failed in at least one client, which the error names.
-                All other clients took the step.
+            WorkerError: Bullet failed in one or more clients. The error names the first
+                of them. Every client that did not fail took the step.
             ValueError: ``control`` does not fit the setpoints or the robot.
         """
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
@@ -154,7 +155,8 @@ class VectorSimulation:
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
                 # An earlier step, with another kind of control, may have run in Python
-                # threads. If a second Ctrl-C interrupted that step, they may still run.
+                # threads. After a first Ctrl-C, the pool still waits for its threads.
+                # A second Ctrl-C ends this waiting, so they may still be running.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -195,12 +197,13 @@ class VectorSimulation:
 
         Args:
             envs: Indices of the clients to reset.
-            vary: Function of the index of an environment that changes the physics of
-                its client. It is called before the reset, in the same thread.
+            vary: Function that gets the index of an environment, and changes the
+                physics of its client. It is called before the reset, in the same
+                thread.
 
         Raises:
-            WorkerError: Bullet or ``vary`` failed in at least one client, which the
-                error names. All other clients were reset.
+            WorkerError: Bullet or ``vary`` failed in one or more clients. The error
+                names the first of them. Every client that did not fail was reset.
         """
         if self._native is not None and vary is None:
             self._pool.wait()

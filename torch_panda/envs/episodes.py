@@ -125,8 +125,8 @@ class Episodes:
         # Environments that need a reset: new ones, and those whose last reset failed.
         self._needs_reset = set(range(n))
         sensors = read_sensors(sensors, robot)
-        # A method of this object would close a cycle of references, which keeps a
-        # forgotten environment alive.
+        # Not a bound method: the simulation would then refer back to this object, and
+        # the cycle of references would keep a forgotten environment alive.
         build = partial(build_scene, robot, task, sensors)
         self.simulation = VectorSimulation(
             build, n, num_threads=num_threads, physics=self.physics
@@ -367,7 +367,6 @@ class Episodes:
                 return clipped
         action = check_action(action, tuple(self._action_shape))
         step_count += 1 if step_mask is None else step_mask
-        # Clip before the conversion: a large float64 is infinite in float32.
         return action.clamp(-1.0, 1.0).float()
 
     def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
@@ -401,7 +400,7 @@ class Episodes:
             step_mask[acting] = True
             self._history.record(action, step_mask)
             self._advance(action, acting)
-            # Each sensor needs only the step that ended at the state.
+            # Sensors need only the last action of each environment.
             self._observer.after_step(last)
         self._starts.step_count[envs] = start_state.values["step_count"]
         start_state.check_arrival(envs, self._starts.state())

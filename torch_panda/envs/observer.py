@@ -142,7 +142,7 @@ class EpisodeObserver:
     def _add_outcome(
         self, observed: Observed, step_count: Tensor, action: Tensor | None
     ) -> None:
-        """Compute success and ends with torch, after a step also the reward."""
+        """Compute success and the end flags with torch, and after a step the reward."""
         goals = observed["achieved_goal"], observed["desired_goal"]
         observed["success"] = self._task.is_success(*goals)
         observed |= self._ends(observed["success"], step_count)
@@ -175,7 +175,7 @@ class EpisodeObserver:
         """``terminated``, ``truncated`` and ``done``, (n, 1) bool."""
         terminated = torch.zeros_like(success)
         if self._terminate_on_success:
-            terminated = success & (step_count > 0)  # a start does not end an episode
+            terminated = success & (step_count > 0)  # none ends before a step
         if self._has_failure:
             failure = self._task.failure(self._simulation)
             terminated = terminated | failure & (step_count > 0)
@@ -265,8 +265,9 @@ class EpisodeObserver:
             is_inside = all(0 <= index < size for index in self._goal_indices)
             if len(self._goal_indices) != task.goal_dim or not is_inside:
                 raise ValueError(
-                    f"{task_name}.goal_entries must name {task.goal_dim} entries of an "
-                    f"observation of {size}, got {task.goal_entries}"
+                    f"{task_name}.goal_entries must name {task.goal_dim} of the "
+                    f"{robot.observation_dim} entries of the robot and the "
+                    f"{task.observation_dim} of the task, got {task.goal_entries}"
                 )
 
 

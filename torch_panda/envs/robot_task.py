@@ -76,8 +76,8 @@ class RobotTaskEnv(EnvBase):
         seed: Seed of all random draws; None draws one from the operating system. Two
             environments with the same seed play the same episodes, so give each worker
             process a seed of its own.
-        device: Device of the outputs; None means the CPU. Physics and states stay on
-            the CPU.
+        device: Device of all outputs, also of `get_state`; None means the CPU. The
+            physics is computed on the CPU.
         max_episode_steps: Number of steps after which an episode is ``truncated``;
             None means the task's number.
         terminate_on_success: Whether success ends an episode, as in panda-gym 3. In the
@@ -377,8 +377,9 @@ class RobotTaskEnv(EnvBase):
             n_objects, 6) and ``desired_goal`` (*batch, goal_dim), all float64, and
             ``step_count`` (*batch, 1), int64. If objects have joints, also
             ``object_joint_position`` and ``object_joint_velocity`` (*batch,
-            n_object_joints). If the physics vary, also ``physics_parameters`` (*batch,
-            k) float64, or ``physics_seed`` (*batch, 1) int64.
+            n_object_joints). If ``randomize`` has ranges, also
+            ``physics_parameters`` (*batch, k) float64. If the task overrides
+            `Task.randomize`, also ``physics_seed`` (*batch, 1) int64.
 
         Raises:
             BulletError: The environment is closed or needs a reset.
@@ -499,8 +500,8 @@ class RobotTaskEnv(EnvBase):
                 connect.
             port: First port to try; the viewer takes the next free one, see ``url``.
             allowed_hosts: Names of this machine under which browsers may open the page,
-                beside ``host`` and the loopback names. Other requests, and requests of
-                other web pages, are refused.
+                beside ``host`` and the loopback names. Requests under any other name
+                are refused, and so are requests that a page of another site sends.
 
         Raises:
             ImportError: viser is not installed.

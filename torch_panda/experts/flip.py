@@ -8,7 +8,8 @@ The hand cannot rotate, so it rotates the cube in two other ways.
   swings about y, the axis from finger to finger. When it hangs down, the hand can put
   it down with another face up.
 
-The last move of a plan is a swing that stops at the best angle, or nothing.
+A plan consists of quarter turns about y (swings) and about z (taps). After these turns,
+it may end with a swing that stops at the angle that is closest to the goal.
 """
 
 import math
@@ -40,7 +41,8 @@ TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m
 SUCCESS, DONE = 0.2, 0.17  # distances at which the task succeeds, and the hand stops
 # Costs of a plan: each quarter turn about y, each about z, a swing as the last move,
 # the distance to the goal after the plan, and the part of this distance above `GOOD`,
-# or above `GOOD_LYING` if no swing comes last. A plan that fails costs 1 more.
+# or above `GOOD_LYING` if no swing comes last. A plan that
+# ends too far from the goal costs 1 more.
 PITCH_COST, YAW_COST, SWING_COST, LEFT_COST, MISS_COST = 0.3, 0.15, 0.1, 0.2, 6.0
 GOOD, GOOD_LYING = 0.15, 0.13
 # Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
@@ -52,7 +54,7 @@ TURN_COSTS = dot(QUARTERS.abs(), torch.tensor((PITCH_COST, YAW_COST)))
 
 
 class Table(NamedTuple):
-    """Numbers of a spinning cube on a table.
+    """How a spinning cube slows down on a table, and how taps spin it.
 
     Attributes:
         deceleration: Deceleration of the spin after a tap [rad/s^2].
@@ -125,7 +127,8 @@ def descend(ee: Tensor, point: Tensor) -> Tensor:
     off = off + (offset[..., :1].abs() - 0.03).clamp(min=0.0)
     rise = offset[..., 2:] + (5 * (off - 0.006)).clamp(0.0, 0.06)
     free = (1 - rise / 0.03).clamp(0.0, 1.0)
-    # The outstretched arm covers only a small part of an offset along x.
+    # Stretched out, the arm covers only a small part of an offset along x in one step,
+    # so enlarge the action along x.
     far = 1 + 30 * (ee[..., :1] - 0.03).clamp(min=0.0)
     return GAIN * torch.cat(
         (offset[..., :1] * far * free, offset[..., 1:2] * free, rise), -1
@@ -159,7 +162,11 @@ def grasp(
     aside: Tensor,
     ready: Tensor,
 ) -> Tensor:
-    """Close the fingers ``aside`` from the centre along x if the cube is ``ready``."""
+    """Move the open fingers beside the cube's centre, and close them if it is ready.
+
+    They close at the distance ``aside`` from the centre along x [m], (n, 1), if
+    ``ready``, (n, 1) bool.
+    """
     x, y, z = (position + 0.04 * velocity).split(1, -1)
     point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)
     error = (point - ee).abs()

@@ -20,7 +20,7 @@ DECELERATION = 0.25 * 9.81
 
 
 def norm(vector: Tensor) -> Tensor:
-    """Lengths of vectors (..., n), (..., 1)."""
+    """Lengths (..., 1) of vectors (..., n)."""
     return dot(vector, vector).sqrt()
 
 
@@ -38,7 +38,7 @@ def move(offset: Tensor, limit: float = 1.0) -> Tensor:
 def go_over(
     position: Tensor, point: Tensor, clearance: float, limit: float = 1.0
 ) -> Tensor:
-    """Move to a point from above: rise by ``clearance``, and descend over the point.
+    """Move to a point from above: travel at a height, and descend over the point.
 
     Args:
         position: Present position, (..., 3).
@@ -81,7 +81,7 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
 
 
 def is_held(ee: Tensor, width: Tensor, cube: Tensor) -> Tensor:
-    """Whether the fingers hold a cube, rotated or not, anywhere along y."""
+    """Whether the fingers hold a cube, which may be rotated, or off-centre along y."""
     offset = (cube - ee).abs() < ee.new_tensor((0.02, 0.04, 0.02))
     return (width > 0.02) & (width < 0.057) & offset.all(-1, keepdim=True)
 

@@ -40,7 +40,7 @@ DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 # Longest episode [steps] of a run in which some episodes start in the middle of the
 # task: these need fewer steps, and all environments of a run have the same limit.
 MAX_STEPS_FROM_MIDDLE = 50
-# Of the episodes in which no object moves, --preset tuned stores this fraction.
+# Of the episodes in which no object moves, all presets but "paper" store this fraction.
 KEEP_UNMOVED = 0.1
 
 
@@ -85,7 +85,7 @@ class Run:
         steps_per_iteration = args.num_envs * steps
         self.buffer = make_buffer(
             self.env,
-            args.total_steps + steps_per_iteration,  # the last iteration may exceed
+            args.total_steps + steps_per_iteration,  # the last one may go further
             her=args.her,
             desired_ratio=args.desired_ratio,
             seed=args.seed,
@@ -108,7 +108,7 @@ class Run:
             frames_per_batch=steps_per_iteration,
             total_frames=-1,
             reset_at_each_iter=True,
-            # In torchrl, the members of this enum are strings.
+            # mypy takes the members of this enum for strings.
             exploration_type=ExplorationType.RANDOM,  # type: ignore[arg-type]
             auto_register_policy_transforms=True,
         )

@@ -94,7 +94,8 @@ class Task(Configured, ABC):
 
     A subclass sets ``goal_dim`` and ``observation_dim``. It also sets
     ``max_episode_steps`` if an episode does not have 50 steps. The arguments of the
-    shipped tasks are fields of dataclasses, whose defaults are those of the ids -v1.
+    shipped tasks are fields of dataclasses, whose defaults are those of the ids that
+    end in ``-v1``.
 
     `randomize`, `reward`, `failure` and `extra_observation` are optional hooks. A hook
     that a task leaves out is never called, so it costs nothing.
@@ -121,7 +122,7 @@ class Task(Configured, ABC):
     observation_layout: ClassVar[tuple[Quantity, ...] | None] = None
     """Quantities of `observation`, in their order; None if they are not declared.
 
-    Relative inputs and data augmentation in training need it, and ``goal_entries`` too.
+    Relative inputs and data augmentation in training need it and ``goal_entries``.
     The position of each object must precede its other quantities."""
     sampled_goal_height: ClassVar[float | None] = None
     """Height of all sampled goals [m], in a task whose objects sink below this height
@@ -148,7 +149,8 @@ class Task(Configured, ABC):
 
         The default calls `sample_goal`, `sample_objects` and `sample_object_joints`, in
         this order. A task overrides `sample_start` instead of these three if one of
-        them depends on another, for example a goal on the start of an object.
+        them depends on another, for example if the goal depends on where an object
+        starts.
 
         Args:
             rng: Random generator of the episode.
@@ -279,9 +281,9 @@ class Task(Configured, ABC):
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
         """States of the objects in which goals are reached, for ``goal="observation"``.
 
-        The default takes a goal as one position for each object, and does not rotate
-        the objects. If the goal is a position of the end-effector, the objects stay at
-        their start.
+        The default takes a goal as one position for each object, and gives the objects
+        the orientation `NO_ROTATION`. If the goal is a position of the end-effector,
+        the objects stay at their start.
 
         Args:
             goal: Desired goals, (n, goal_dim) float64.
