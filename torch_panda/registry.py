@@ -106,18 +106,9 @@ BLOCKED = {"block_gripper": True}
 FIRM = {"finger_friction": 5.0}
 SPINNING = {"finger_spinning_friction": 0.001}  # panda-gym 3.0.7; the URDF has 0.1
 
-
-def _robot(path: str) -> type[Robot]:
-    """A class in `torch_panda.robots`, given as ``module:Class``."""
-    robot: type[Robot] = load_class("torch_panda.robots", path)
-    return robot
-
-
-def _task(path: str) -> type[Task]:
-    """A class in `torch_panda.tasks`, given as ``module:Class``."""
-    task: type[Task] = load_class("torch_panda.tasks", path)
-    return task
-
+# Load a robot or a task that is given as ``module:Class``.
+_robot = partial(load_class, "torch_panda.robots")
+_task = partial(load_class, "torch_panda.tasks")
 
 # To add a task or a robot, add its line here; nothing else imports its file. The page
 # tasks/README.md shows the numbers of both versions side by side, with their sources.

@@ -111,14 +111,16 @@ def test_sensors_do_not_change_the_physics():
 def test_specs(num_envs):
     batch = () if num_envs is None else (num_envs,)
     with torch_panda.make(
-        "PandaStack-v1", num_envs=num_envs, seed=0, sensors=SENSORS
+        "PandaStack-v1", num_envs=num_envs, seed=0, sensors=(*SENSORS, "joint_state")
     ) as env:
         check_env_specs(env)
         torch.manual_seed(0)
         td = env.rollout(3)["next"]
         assert td["wrist_force_torque"].shape == (*batch, 3, 6)
         assert td["finger_contact"].shape == (*batch, 3, 2, 3)
-        assert td["joint_torque"].shape == (*batch, 3, 9)
+        for key in ("joint_torque", "joint_position", "joint_velocity"):
+            assert td[key].shape == (*batch, 3, 9)
+            assert td[key].dtype == torch.float32
         assert (td["joint_torque"][..., 1].abs() > 1).all()
 
 

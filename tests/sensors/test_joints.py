@@ -1,23 +1,10 @@
 """The sensor "joint_state"."""
 
-import pytest
 import torch
-from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 
 SENSORS = ("joint_state",)
-
-
-@pytest.mark.parametrize("num_envs", [None, 2])
-def test_specs(num_envs):
-    batch = () if num_envs is None else (num_envs,)
-    with torch_panda.make("PandaPush-v1", num_envs=num_envs, sensors=SENSORS) as env:
-        check_env_specs(env)
-        following = env.rollout(3)["next"]
-        for key in ("joint_position", "joint_velocity"):
-            assert following[key].shape == (*batch, 3, 9)
-            assert following[key].dtype == torch.float32
 
 
 def test_it_observes_the_joints_of_the_state():

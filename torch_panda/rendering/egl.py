@@ -9,7 +9,6 @@ from torch_panda.checks import check_choice
 
 # Bullet's software renderer, and its OpenGL renderer without a window.
 RendererName = Literal["tiny", "egl"]
-RENDERERS: tuple[RendererName, ...] = get_args(RendererName)
 
 # Draws a box in front of the background and checks that the picture shows both. The
 # code uses pybullet instead of this package, because importing torch takes much longer.
@@ -33,7 +32,7 @@ def check_renderer(renderer: str) -> None:
         ValueError: there is no renderer of this name.
         RuntimeError: EGL does not work on this machine.
     """
-    check_choice("renderer", renderer, RENDERERS)
+    check_choice("renderer", renderer, get_args(RendererName))
     if renderer == "egl":
         _check_egl()
 
