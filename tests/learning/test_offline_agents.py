@@ -58,7 +58,7 @@ def make_data(env, agent, transitions):
     return data
 
 
-@pytest.mark.parametrize("algo", ["gcbc", "gcivl", "gciql", "hiql"])
+@pytest.mark.parametrize("algo", ["gcbc", "gcivl", "gciql", "hiql", "qrl"])
 def test_agents_learn_to_reach(env, transitions, algo):
     agent = make_agent(env, algo)
     data = make_data(env, agent, transitions)

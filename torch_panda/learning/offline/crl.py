@@ -36,7 +36,10 @@ ContrastiveLoss = Literal["binary", "infonce"]
 
 @dataclass
 class CRLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of CRL, by default OGBench's, but with smaller phi and psi."""
+    """Hyperparameters of CRL, by default OGBench's, but with smaller phi and psi.
+
+    For its cube tasks, OGBench takes an alpha of 0.1 (noisy) or 3 (play).
+    """
 
     algo: Literal["crl"] = "crl"
     """algorithm"""
