@@ -8,7 +8,7 @@ import torch
 
 import torch_panda
 from tests.commands.runs import After, read_curve
-from torch_panda.commands import evaluate, plot, refine, train
+from torch_panda.commands import evaluate, plot, refine, train, watch
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.offline.options import make_args_class
@@ -47,6 +47,8 @@ def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
     assert len(result.success) == 2
     evaluate.main(evaluate.Args(run=str(out), episodes=4))
     assert "PandaReach-v1, 4 episodes" in capsys.readouterr().out
+    watch.main(watch.Args(policy=str(out), num_envs=1, out=tmp_path / "watch.gif"))
+    assert (tmp_path / "watch.gif").read_bytes().startswith(b"GIF8")
     plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "all.png"))
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit, match="was learned offline by gcbc, but refine"):
