@@ -58,9 +58,19 @@ def make_data(env, agent, transitions):
     return data
 
 
-@pytest.mark.parametrize("algo", ["gcbc", "gcivl", "gciql", "hiql", "qrl"])
-def test_agents_learn_to_reach(env, transitions, algo):
-    agent = make_agent(env, algo)
+@pytest.mark.parametrize(
+    ("algo", "options"),
+    [
+        ("gcbc", {}),
+        ("gcivl", {}),
+        ("gciql", {}),
+        ("hiql", {}),
+        ("qrl", {}),
+        ("qrl", {"actor_loss": "descend"}),
+    ],
+)
+def test_agents_learn_to_reach(env, transitions, algo, options):
+    agent = make_agent(env, algo, **options)
     data = make_data(env, agent, transitions)
     env.set_seed(1)
     untrained = evaluate_episodes(env, agent.policy, 20)
@@ -74,9 +84,14 @@ def test_agents_learn_to_reach(env, transitions, algo):
     assert trained.success_rate > 0.8
 
 
-@pytest.mark.parametrize("algo", OFFLINE_AGENTS)
-def test_a_loss_of_the_policy_leaves_the_other_networks_alone(env, transitions, algo):
-    agent = make_agent(env, algo)
+@pytest.mark.parametrize(
+    ("algo", "options"),
+    [*((algo, {}) for algo in OFFLINE_AGENTS), ("qrl", {"actor_loss": "descend"})],
+)
+def test_a_loss_of_the_policy_leaves_the_other_networks_alone(
+    env, transitions, algo, options
+):
+    agent = make_agent(env, algo, **options)
     data = make_data(env, agent, transitions)
     losses = agent.losses(agent.extend(data.sample(32), data))
     names = [name for name in losses if "actor" in name]

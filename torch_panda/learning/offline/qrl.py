@@ -4,8 +4,11 @@ The cost of going from a state to a goal is a quasimetric: it satisfies the tria
 inequality, but need not be symmetric. QRL learns the largest quasimetric d in which
 every observed step costs at most 1. That is the optimal cost, because paths of steps
 bound d from above. A Lagrange multiplier lambda, which is learned too, enforces the
-bound on steps. d is an interval quasimetric embedding, IQE (arXiv 2211.15120). The
-policy descends d through a learned model of the dynamics, and imitates the data.
+bound on steps. d is an interval quasimetric embedding, IQE (arXiv 2211.15120).
+
+The paper's policy descends d through a learned model of the dynamics ("descend"). This
+model needs more gradient steps than d. So by default the policy imitates actions in
+proportion to exp(alpha * progress), as OGBench's option "awr" ("imitate").
 
 The paper's goals are states. Here a goal is a part of a state, so goals have an encoder
 of their own, and a step from each state to the goal that it achieves costs 0.
@@ -29,6 +32,7 @@ from torch_panda.learning.offline.base import (
     frozen,
     log_prob,
     make_gelu_mlp,
+    weighted_regression,
 )
 from torch_panda.learning.spaces import Spaces
 
@@ -47,22 +51,30 @@ OFFSET, BETA = 50.0, 0.1
 class QRLHyperparameters(OfflineHyperparameters):
     """Hyperparameters of QRL.
 
-    `num_components` is half of OGBench's, and `alpha` is OGBench's for cubes and play.
-    For noisy data, OGBench has an alpha of 0.03. With that, the policy is too fast at
-    the goal and leaves it again: its loss divides costs by their mean, and our tasks
-    take fewer steps than OGBench's, so the slope of one step weighs more here.
+    `imitation` is OGBench's alpha for cubes and play, and `num_components` is half of
+    OGBench's. For noisy data, OGBench has an alpha of 0.03. With that, the policy is
+    too fast at the goal and leaves it again: its loss divides costs by their mean, and
+    our tasks take fewer steps than OGBench's, so the slope of one step weighs more.
     """
 
     algo: Literal["qrl"] = "qrl"
     """algorithm"""
-    alpha: Weight = 0.3
-    """weight of the imitation in the policy's loss"""
+    actor_loss: Literal["imitate", "descend"] = "imitate"
+    """imitate actions that progress towards the goal ("imitate"), or descend the costs
+    through learned dynamics (the paper's, "descend")"""
+    alpha: Weight = 10.0
+    """inverse temperature of the weights of actions for "imitate\""""
+    imitation: Weight = 0.3
+    """weight of the imitation in the policy's loss for "descend\""""
     num_components: Positive = 32
     """number of components of the quasimetric"""
 
 
 class QRL(OfflineAgent):
-    """A quasimetric d(s, g), a model of latent dynamics, and a policy pi(a | s, g)."""
+    """A quasimetric d(s, g), and a policy pi(a | s, g) that follows it.
+
+    With "descend" also a model of latent dynamics.
+    """
 
     Hyperparameters: ClassVar = QRLHyperparameters
     value_goal: ClassVar = "random"
@@ -75,9 +87,10 @@ class QRL(OfflineAgent):
         self.state_encoder = make_gelu_mlp(state_size, latent_size, hp.hidden_size)
         self.goal_encoder = make_gelu_mlp(spaces.goal_size, latent_size, hp.hidden_size)
         self.quasimetric = IQE()
-        self.dynamics = make_gelu_mlp(
-            latent_size + action_size, latent_size, hp.hidden_size
-        )
+        if hp.actor_loss == "descend":
+            self.dynamics = make_gelu_mlp(
+                latent_size + action_size, latent_size, hp.hidden_size
+            )
         self.actor = Actor(self.normalizer, action_size, hp.hidden_size)
         self.assemble(self.actor)
         self.log_lambda = nn.Parameter(torch.zeros(()))
@@ -107,12 +120,23 @@ class QRL(OfflineAgent):
         achieved = self.quasimetric(z_next, self.encode_goal(b.achieved))
         violation = too_far + achieved.square().mean()
         multiplier = self.log_lambda.exp()
-        return {
+        losses = {
             "value_loss": push + multiplier.detach() * violation,
             "multiplier_loss": multiplier * (EPSILON**2 - violation.detach()),
-            "dynamics_loss": self.dynamics_loss(z, b.a, z_next),
-            "actor_loss": self.actor_loss(b),
         }
+        if self.hp.actor_loss == "imitate":
+            return {**losses, "actor_loss": self.imitation_loss(b)}
+        losses["dynamics_loss"] = self.dynamics_loss(z, b.a, z_next)
+        return {**losses, "actor_loss": self.descent_loss(b)}
+
+    def imitation_loss(self, b: Batch) -> Tensor:
+        """Weighted imitation. The advantage is the progress d(s, g) - d(s', g)."""
+        with torch.no_grad():
+            goal = self.encode_goal(b.g_actor)
+            before = self.quasimetric(self.encode_state(b.s), goal)
+            after = self.quasimetric(self.encode_state(b.s_next), goal)
+        log_probs = log_prob(self.actor(b.s, b.g_actor), b.a)
+        return weighted_regression(log_probs, before - after, self.hp.alpha)
 
     def dynamics_loss(self, z: Tensor, a: Tensor, z_next: Tensor) -> Tensor:
         """Distance of z + T(z, a) from z', both ways (section 3.4).
@@ -123,7 +147,7 @@ class QRL(OfflineAgent):
         distance = self.quasimetric(predicted, z_next)
         return (distance + self.quasimetric(z_next, predicted)).mean() / 2
 
-    def actor_loss(self, b: Batch) -> Tensor:
+    def descent_loss(self, b: Batch) -> Tensor:
         """Descend d(z + T(z, pi(s, g)), g) (section 3.4), and imitate as OGBench."""
         mean = self.actor(b.s, b.g_actor)
         with torch.no_grad():
@@ -131,7 +155,7 @@ class QRL(OfflineAgent):
         with frozen(self.dynamics, self.quasimetric):
             predicted = z + self.dynamics(z, mean.clamp(-1.0, 1.0))
             q = -self.quasimetric(predicted, goal)
-        return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.alpha)
+        return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.imitation)
 
 
 class IQE(nn.Module):
