@@ -222,7 +222,9 @@ def test_box_wedged_between_fingers():
 
         world.drive = drive
 
-    assert_same(scene(fill), 300)
+    counts = assert_same(scene(fill), 300)
+    # Bullet creates the first rows of a manifold, for which it enlarges its arrays.
+    assert counts.bullet_manifolds < counts.manifolds / 20
 
 
 @pytest.mark.parametrize("last_force", [1e280, math.inf, math.nan])

@@ -4,7 +4,6 @@
  * Functions here, and their counterparts in Bullet
  * ------------------------------------------------
  * accelerate        btMultiBody::computeAccelerationsArticulatedBodyAlgorithmMultiDof
- * rotation_matrix   btMatrix3x3::setRotation
  * safe_norm         btVector3::safeNorm
  * move_motion       btSpatialTransformationMatrix::transform
  * add_moved_inertia btSpatialTransformationMatrix::transformInverse, for a dyad
@@ -33,6 +32,7 @@
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"
 #include "solver.h"
+#include "vectors.h"
 
 #include <emmintrin.h>
 
@@ -112,11 +112,6 @@ static inline double dot(struct spatial_pair motion, struct spatial_pair force) 
     return sum[LINEAR] + sum[ANGULAR];
 }
 
-static inline struct vector3 cross(struct vector3 a, struct vector3 b) {
-    return (struct vector3){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z,
-                            a.x * b.y - a.y * b.x, 0.0};
-}
-
 /* The cross products of a vector with both parts. */
 static inline struct spatial_pair cross_both(struct vector3 a, struct spatial_pair b) {
     return (struct spatial_pair){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z,
@@ -147,7 +142,7 @@ static inline struct spatial_pair move_motion(const struct matrix *rotation,
                                               struct spatial_pair parent) {
     const struct spatial_pair own = rotate(rotation, parent);
     const struct vector3 angular = part(own, ANGULAR);
-    const struct vector3 turned = cross(arm, angular);
+    const struct vector3 turned = cross(&arm, &angular);
     const struct vector3 linear = {-turned.x + own.x[LINEAR], -turned.y + own.y[LINEAR],
                                    -turned.z + own.z[LINEAR], 0.0};
     return join(angular, linear);
@@ -157,7 +152,8 @@ static inline struct spatial_pair move_motion(const struct matrix *rotation,
 static inline struct spatial_pair cross_motion(struct spatial_pair a,
                                                struct spatial_pair b) {
     const struct spatial_pair first = cross_both(part(a, ANGULAR), b);
-    const struct vector3 second = cross(part(a, LINEAR), part(b, ANGULAR));
+    const struct vector3 linear = part(a, LINEAR), angular = part(b, ANGULAR);
+    const struct vector3 second = cross(&linear, &angular);
     return (struct spatial_pair){{first.x[ANGULAR], second.x + first.x[LINEAR]},
                                  {first.y[ANGULAR], second.y + first.y[LINEAR]},
                                  {first.z[ANGULAR], second.z + first.z[LINEAR]}};
@@ -253,15 +249,12 @@ static inline void subtract_outer(struct matrix *m, struct vector3 a, struct vec
         m->row[i].xy -= factors[i] * xy, m->row[i].zw -= factors[i] * zw;
 }
 
-static inline struct matrix rotation_matrix(const struct vector3 *q) {
-    const double s = 2.0 / (q->x * q->x + q->y * q->y + q->z * q->z + q->w * q->w);
-    const double xs = q->x * s, ys = q->y * s, zs = q->z * s;
-    const double wx = q->w * xs, wy = q->w * ys, wz = q->w * zs;
-    const double xx = q->x * xs, xy = q->x * ys, xz = q->x * zs;
-    const double yy = q->y * ys, yz = q->y * zs, zz = q->z * zs;
-    return (struct matrix){{{{1.0 - (yy + zz), xy - wz}, {xz + wy, 0.0}},
-                            {{xy + wz, 1.0 - (xx + zz)}, {yz - wx, 0.0}},
-                            {{xz - wy, yz + wx}, {1.0 - (xx + yy), 0.0}}}};
+static inline struct matrix packed_rotation(const struct vector3 *quaternion) {
+    const struct matrix3 rotation = rotation_matrix(quaternion);
+    const struct vector3 *r = rotation.row;
+    return (struct matrix){{{{r[0].x, r[0].y}, {r[0].z, 0.0}},
+                            {{r[1].x, r[1].y}, {r[1].z, 0.0}},
+                            {{r[2].x, r[2].y}, {r[2].z, 0.0}}}};
 }
 
 /* The lengths of both parts. A tiny length counts as 0. */
@@ -305,10 +298,10 @@ static void compute_velocities(struct work *work, const struct multi_body *body)
     const struct link *link = body->links.data;
     const double *joint_velocity = (const double *)body->real_buffer.data + 6;
     const pair damping = {body->angular_damping, body->linear_damping};
-    work->rotation[0] = work->from_world[0] = rotation_matrix(&body->base_rotation);
+    work->rotation[0] = work->from_world[0] = packed_rotation(&body->base_rotation);
     work->velocity[0] = ZERO;
     for (int i = 0; i < body->links.size; i++, link++) {
-        const struct matrix rotation = rotation_matrix(&link->rotation);
+        const struct matrix rotation = packed_rotation(&link->rotation);
         const struct matrix from_world =
             multiply(&rotation, &work->from_world[link->parent + 1]);
         struct spatial_pair velocity =
@@ -367,7 +360,7 @@ static void compute_inertias(struct work *work, const struct multi_body *body,
         add_moved_inertia(&work->inertia[link->parent + 1], rotation, link->r_vector,
                           inertia);
         const struct vector3 linear = part(force, LINEAR);
-        force = add(force, join(cross(link->r_vector, linear), (struct vector3){0}));
+        force = add(force, join(cross(&link->r_vector, &linear), (struct vector3){0}));
         work->force[link->parent + 1] =
             add(work->force[link->parent + 1], rotate_back(rotation, force));
     }

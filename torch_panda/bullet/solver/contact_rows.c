@@ -11,7 +11,6 @@
  * fill_jacobians    btMultiBody::fillConstraintJacobianMultiDof
  * respond           btMultiBody::calcAccelerationDeltasMultiDof, for a body without links
  * set_directions    btPlaneSpace1 and btVector3::normalize
- * matrix            btMatrix3x3::setRotation
  *
  * Why the results are the same bits
  * ---------------------------------
@@ -26,16 +25,12 @@
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"
 #include "solver.h"
+#include "vectors.h"
 
 #include <math.h>
 
 static inline double dot(const struct vector3 *a, const struct vector3 *b) {
     return a->x * b->x + a->y * b->y + a->z * b->z;
-}
-
-static inline struct vector3 cross(const struct vector3 *a, const struct vector3 *b) {
-    return (struct vector3){a->y * b->z - a->z * b->y, a->z * b->x - a->x * b->z,
-                            a->x * b->y - a->y * b->x, 0.0};
 }
 
 static inline struct vector3 minus(const struct vector3 *a, const struct vector3 *b) {
@@ -128,18 +123,6 @@ static void respond(const struct multi_body *body, const double *jacobian,
 
 static const struct vector3 ZERO = {0.0, 0.0, 0.0, 0.0};
 
-static struct matrix3 matrix(const struct vector3 *q) {
-    const double d = q->x * q->x + q->y * q->y + q->z * q->z + q->w * q->w;
-    const double s = 2.0 / d;
-    const double xs = q->x * s, ys = q->y * s, zs = q->z * s;
-    const double wx = q->w * xs, wy = q->w * ys, wz = q->w * zs;
-    const double xx = q->x * xs, xy = q->x * ys, xz = q->x * zs;
-    const double yy = q->y * ys, yz = q->y * zs, zz = q->z * zs;
-    return (struct matrix3){{{1.0 - (yy + zz), xy - wz, xz + wy, 0.0},
-                             {xy + wz, 1.0 - (xx + zz), yz - wx, 0.0},
-                             {xz - wy, yz + wx, 1.0 - (xx + yy), 0.0}}};
-}
-
 /* A row of a contact while it is created: its directions and its parts, by body. */
 struct direction {
     struct vector3 angular[2], linear[2];
@@ -179,7 +162,7 @@ static void fill_jacobians(const struct side *side, struct direction *rows,
     const struct link *links = body->links.data;
     int chain[MAX_LINKS], length = 0; /* from the link to the base */
     for (int i = side->link; i >= 0; i = links[i].parent) chain[length++] = i;
-    struct matrix3 rotation = matrix(&body->base_rotation);
+    struct matrix3 rotation = rotation_matrix(&body->base_rotation);
     struct vector3 local = rotate(&rotation, &arm);
     struct vector3 angular[MAX_ROWS], linear[MAX_ROWS];
     for (int i = 0; i < num_rows; i++) {
@@ -189,7 +172,7 @@ static void fill_jacobians(const struct side *side, struct direction *rows,
     for (int k = length - 1; k >= 0; k--) {
         const struct link *link = &links[chain[k]];
         const struct vector3 *top = &link->axes[0].top, *bottom = &link->axes[0].bottom;
-        rotation = matrix(&link->rotation);
+        rotation = rotation_matrix(&link->rotation);
         const struct vector3 turned = rotate(&rotation, &local);
         local = minus(&turned, &link->r_vector);
         struct vector3 lever = cross(top, &local);
@@ -489,8 +472,12 @@ int convert_manifold(struct responses **responses, struct solver *solver,
     const int size =
         num_normal ? sides[0].body->num_dofs + sides[1].body->num_dofs + 12 : 0;
     const int num_entries = size * (num_normal + num_spinning + num_friction);
+    int num_velocities = 0; /* of bodies that no earlier row has */
+    for (int part = 0; num_normal && part < 2; part++)
+        if (sides[part].body->companion_id < 0)
+            num_velocities += sides[part].body->num_dofs + 6;
     const int needed[] = {num_normal,  num_spinning, num_friction,
-                          num_entries, num_entries,  size};
+                          num_entries, num_entries,  num_velocities};
     int before[6];
     for (int i = 0; i < 6; i++) {
         if (!has_room(arrays[i], needed[i])) return 0;
