@@ -18,3 +18,21 @@ def read_curve(folder):
     """The rows of a run's curve.csv."""
     with (folder / "curve.csv").open() as file:
         return list(csv.DictReader(file))
+
+
+def weights(run):
+    """A copy of the weights of a run's agent."""
+    return {key: x.clone() for key, x in run.agent.state_dict().items()}
+
+
+def points(run):
+    """The curve of a run, without the time that it took."""
+    return [{**row, "seconds": 0} for row in run.progress.curve]
+
+
+class Kill(BaseException):
+    """Ends a run as a kill of its process does."""
+
+
+def kill(*arguments, **options):
+    raise Kill

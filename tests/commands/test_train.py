@@ -1,4 +1,4 @@
-"""The training example: it learns something, writes its files, stops and resumes."""
+"""A training writes its files, stops and resumes."""
 
 import json
 import os
@@ -13,7 +13,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from tests.commands.runs import After, read_curve
+from tests.commands.runs import After, Kill, points, read_curve, weights
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import training
@@ -22,15 +22,6 @@ from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")
-
-
-def weights(run):
-    return {key: x.clone() for key, x in run.agent.state_dict().items()}
-
-
-def points(run):
-    """Its curve, but for the time that it took."""
-    return [{**row, "seconds": 0} for row in run.progress.curve]
 
 
 def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
@@ -81,7 +72,7 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
     ids=lambda options: "-".join(map(str, options.values())),
 )
 def test_resumed_run_equals_uninterrupted_run(tmp_path, options):
-    """Stopped after an iteration and gone on with, in all its bits."""
+    """A stop after an iteration changes no bit of the result."""
     args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=300, **options)
     args = replace(args, updates_per_step=0.1, eval_interval=100)
     whole = Run(args, tmp_path)
@@ -118,9 +109,6 @@ def test_a_killed_run_goes_on_from_its_last_save(tmp_path, monkeypatch):
     whole = Run(args, tmp_path)
     whole.train()
     whole.close()
-
-    class Kill(BaseException):
-        pass
 
     def killed_at(steps, run):
         learn = run.learn

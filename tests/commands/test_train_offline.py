@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torch_panda
-from tests.commands.runs import After, read_curve
+from tests.commands.runs import After, points, read_curve, weights
 from torch_panda.commands import evaluate, plot, refine, train, watch
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -21,11 +21,6 @@ SMALL = {"hidden_size": 32, "batch_size": 64, "num_envs": 4, "video": False}
 def make_args(out, algo="gcbc", **options):
     options = {**SMALL, "transitions": 400, "total_steps": 6, **options}
     return make_args_class(algo)(out=out, eval_interval=4, **options)
-
-
-def state(run):
-    curve = [{**row, "seconds": 0} for row in run.progress.curve]
-    return {key: x.clone() for key, x in run.agent.state_dict().items()}, curve
 
 
 def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
@@ -71,11 +66,9 @@ def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo):
     assert resumed.progress.steps == 3
     assert resumed.train()
     resumed.close()
-    weights, curve = state(whole)
-    resumed_weights, resumed_curve = state(resumed)
-    torch.testing.assert_close(resumed_weights, weights, rtol=0, atol=0)
-    assert resumed_curve == curve
-    assert [row["step"] for row in curve] == [0, 4, 6]
+    torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
+    assert points(resumed) == points(whole)
+    assert [row["step"] for row in points(whole)] == [0, 4, 6]
 
 
 @pytest.mark.parametrize("algo", OFFLINE_AGENTS)
@@ -112,16 +105,8 @@ def test_data_of_a_file(tmp_path):
 
 
 def test_the_options_are_those_of_the_algorithm(capsys):
-    arguments = [
-        "--offline",
-        "--algo",
-        "hiql",
-        "--subgoal-steps",
-        "7",
-        "--data",
-        "play",
-    ]
-    args = parse(arguments)
+    options = ["--algo", "hiql", "--subgoal-steps", "7", "--data", "play"]
+    args = parse(["--offline", *options])
     expected = make_args_class("hiql")(subgoal_steps=7, data="play")
     assert args == expected
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""The examples that draw: a video of a policy, and the picture of all tasks."""
+"""Watching a policy as a video and in a window."""
 
 import os
 import shutil

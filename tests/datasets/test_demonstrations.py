@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 import torch_panda
-from tests.commands.runs import After
+from tests.commands.runs import After, Kill, weights
 from torch_panda.commands.train import make_run
 from torch_panda.datasets.demonstrations import read_demos
 from torch_panda.learning import pretraining
@@ -107,9 +107,6 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
     options = {"total_steps": 0, "pretrain_updates": 40, "augmentation": "mirror"}
     args = small(make_demos(), algo=algo, **options)
 
-    def weights(run):
-        return {key: x.clone() for key, x in run.agent.state_dict().items()}
-
     whole = make_run(args, tmp_path)
     before = weights(whole)
     assert whole.train()
@@ -145,9 +142,6 @@ def test_what_was_imitated_is_evaluated_also_after_a_kill(make_demos, tmp_path):
     whole = make_run(args, tmp_path)
     assert whole.train()
     whole.close()
-
-    class Kill(BaseException):
-        pass
 
     killed = make_run(args, tmp_path)
     add = killed.curve.add

@@ -1,4 +1,4 @@
-"""What a newcomer runs first: it learns, and it is short."""
+"""The first script of a newcomer learns Reach, and it is short."""
 
 import subprocess
 import sys

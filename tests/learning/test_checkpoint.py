@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.commands.runs import Kill, kill, points, weights
 from torch_panda.commands import train
 from torch_panda.learning import curve
 from torch_panda.learning.checkpoint import check_folder, lock_folder
@@ -18,22 +19,13 @@ from torch_panda.learning.training import Run
 pytestmark = pytest.mark.usefixtures("quick")
 
 
-class Kill(BaseException):
-    """Ends a run as a kill of its process does."""
-
-
 def train_whole(args, out):
     """Train until the end, and return the weights and the curve without times."""
     out.mkdir(exist_ok=True)
     run = Run(args, out)
     run.train()
     run.close()
-    rows = [{**row, "seconds": 0} for row in run.progress.curve]
-    return run.agent.state_dict(), rows
-
-
-def kill(*arguments, **options):
-    raise Kill
+    return weights(run), points(run)
 
 
 @pytest.mark.parametrize("during", ["plot_curve", "save_policy"])
@@ -42,7 +34,7 @@ def test_a_run_killed_in_its_first_evaluation_can_be_resumed(
 ):
     """Its curve.csv is there already."""
     args = Args(num_envs=2, total_steps=100, updates_per_step=0.1)
-    weights, rows = train_whole(args, tmp_path / "whole")
+    whole = train_whole(args, tmp_path / "whole")
     out = tmp_path / "killed"
     out.mkdir()
     run = Run(args, out)
@@ -52,9 +44,8 @@ def test_a_run_killed_in_its_first_evaluation_can_be_resumed(
     run.close()
     assert (out / "curve.csv").exists()
     check_folder(out, resume=True)
-    resumed_weights, resumed_rows = train_whole(replace(args, resume=True), out)
-    torch.testing.assert_close(resumed_weights, weights, rtol=0, atol=0)
-    assert resumed_rows == rows
+    resumed = train_whole(replace(args, resume=True), out)
+    torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
 
 
 HOLD = """
