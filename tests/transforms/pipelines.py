@@ -14,11 +14,19 @@ def make(env_id="PandaPush-v1", num_envs=4):
     return torch_panda.make(env_id, num_envs=num_envs, seed=0)
 
 
-def buffer(transform, *, capacity=1000, ndim=1, **options):
-    storage = LazyTensorStorage(capacity, ndim=ndim)
-    return TensorDictReplayBuffer(
-        storage=storage, transform=transform, batch_size=64, **options
-    )
+def buffer(
+    transform,
+    *,
+    capacity=1000,
+    ndim=1,
+    storage=None,
+    cls=TensorDictReplayBuffer,
+    batch_size=64,
+    **options,
+):
+    if storage is None:
+        storage = LazyTensorStorage(capacity, ndim=ndim)
+    return cls(storage=storage, transform=transform, batch_size=batch_size, **options)
 
 
 def collect(env, steps=10, batches=3, **options):

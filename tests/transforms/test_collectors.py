@@ -2,10 +2,10 @@ import functools
 
 import pytest
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from tests.transforms import toy
 from tests.transforms.identifiable import check_batch, relabelled, reward_fn
+from tests.transforms.pipelines import buffer
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 SINGLE = functools.partial(Collector, toy.make_env)
@@ -31,11 +31,7 @@ def collect(make_collector, frames_per_batch, total_frames, **options):
 
 
 def check(make_collector, frames, batches, *, ndim=1, **options):
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(200, ndim=ndim),
-        transform=HindsightRelabel(reward_fn),
-        batch_size=64,
-    )
+    rb = buffer(HindsightRelabel(reward_fn), capacity=200, ndim=ndim)
     share, written = [], 0
     for data in collect(make_collector, frames, frames * batches, **options):
         rb.extend(data if ndim == 2 else data.reshape(-1))
@@ -69,9 +65,7 @@ def test_worker_processes(collector):
 @pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
 def test_collectors_in_turn(hindsight):
     """Each numbers its trajectories from 0 and leaves some unfinished."""
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(5000), transform=hindsight(reward_fn), batch_size=256
-    )
+    rb = buffer(hindsight(reward_fn), capacity=5000, batch_size=256)
     for make in (*WORKERS, toy.make_env):
         for data in collect(functools.partial(Collector, make), 3 * 5, 3 * 5 * 4):
             rb.extend(data.reshape(-1))
@@ -79,9 +73,7 @@ def test_collectors_in_turn(hindsight):
 
 
 def test_augment_of_a_collectors_data():
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(5000), transform=HindsightAugment(reward_fn, k=2)
-    )
+    rb = buffer(HindsightAugment(reward_fn, k=2), capacity=5000)
     for data in collect(SINGLE, 3 * 5, 3 * 5 * 20):
         rb.extend(data)
     stored = rb.storage[:]

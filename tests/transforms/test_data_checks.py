@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
-from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer, Unbounded
+from torchrl.data import MultiStep, Unbounded
 from torchrl.envs import (
     CatTensors,
     Compose,
@@ -435,11 +435,7 @@ def test_a_mask_without_padding_changes_nothing():
 
 
 def test_split_trajectories_of_a_collector():
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(1000),
-        transform=HindsightRelabel(reward_fn, her_ratio=1.0),
-        batch_size=64,
-    )
+    rb = buffer(HindsightRelabel(reward_fn, her_ratio=1.0))
     for data in Collector(
         toy.make_env, frames_per_batch=60, total_frames=240, split_trajs=True
     ):

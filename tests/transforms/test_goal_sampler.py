@@ -6,7 +6,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torchrl.data import (
     LazyMemmapStorage,
-    LazyTensorStorage,
     ReplayBuffer,
     SliceSampler,
     TensorDictReplayBuffer,
@@ -47,11 +46,7 @@ def check_sample(batch, stored):
 )
 def test_no_goal_is_wrong(num_envs, lengths, steps, capacity, layout):
     ndim = 1 if layout in ("flat", "time first") else 2
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, ndim=ndim),
-        transform=GoalSampler(ALL, reward_fn),
-        batch_size=64,
-    )
+    rb = buffer(GoalSampler(ALL, reward_fn), capacity=capacity, ndim=ndim)
     envs = Envs(num_envs, lengths)
     for _ in range(30):
         data = name_goals(envs.chunk(steps))
@@ -207,23 +202,25 @@ def test_the_representation_names_the_strategies():
     )
 
 
-# -- the distribution of "geometric" goals, in all transforms -------------------------
+# -- the distribution of goals, in all transforms -------------------------------------
 
 LENGTH = 8
+ALL_TRANSFORMS = pytest.mark.parametrize(
+    "hindsight", [HindsightRelabel, HindsightAugment, GoalSampler]
+)
 
 
-def draw(hindsight, discount, n=4000):
+def draw(hindsight, strategy, discount, n=4000):
     """Returns steps and goal steps of n or more rows, of finished episodes."""
     data = name_goals(Envs(5, [LENGTH]).chunk(LENGTH)).reshape(-1)
     options = {"discount": discount, "seed": 0}
     if hindsight is GoalSampler:
-        transform = GoalSampler({"goal": "geometric"}, reward_fn, **options)
+        transform = GoalSampler({"goal": strategy}, reward_fn, **options)
     else:
-        options |= {"strategy": "geometric"}
+        options["strategy"] = strategy
         options |= {"k": n // 40} if hindsight is HindsightAugment else {"her_ratio": 1}
         transform = hindsight(reward_fn, **options)
-    storage = LazyTensorStorage(2 * n)
-    rb = TensorDictReplayBuffer(storage=storage, transform=transform, batch_size=n)
+    rb = buffer(transform, capacity=2 * n, batch_size=n)
     rb.extend(data)
     torch.manual_seed(0)
     batch = rb.storage[40:] if hindsight is HindsightAugment else rb.sample()
@@ -233,23 +230,30 @@ def draw(hindsight, discount, n=4000):
     return achieved[:, 2].long(), goal[:, 2].long()
 
 
-@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment, GoalSampler])
-@pytest.mark.parametrize("discount", [0.5, 0.9, 0.99, 1.0])
-def test_geometric_goals_have_their_distribution(hindsight, discount):
-    steps, goal_steps = draw(hindsight, discount)
+@ALL_TRANSFORMS
+@pytest.mark.parametrize(
+    ("strategy", "discount"),
+    [
+        *(("geometric", discount) for discount in (0.5, 0.9, 0.99, 1.0)),
+        *(("future", 0.5), ("episode", 0.5)),
+    ],
+)
+def test_goals_have_their_distribution(hindsight, strategy, discount):
+    steps, goal_steps = draw(hindsight, strategy, discount)
     chi2, freedom = 0.0, 0
     for step in range(1, LENGTH + 1):
-        delays = (goal_steps - steps)[steps == step]
-        counts = torch.bincount(delays, minlength=LENGTH)
-        weights = discount ** torch.arange(LENGTH - step + 1.0)
-        expected = len(delays) * weights / weights.sum()
-        assert counts.sum() == counts[: len(expected)].sum()
-        chi2 += ((counts[: len(expected)] - expected) ** 2 / expected).sum()
+        first = 1 if strategy == "episode" else step
+        drawn = goal_steps[steps == step]
+        counts = torch.bincount(drawn - first, minlength=LENGTH + 1 - first)
+        base = discount if strategy == "geometric" else 1.0
+        weights = base ** torch.arange(LENGTH + 1.0 - first)
+        expected = len(drawn) * weights / weights.sum()
+        chi2 += ((counts - expected) ** 2 / expected).sum()
         freedom += len(expected) - 1
     assert chi2 <= freedom + 5 * (2 * freedom) ** 0.5
 
 
-@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment, GoalSampler])
+@ALL_TRANSFORMS
 def test_geometric_goals_without_future_are_the_current_ones(hindsight):
-    steps, goal_steps = draw(hindsight, 0.0)
+    steps, goal_steps = draw(hindsight, "geometric", 0.0)
     assert torch.equal(steps, goal_steps)

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import (
-    LazyTensorStorage,
     ReplayBuffer,
     ReplayBufferEnsemble,
     SliceSampler,
@@ -172,33 +171,24 @@ def test_slices_with_goals_per_row_warn_once(unit):
     assert len(messages) == (unit == "row")
 
 
-def test_augment_under_a_slice_sampler_is_refused():
-    rb = buffer(HindsightAugment(reward_fn), sampler=slices())
-    with pytest.raises(RuntimeError, match=r'unit="slice"'):
-        rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
-
-
-def test_augment_on_two_dimensions_is_refused():
-    rb = buffer(HindsightAugment(reward_fn), ndim=2)
-    with pytest.raises(RuntimeError, match="ndim=1"):
-        rb.extend(Envs(2, [4]).chunk(8))
-
-
-def test_chunks_into_one_dimension_are_refused_at_once():
-    rb = buffer(HindsightRelabel(reward_fn))
-    with pytest.raises(RuntimeError, match=r"\[2, 8\] for ndim=1.*reshape.*ndim=2"):
-        rb.extend(Envs(2, [4]).chunk(8))
+@pytest.mark.parametrize(
+    ("hindsight", "options", "message"),
+    [
+        (HindsightAugment, {"sampler": slices()}, r'unit="slice"'),
+        (HindsightAugment, {"ndim": 2}, "ndim=1"),
+        (HindsightRelabel, {}, r"\[2, 8\] for ndim=1.*reshape.*ndim=2"),
+    ],
+)
+def test_layouts_that_are_refused_at_once(hindsight, options, message):
+    rb, data = buffer(hindsight(reward_fn), **options), Envs(2, [4]).chunk(8)
+    with pytest.raises(RuntimeError, match=message):
+        rb.extend(data.reshape(-1) if "sampler" in options else data)
 
 
 @pytest.mark.parametrize("cls", [TensorDictReplayBuffer, ReplayBuffer])
-@pytest.mark.parametrize("options", [{}, {"capacity": 1000}])
-def test_max_value_writer_is_refused(cls, options):
-    rb = cls(
-        storage=LazyTensorStorage(1000),
-        transform=HindsightRelabel(reward_fn, **options),
-        writer=TensorDictMaxValueWriter(rank_key=("next", "reward")),
-        batch_size=64,
-    )
+def test_max_value_writer_is_refused(cls):
+    writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
+    rb = buffer(HindsightRelabel(reward_fn), cls=cls, writer=writer)
     with pytest.raises(RuntimeError, match=r"round-robin.*TensorDictMaxValueWriter"):
         rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
 
@@ -335,11 +325,7 @@ def test_collector_with_a_flat_buffer_is_refused():
 @pytest.mark.parametrize("ndim", [1, 2])
 def test_multi_process_collector_with_the_buffer_is_refused(ndim):
     # A TensorDictReplayBuffer of ndim=2 fails at the first [num_envs, 1] by itself.
-    rb = ReplayBuffer(
-        storage=LazyTensorStorage(1000, ndim=ndim),
-        transform=HindsightRelabel(reward_fn),
-        batch_size=64,
-    )
+    rb = buffer(HindsightRelabel(reward_fn), ndim=ndim, cls=ReplayBuffer)
     message = "multi-process collector" if ndim == 2 else "replay_buffer="
     with pytest.raises(RuntimeError, match=message):
         MultiSyncCollector(
@@ -444,9 +430,7 @@ def test_data_that_exist_already(storage, layout, tmp_path):
     assert prepared.shape == (data.numel(),)
     if storage == "memmap":
         assert prepared["action"].data_ptr() == data["action"].data_ptr()
-    rb = TensorDictReplayBuffer(
-        storage=TensorStorage(prepared), transform=relabel, batch_size=256
-    )
+    rb = buffer(relabel, storage=TensorStorage(prepared), batch_size=256)
     for _ in range(20):
         batch = rb.sample()
         check_batch(batch, prepared, "future")

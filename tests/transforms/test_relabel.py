@@ -13,7 +13,6 @@ from torchrl.data import (
     ReplayBuffer,
     SamplerWithoutReplacement,
     SliceSampler,
-    TensorDictReplayBuffer,
 )
 from torchrl.data.replay_buffers import HERReplayBuffer
 from torchrl.data.replay_buffers.samplers import prioritized
@@ -33,21 +32,16 @@ from tests.transforms.identifiable import (
     reward_fn,
     terminated_fn,
 )
+from tests.transforms.pipelines import buffer
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 STRATEGIES = ["future", "final", "episode", "random"]
 
 
 def make_buffer(capacity=1000, *, ndim=1, sampler=None, batch_size=64, **options):
-    buffer_options = {
-        key: options.pop(key) for key in ("prefetch", "shared") if key in options
-    }
-    return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, ndim=ndim),
-        sampler=sampler,
-        transform=HindsightRelabel(reward_fn, **options),
-        batch_size=batch_size,
-        **buffer_options,
+    transform = HindsightRelabel(reward_fn, **options)
+    return buffer(
+        transform, capacity=capacity, ndim=ndim, sampler=sampler, batch_size=batch_size
     )
 
 
@@ -156,45 +150,6 @@ def test_share_and_position_of_relabelled_rows(her_ratio):
     assert (position <= 5 * error / len(mask) ** 0.5).all()
 
 
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("strategy", ["future", "episode"])
-def test_goals_are_uniform(finished, strategy):
-    torch.manual_seed(0)
-    length = 10
-    rb = make_buffer(1000, her_ratio=1.0, strategy=strategy, seed=1, batch_size=500)
-    rb.extend(Envs(3, [length if finished else 99]).chunk(length).reshape(-1))
-    counts = torch.zeros(length, length)
-    for _ in range(200):
-        batch = rb.sample()
-        step = batch["next", "achieved_goal"][:, 2].long() - 1
-        goal = batch["desired_goal"][:, 2].long() - 1
-        counts += torch.bincount(step * length + goal, minlength=length**2).view(
-            length, length
-        )
-    first = torch.arange(length) if strategy == "future" else torch.zeros(length)
-    for step in range(length):
-        drawn = counts[step, int(first[step]) :]
-        assert drawn.sum() == counts[step].sum()
-        expected = drawn.sum() / len(drawn)
-        chi2 = ((drawn - expected) ** 2 / expected).sum()
-        freedom = len(drawn) - 1
-        assert chi2 <= freedom + 5 * (2 * freedom) ** 0.5, f"step {step}"
-
-
-def test_random_goals_are_uniform_over_what_is_stored():
-    rb = make_buffer(40, her_ratio=1.0, strategy="random", seed=1, batch_size=400)
-    envs = Envs(2, [5])
-    for _ in range(6):
-        rb.extend(envs.chunk(5).reshape(-1))
-        rb.sample()
-    stored = rb.storage[:]["next", "achieved_goal"]
-    goals = torch.cat([rb.sample()["desired_goal"] for _ in range(100)])
-    counts = (goals[:, None] == stored).all(-1).float().sum(0)
-    expected = len(goals) / 40
-    assert counts.sum() == len(goals)
-    assert ((counts - expected) ** 2 / expected).sum() <= 39 + 5 * (2 * 39) ** 0.5
-
-
 def test_strategy_of_the_user():
     def next_step(step, first, end, generator):
         return torch.minimum(step + 1, end - 1)
@@ -269,10 +224,8 @@ def test_reward_fn_must_be_a_function():
 @pytest.mark.parametrize("name", ["reward_fn", "terminated_fn"])
 def test_functions_that_return_no_column_raise(name, values, got):
     functions = {"reward_fn": reward_fn, "terminated_fn": terminated_fn, name: values}
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100),
-        transform=HindsightRelabel(**functions, her_ratio=1.0),
-        batch_size=8,
+    rb = buffer(
+        HindsightRelabel(**functions, her_ratio=1.0), capacity=100, batch_size=8
     )
     with pytest.raises(ValueError, match=rf"{name}.*tensor.*\(.*, 1\), got {got}"):
         rb.extend(Envs(2, [4]).chunk(4).reshape(-1))
@@ -284,9 +237,7 @@ def test_other_types_are_cast():
         lambda achieved, desired: reward_fn(achieved, desired).double(),
         terminated_fn=lambda achieved, desired: terminated_fn(achieved, desired).int(),
     )
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100), transform=transform, batch_size=64
-    )
+    rb = buffer(transform, capacity=100)
     data = Envs(2, [5]).chunk(5).reshape(-1)
     data["next", "achieved_goal"] = data["next", "achieved_goal"].double()
     rb.extend(data)
@@ -317,7 +268,7 @@ def test_missing_entries_raise(key, later):
 
 
 def test_rows_stored_without_the_transform_raise(tmp_path):
-    plain = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=64)
+    plain = buffer(None, capacity=100)
     plain.extend(Envs(2, [5]).chunk(5).reshape(-1))
     plain.dumps(tmp_path)
     loaded = make_buffer(100)
@@ -429,9 +380,9 @@ def test_three_dimensional_data():
 
 
 def test_memmap_storage_and_reading_it_all(tmp_path):
-    rb = TensorDictReplayBuffer(
+    rb = buffer(
+        HindsightRelabel(reward_fn),
         storage=LazyMemmapStorage(60, scratch_dir=tmp_path),
-        transform=HindsightRelabel(reward_fn),
         batch_size=32,
     )
     envs = Envs(3, [5, 9])
@@ -462,9 +413,10 @@ def test_reading_one_row_or_all_of_two_dimensions():
 
 @pytest.mark.parametrize("strategy", ["future", "random"])
 def test_plain_replay_buffer(strategy):
-    rb = ReplayBuffer(
-        storage=LazyTensorStorage(50),
-        transform=HindsightRelabel(reward_fn, strategy=strategy),
+    rb = buffer(
+        HindsightRelabel(reward_fn, strategy=strategy),
+        capacity=50,
+        cls=ReplayBuffer,
         batch_size=32,
     )
     envs = Envs(3, [5, 9])
@@ -524,11 +476,10 @@ def test_padded_slices():
 )
 def test_prioritized_sampler():
     def make(transform):
-        return TensorDictReplayBuffer(
-            storage=LazyTensorStorage(100),
+        return buffer(
+            transform,
+            capacity=100,
             sampler=PrioritizedSampler(100, alpha=0.7, beta=0.5),
-            transform=transform,
-            batch_size=64,
         )
 
     rb, plain = make(HindsightRelabel(reward_fn, seed=0)), make(None)
@@ -536,24 +487,24 @@ def test_prioritized_sampler():
     for i in range(30):
         data = envs.chunk(4).reshape(-1)
         batches = []
-        for buffer in (rb, plain):
-            buffer.extend(data)
+        for replay in (rb, plain):
+            replay.extend(data)
             torch.manual_seed(i)
             np.random.seed(i)
-            batches.append(buffer.sample())
+            batches.append(replay.sample())
         batch, expected = batches
         check_batch(batch, rb.storage[:], "future")
         check_untouched(batch, rb.storage[:])
         for key in ("index", "priority_weight"):
             assert (batch[key] == expected[key]).all(), key
-        for buffer, sampled in zip((rb, plain), batches, strict=True):
+        for replay, sampled in zip((rb, plain), batches, strict=True):
             sampled["td_error"] = (sampled["index"] % 7 + 1).float()
-            buffer.update_tensordict_priority(sampled)
+            replay.update_tensordict_priority(sampled)
     assert batch["priority_weight"].unique().numel() > 1
 
 
 def test_prefetch_beside_writing():
-    rb = make_buffer(100, prefetch=3)
+    rb = buffer(HindsightRelabel(reward_fn), capacity=100, prefetch=3)
     envs = Envs(3, [5, 9, 30])
     failures = []
 
@@ -663,7 +614,7 @@ def test_seed_does_not_touch_torchs_generator():
         index = rb.sample()["index"]
         return index, torch.rand(3)
 
-    plain = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=64)
+    plain = buffer(None, capacity=100)
     rb = make_buffer(100, seed=0)
     data = Envs(3, [5]).chunk(10).reshape(-1)
     plain.extend(data)
@@ -694,9 +645,10 @@ def test_multi_step_raises(nested, late):
     if nested:
         relabel = Compose(relabel)
         multi_step = Compose(DoubleToFloat(), Compose(multi_step))
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(100, ndim=2),
-        transform=Compose(relabel) if late else Compose(relabel, multi_step),
+    rb = buffer(
+        Compose(relabel) if late else Compose(relabel, multi_step),
+        capacity=100,
+        ndim=2,
         batch_size=8,
     )
     envs = Envs(3, [5])
@@ -736,10 +688,9 @@ def test_default_device(seed, layout):
 @pytest.mark.parametrize("data_device", ["cpu", "cuda"])
 @pytest.mark.parametrize("storage_device", ["cpu", "cuda"])
 def test_devices(data_device, storage_device):
-    rb = TensorDictReplayBuffer(
+    rb = buffer(
+        HindsightRelabel(reward_fn),
         storage=LazyTensorStorage(100, device=storage_device),
-        transform=HindsightRelabel(reward_fn),
-        batch_size=64,
     )
     envs = Envs(3, [5, 9])
     for _ in range(30):
@@ -757,9 +708,7 @@ def test_nested_goal_keys():
         goal_key=("goals", "desired"),
         achieved_goal_key=("goals", "achieved"),
     )
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(30), transform=transform, batch_size=30
-    )
+    rb = buffer(transform, capacity=30, batch_size=30)
     data = Envs(3, [5]).chunk(10).reshape(-1)
     for part in (data, data["next"]):
         part["goals"] = TensorDict(

@@ -4,9 +4,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from tests.transforms.identifiable import Envs, name_goals, reward_fn
+from tests.transforms.pipelines import buffer
 from torch_panda.transforms import HindsightRelabel
 
 NAMES = [
@@ -24,9 +24,9 @@ SAMPLE = 4000
 def sample(capacity, lengths, **options):
     """Returns a sample, the desired goals as stored, and all that is stored."""
     torch.manual_seed(0)
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity),
-        transform=HindsightRelabel(reward_fn, seed=0, **options),
+    rb = buffer(
+        HindsightRelabel(reward_fn, seed=0, **options),
+        capacity=capacity,
         batch_size=SAMPLE,
     )
     envs = Envs(4, lengths)
@@ -134,8 +134,6 @@ def test_the_users_own_strategy_in_a_mixture():
 def test_goals_of_bfloat16_are_refused(key):
     data = name_goals(Envs(2, [5]).chunk(5)).reshape(-1)
     data[key] = data[key].bfloat16()
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(99), transform=HindsightRelabel(reward_fn)
-    )
+    rb = buffer(HindsightRelabel(reward_fn), capacity=99)
     with pytest.raises(ValueError, match=r"bfloat16.*float32"):
         rb.extend(data)

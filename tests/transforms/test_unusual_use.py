@@ -5,7 +5,7 @@ import time
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage
 from torchrl.envs import Compose, RewardScaling
 
 from tests.transforms.identifiable import Envs, name_goals, reward_fn, terminated_fn
@@ -66,10 +66,9 @@ class SlowStorage(LazyTensorStorage):
 
 @pytest.mark.parametrize("strategy", ["episode", "random"])
 def test_nothing_is_forgotten_while_it_is_written(strategy):
-    rb = TensorDictReplayBuffer(
+    rb = buffer(
+        HindsightRelabel(reward_fn, strategy=strategy, her_ratio=1.0),
         storage=SlowStorage(100_000),
-        transform=HindsightRelabel(reward_fn, strategy=strategy, her_ratio=1.0),
-        batch_size=64,
         prefetch=3,
     )
     rb.extend(play(10))
