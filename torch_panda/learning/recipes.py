@@ -23,7 +23,7 @@ from torch_panda.tasks import (
     Task,
 )
 
-# Shared by all tasks with objects.
+# Shared by the recipes of all tasks with objects but Slide.
 OBJECT: dict[str, Any] = {
     "num_envs": 8,
     "gamma": 0.95,
@@ -32,13 +32,13 @@ OBJECT: dict[str, Any] = {
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
 }
-# Options that plots do not name. Runs that differ only in these options belong to the
-# same line of a plot.
+# Options that the legend of a plot does not name. Runs of one task and algorithm that
+# differ only in these options belong to the same line of a plot.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
     *("out", "resume", "device", "video", "imports"),
 }
-# Options that are left out under joint control, because they need the end-effector's.
+# Options that need a robot whose control type is "ee". Other robots leave them out.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
 RECIPES: dict[type[Task], dict[str, Any]] = {
     Reach: {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
@@ -108,16 +108,33 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     },
 }
 
-# The changes that "sample-efficient" makes to the recipe of any task. None of them is
-# enough by itself.
+# Changes to these recipes where success ends an episode, as in -v3. There, a puck that
+# slides through its goal succeeds. So Slide needs fewer steps, and it takes more
+# gradient steps and explores by random points.
+CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
+    Push: {"anneal_lr": True, "total_steps": 80_000},
+    Slide: {
+        "exploration": "points",
+        "network": "layer-norm",
+        "gamma": 0.95,
+        "batch_size": 256,
+        "target_interval": 1,
+        "updates_per_step": 0.5,
+        "total_steps": 160_000,
+        "eval_interval": 10_000,
+    },
+}
+# The changes that "sample-efficient" makes to the recipe of any task. Push needs all of
+# them for its success after 20,000 steps.
 SAMPLE_EFFICIENT: dict[str, Any] = {
     "exploration": "points",
     "updates_per_step": 2.0,
     "network": "layer-norm",
     "anneal_lr": False,
 }
-# Its further changes to single tasks. Random points lift the cube of PickAndPlace often
-# enough, so that no episode needs to start with the cube in the hand.
+# Further changes that "sample-efficient" makes to single tasks. On its way to random
+# points, the hand lifts the cube of PickAndPlace often enough, so no episode needs to
+# start with the cube in the hand.
 SAMPLE_EFFICIENT_CHANGES: dict[type[Task], dict[str, Any]] = {
     Push: {"total_steps": 30_000, "eval_interval": 2_500},
     PickAndPlace: {
@@ -146,6 +163,8 @@ def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
     registration = find_registration(env_id)
     task = type(registration.make_task())
     recipe = RECIPES.get(task, {})
+    if registration.terminate_on_success:
+        recipe = recipe | CHANGES_IF_SUCCESS_ENDS.get(task, {})
     if preset == "sample-efficient":
         recipe = recipe | SAMPLE_EFFICIENT | SAMPLE_EFFICIENT_CHANGES.get(task, {})
     if registration.make_robot().control_type == "ee":
