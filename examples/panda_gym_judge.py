@@ -13,6 +13,8 @@ import gymnasium
 import panda_gym
 import torch
 import tyro
+from panda_gym.envs import panda_tasks
+from panda_gym.pybullet import PyBullet
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -22,12 +24,21 @@ from torch_panda.learning.evaluation import Evaluation
 OBSERVED = ("observation", "achieved_goal", "desired_goal")
 
 
+class WithoutTextures(PyBullet):
+    """panda-gym's wheel misses the texture of Flip's cube; physics does not need it."""
+
+    def create_box(self, body_name: str, *args: object, **kwargs: object) -> None:
+        """Create a box without a texture."""
+        super().create_box(body_name, *args, **{**kwargs, "texture": None})
+
+
 @torch.no_grad()
 @set_exploration_type(ExplorationType.DETERMINISTIC)
 def judge(policy_name: str, env_id: str, episodes: int, seed: int) -> Evaluation:
     """Play episodes of panda-gym with a policy of `torch_panda.load_policy`."""
     policy = torch_panda.load_policy(policy_name)
     flags, returns, lengths = [], [], []
+    panda_tasks.PyBullet = WithoutTextures
     env = gymnasium.make(env_id)
     for episode in range(episodes):
         state, info = env.reset(seed=seed + episode)

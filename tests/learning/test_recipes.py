@@ -40,12 +40,11 @@ def test_every_task_has_a_recipe():
     for env_id in torch_panda.ENV_IDS:
         assert find_recipe(env_id)
     push = RECIPES[torch_panda.Push]
-    assert find_recipe("PandaPush-v1") == find_recipe("PandaPushDense-v1") == push
-    assert find_recipe("PandaPush-v3") == {
-        **push,
-        **CHANGES_IF_SUCCESS_ENDS[torch_panda.Push],
-    }
+    assert find_recipe("PandaPush-v1") == find_recipe("PandaPushDense-v3") == push
     assert find_recipe("PandaPickAndPlace-v1") != push
+    changes = CHANGES_IF_SUCCESS_ENDS[torch_panda.Slide]
+    slide = RECIPES[torch_panda.Slide]
+    assert find_recipe("PandaSlide-v3") == {**slide, **changes} != slide
 
 
 @pytest.mark.parametrize(
@@ -94,13 +93,3 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(
     data = next(iter(run.collector))
     run.close()
     assert data.shape == (2, steps)
-
-
-@pytest.mark.parametrize("continues", [False, True])
-def test_training_episodes_of_v3_may_continue_after_success(continues, tmp_path):
-    args = Args(env_id="PandaPush-v3", num_envs=32, continue_after_success=continues)
-    run = Run(args, tmp_path)
-    end = next(iter(run.collector))["next"]
-    run.close()
-    assert end["success"].any()
-    assert end["terminated"].any() != continues

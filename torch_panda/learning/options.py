@@ -58,9 +58,6 @@ class Args(Hyperparameters):
     """fraction of training episodes that start in the middle of the task: the hand is
     at an object or holds it, or the first cube of Stack is at its goal. If it is above
     0, all episodes last at most 50 steps"""
-    continue_after_success: bool = False
-    """let training episodes continue after success, although success ends the episodes
-    of the task (-v3). Evaluations end as the task says"""
     randomize: Factor = 1.0
     """draw the masses and frictions of objects and table for every training episode,
     between 1 / factor and factor times the task's values"""

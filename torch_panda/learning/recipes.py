@@ -112,7 +112,6 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
 # slides through its goal succeeds. So Slide needs fewer steps, and it takes more
 # gradient steps and explores by random points.
 CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
-    Push: {"anneal_lr": True, "total_steps": 80_000},
     Slide: {
         "exploration": "points",
         "network": "layer-norm",

@@ -72,13 +72,11 @@ class Run:
             randomize = Randomization(
                 object_mass=factors, object_friction=factors, table_friction=factors
             )
-        ends = {"terminate_on_success": False} if args.continue_after_success else {}
         self.env = make(
             args.env_id,
             num_envs=args.num_envs,
             device=args.device,
             randomize=randomize,
-            **ends,
         )
         self.agent = make_agent(self.env, args)
         steps = self.env.max_episode_steps
