@@ -137,8 +137,9 @@ def test_loading_and_evaluating_need_no_extra():
 
 
 def test_ids_without_a_policy_name_those_with_one():
-    with pytest.raises(ValueError, match=r"no policy 'PandaPush-v3': .* PandaPush-v1"):
-        torch_panda.load_policy("PandaPush-v3")
+    message = r"no policy 'PandaPushJoints-v3': .* PandaPush-v1"
+    with pytest.raises(ValueError, match=message):
+        torch_panda.load_policy("PandaPushJoints-v3")
     with pytest.raises(TypeError, match=r"takes the folder of a run.* got None"):
         torch_panda.load_policy(None)
 
