@@ -343,7 +343,7 @@ def _is_in_copy(column: int, columns: Tensor, entry: Tensor) -> bool:
 
 
 def _is_rounding_error(errors: Tensor, columns: Tensor) -> Tensor:
-    """Returns for which columns the errors are as small as rounding errors of float32.
+    """Returns whether all errors of a column are as small as float32's rounding errors.
 
     Args:
         errors: Deviations from the columns, (n, m).

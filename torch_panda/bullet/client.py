@@ -399,7 +399,8 @@ class PhysicsClient:
         """Set the friction [N m] or [N] of a joint that nothing else controls.
 
         Bullet imitates friction by a motor. The motor's target velocity is 0, and its
-        maximum force is ``force``. Without this call, it is about 1 N.
+        maximum force is ``force``. Without this call, the
+        maximum force of this motor is about 1 N.
 
         Raises:
             ValueError: the force is negative or not finite.

@@ -154,9 +154,9 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # An earlier step, with another kind of control, may have run in Python
-                # threads. After a first Ctrl-C, the pool still waits for its threads.
-                # A second Ctrl-C ends this waiting, so they may still be running.
+                # Python threads may still be running an earlier step with another kind
+                # of control, because a second Ctrl-C makes `WorkerPool.run` return
+                # before its threads finish. Wait for them.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -263,7 +263,7 @@ class VectorSimulation:
         return BroadPhase(client)
 
     def _check_joints(self) -> None:
-        """Make sure that the scene lists all joints of the robot's state."""
+        """Check that the scene lists as many joints as Bullet's state of the robot."""
         scene = self.scene
         count = len(self._clients[0].state(scene.robot).joint_positions)
         if count != len(scene.joints):

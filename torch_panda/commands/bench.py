@@ -45,7 +45,7 @@ from torch_panda.transforms import HindsightRelabel
 OURS = "torch_panda"
 Other = Literal[
     "fast",
-    "own-solver",
+    "bullet-solver",
     "bare-bullet",
     "async",
     "sb3",
@@ -289,7 +289,9 @@ CONTENDERS = {
     "fast": Contender(
         'torch_panda, physics="fast"', partial(_make_ours, physics="fast")
     ),
-    "own-solver": Contender("torch_panda, Bullet's own solver", _make_ours, "bullet"),
+    "bullet-solver": Contender(
+        "torch_panda, Bullet's own solver", _make_ours, "bullet"
+    ),
     "bare-bullet": Contender("bare Bullet, C threads", _make_bare_bullet, "bullet"),
     "async": Contender(
         "panda-gym, AsyncVectorEnv", partial(_make_async, _make_panda_gym_env)

@@ -3,10 +3,10 @@
     python -m torch_panda distributed --num-workers 4 --cpus-per-worker 8 --address auto
 
 Each worker steps `num_envs` environments in `cpus_per_worker` threads and sends its
-transitions to the learner. The learner stores the transitions of all workers in one
-replay buffer, takes gradient steps, and sends the new weights back to this worker. The
-other workers continue meanwhile, and batches arrive in varying order. So two runs with
-the same seed differ.
+transitions to the learner. When a batch of a worker arrives, the learner adds it to
+one replay buffer for all workers, takes gradient steps, and sends the new weights back
+to that worker. The other workers continue meanwhile, and batches arrive in varying
+order. So two runs with the same seed differ.
 
 Without `--address` the workers run on this machine. To start a cluster of machines that
 all have torch_panda and the same version of Ray:

@@ -265,9 +265,10 @@ class EpisodeObserver:
             is_inside = all(0 <= index < size for index in self._goal_indices)
             if len(self._goal_indices) != task.goal_dim or not is_inside:
                 raise ValueError(
-                    f"{task_name}.goal_entries must name {task.goal_dim} of the "
-                    f"{robot.observation_dim} entries of the robot and the "
-                    f"{task.observation_dim} of the task, got {task.goal_entries}"
+                    f"{task_name}.goal_entries must name {task.goal_dim} entries of an "
+                    f"observation; the robot's part has {robot.observation_dim} "
+                    f"entries and the task's has {task.observation_dim}, got "
+                    f"{task.goal_entries}"
                 )
 
 

@@ -101,7 +101,8 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
         goal: Quaternion of the goal, (..., 4).
         table: Table on which the cube spins.
     """
-    # The hand can catch the cube now, on the way, or after its spin: (..., 3, 4).
+    # The hand can catch the cube now, halfway through its spin, or after its spin:
+    # (..., 3, 4).
     ahead = (spin * spin.abs() / (2 * table.deceleration)).clamp(-2.0, 2.0)
     ahead = ahead[..., None, :] * ahead.new_tensor(((0.0,), (0.5,), (1.0,)))
     lying = straighten(compose(turn(2, ahead), cube[..., None, :]))
@@ -120,7 +121,7 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
 
 
 def descend(ee: Tensor, point: Tensor) -> Tensor:
-    """Move with open fingers to a point from above, past a cube beside it."""
+    """Descend to a point, with open fingers that pass on both sides of a cube."""
     offset = point - ee
     # Along x the fingers pass on both sides of the cube. Along y they would hit it.
     off = (offset[..., 1:2].abs() - 0.01).clamp(min=0.0)
@@ -162,10 +163,10 @@ def grasp(
     aside: Tensor,
     ready: Tensor,
 ) -> Tensor:
-    """Move the open fingers beside the cube's centre, and close them if it is ready.
+    """Move the open fingers beside the cube's centre, and close them there.
 
-    They close at the distance ``aside`` from the centre along x [m], (n, 1), if
-    ``ready``, (n, 1) bool.
+    They close at the distance ``aside`` from the centre along x [m], (n, 1), in the
+    environments where ``ready``, (n, 1) bool, is true.
     """
     x, y, z = (position + 0.04 * velocity).split(1, -1)
     point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)

@@ -14,8 +14,9 @@ GAIN = 0.8 / 0.05  # action per metre of offset; a step covers 0.8 of the offset
 GRIPPER = 0.2  # distance by which an action of 1 opens the fingers [m]
 OPEN = 0.075  # distance between the fingers before a grasp [m]
 CUBE = 0.04  # edge length of a cube [m]
-# Deceleration of a cube that slides on the table of -v3 [m/s^2]: the friction of the
-# contact is 0.5 * 0.5. The cubes of Stack-v1 stop sooner, with 5 * 0.1.
+# Deceleration of a cube that slides on the table of -v3 [m/s^2]: the friction of a
+# contact is the product of the frictions of cube and table, 0.5 * 0.5. In Stack-v1 it
+# is 5 * 0.1, so cubes stop sooner.
 DECELERATION = 0.25 * 9.81
 
 
@@ -74,7 +75,8 @@ def push_to(ee: Tensor, cube: Tensor, velocity: Tensor, goal: Tensor) -> Tensor:
     remaining = distance - dot(velocity, velocity) / (2 * DECELERATION)
     step = (0.5 * remaining).clamp(0.0, 0.025) * direction - lateral
     advance = move(torch.cat((step, height - ee[..., 2:]), -1))
-    # Leave a cube within 3 cm alone, because another approach would disturb it.
+    # Leave a cube within 3 cm of the goal alone, because another approach would
+    # disturb it.
     done = (remaining < 0.01) | ~pushing & (distance < 0.03)
     action = torch.where(pushing, advance, go_over(ee, behind, 0.06))
     return torch.where(done, 0.0, action)

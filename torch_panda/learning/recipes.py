@@ -109,8 +109,9 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
 }
 
 # Changes to these recipes where success ends an episode, as in -v3. There, a puck that
-# slides through its goal succeeds. So Slide needs fewer steps, and it takes more
-# gradient steps and explores by random points.
+# slides through its goal succeeds. So Slide needs fewer environment
+# steps. It takes more gradient steps per environment step, and explores by random
+# points.
 CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
     Slide: {
         "exploration": "points",
@@ -123,8 +124,8 @@ CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
         "eval_interval": 10_000,
     },
 }
-# The changes that "sample-efficient" makes to the recipe of any task. Push needs all of
-# them for its success after 20,000 steps.
+# The changes that "sample-efficient" makes to the recipe of any task. Without
+# any one of them, Push has less success after 20,000 steps.
 SAMPLE_EFFICIENT: dict[str, Any] = {
     "exploration": "points",
     "updates_per_step": 2.0,

@@ -85,7 +85,8 @@ class Run:
         steps_per_iteration = args.num_envs * steps
         self.buffer = make_buffer(
             self.env,
-            args.total_steps + steps_per_iteration,  # the last one may go further
+            # The last iteration may go past `total_steps`.
+            args.total_steps + steps_per_iteration,
             her=args.her,
             desired_ratio=args.desired_ratio,
             seed=args.seed,

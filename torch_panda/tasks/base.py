@@ -188,8 +188,8 @@ class Task(Configured, ABC):
         """Change the physics of an environment before each of its episodes.
 
         A hook. It runs in the thread that resets the environment. Its changes may
-        depend on ``rng`` only. They last until the next change, so a value that it sets
-        in one episode it must set in every episode.
+        depend on ``rng`` only. They last until the next change, so if it sets a
+        property in one episode, it must set this property in every episode.
 
         Args:
             client: Client of the environment; see `PhysicsClient.set_dynamics`.

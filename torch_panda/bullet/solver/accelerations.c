@@ -1,5 +1,5 @@
 /*
- * Forward dynamics of a robot: its joint accelerations by forces and gravity.
+ * Forward dynamics of a robot: the joint accelerations that forces and gravity cause.
  *
  * Functions here, and their counterparts in Bullet
  * ------------------------------------------------
@@ -64,7 +64,8 @@ struct inertia {
     struct matrix top_left, top_right, bottom_left;
 };
 
-/* Numbers of the links. In arrays with one more entry, entry 0 is the base. */
+/* What the three visits compute for each link. In arrays of MAX_LINKS + 1 entries,
+   entry 0 is the base and entry i + 1 is link i. */
 struct work {
     struct matrix rotation[MAX_LINKS + 1];   /* from the parent */
     struct matrix from_world[MAX_LINKS + 1]; /* rotation */
@@ -73,7 +74,7 @@ struct work {
     struct spatial_pair force[MAX_LINKS + 1];
     struct inertia inertia[MAX_LINKS + 1];
     struct spatial_pair response[MAX_LINKS]; /* force that accelerates the joint by 1 */
-    double y[MAX_LINKS];                     /* of each joint, as Bullet calls it */
+    double y[MAX_LINKS];                     /* Bullet's Y: torque that moves the joint */
     struct spatial_pair acceleration[MAX_LINKS + 1];
     double joint_acceleration[MAX_LINKS];
     char is_needed[MAX_LINKS]; /* whether the link or a descendant has a joint */
@@ -136,7 +137,8 @@ static inline struct spatial_pair rotate_back(const struct matrix *m,
         r[0].zw[0] * a.x + r[1].zw[0] * a.y + r[2].zw[0] * a.z};
 }
 
-/* The motion of a link at `arm` that moves with its parent. */
+/* The motion of a link whose joint does not move, from the motion of its parent. `arm`
+   leads from the parent to the link. */
 static inline struct spatial_pair move_motion(const struct matrix *rotation,
                                               struct vector3 arm,
                                               struct spatial_pair parent) {
@@ -193,7 +195,7 @@ static inline struct matrix minus(struct matrix a, const struct matrix *b) {
     return a;
 }
 
-/* Adds a matrix to `sum`, seen from the parent. */
+/* Converts a matrix from the link's frame to the parent's, and adds it to `sum`. */
 static inline void add_turned(struct matrix *sum, const struct matrix *rotation,
                               const struct matrix *m) {
     const struct matrix half = multiply_back(rotation, m);
@@ -264,7 +266,8 @@ static inline pair safe_norm(struct spatial_pair a) {
     return (pair)_mm_and_pd(_mm_sqrt_pd((__m128d)square), is_large);
 }
 
-/* The force on a link alone: applied from outside, damping, and of its rotation. */
+/* The force of one link without its descendants, from outside forces, from damping and
+   from its rotation. */
 static inline struct spatial_pair own_force(const struct link *link, pair damping,
                                             const struct matrix *from_world,
                                             struct spatial_pair velocity) {

@@ -6,8 +6,9 @@
  *
  * What is not replaced
  * --------------------
- * The shares are those of a step of 16 Push environments with all replacements (perf;
- * each function with the functions that it calls).
+ * The percentages are shares of the time of a step of 16 Push environments with all
+ * replacements, measured with perf. The share of a function includes the functions that
+ * it calls.
  *
  * AABBs and their pairs, 14 %. btDbvtBroadphase::setAabb is virtual. But the shape of its
  * tree decides the order of pairs, and this order decides the results. A replacement
@@ -31,7 +32,7 @@ enum { VERSION = 5 }; /* native.py refuses a library of another version */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, EXTERNAL_FORCES,
        NUM_FUNCTIONS };
 
-enum { MAX_BODIES = 16 }; /* of a world that are accelerated here */
+enum { MAX_BODIES = 16 }; /* of a world; Bullet accelerates further bodies */
 
 /* btSequentialImpulseConstraintSolver::solveGroupCacheFriendlyIterations */
 typedef double iterations_function(struct solver *, struct collision_object **, int,
@@ -47,7 +48,7 @@ typedef void rows_function(void *, struct array *, struct jacobian_data *,
 /* btMultiBodyDynamicsWorld::solveExternalForces */
 typedef void forces_function(struct world *, const struct solver_info *);
 
-/* Whose functions run in a thread. */
+/* Whether a thread runs Bullet's functions or the replacements. */
 enum mode {
     FOLLOW, /* those that solver_enable chose for the process */
     PROBE,  /* Bullet's, while the layout of Bullet's structs is checked */
@@ -77,7 +78,8 @@ static int enabled; /* whether threads in mode FOLLOW use this solver */
 static __thread enum mode mode;
 static __thread struct counts counts;
 static __thread struct expectation expectation;
-/* The responses of the group whose rows `convert` creates in this thread, else NULL. */
+/* The responses of a group while `convert` lets Bullet create the rows of its joints in
+   this thread, and NULL at all other times. */
 static __thread struct responses **responses;
 
 static int is_active(void) {
@@ -115,10 +117,11 @@ static double iterations(struct solver *solver, struct collision_object **bodies
 /*
  * Creates the rows of a group: first those of contacts, then those of joints.
  *
- * Bullet's function creates both in one call. Here, it is called for each manifold that
- * convert_manifold refuses, without joints. A last call without manifolds creates the
- * rows of the joints: in it, Bullet calls motor_rows and limit_rows below for each
- * joint. They share the responses of the bodies through the variable `responses`.
+ * Bullet's function creates both in one call. Here, convert_manifold creates the rows of
+ * contacts. For each manifold that it refuses, Bullet's function is called with this
+ * manifold alone and without joints. A last call, with the joints and without manifolds,
+ * makes Bullet call motor_rows and limit_rows below for each joint. These two get the
+ * responses of the bodies from the variable `responses`.
  */
 static void convert(struct solver *solver, struct manifold **manifolds,
                     int num_manifolds, const struct solver_info *info) {
@@ -169,9 +172,10 @@ static void limit_rows(void *limit, struct array *rows, struct jacobian_data *da
 }
 
 /*
- * Marks the bodies that `accelerate` can accelerate as asleep.
+ * Marks as asleep all bodies that `accelerate` can handle.
  *
- * Returns their number, and stores them and their activation states.
+ * Returns their number. Stores the bodies in `sleepers`, and their previous activation
+ * states in `states`.
  */
 static int put_to_sleep(const struct world *world, struct multi_body **sleepers,
                         int *states) {

@@ -6,9 +6,10 @@ every observed step costs at most 1. That is the optimal cost, because paths of 
 bound d from above. A Lagrange multiplier lambda, which is learned too, enforces the
 bound on steps. d is an interval quasimetric embedding, IQE (arXiv 2211.15120).
 
-The paper's policy descends d through a learned model of the dynamics ("descend"). This
-model needs more gradient steps than d. So by default the policy imitates actions in
-proportion to exp(alpha * progress), as OGBench's option "awr" ("imitate").
+With ``actor_loss="descend"``, the paper's policy descends d through a learned model of
+the dynamics. This model needs more gradient steps than d. So the default is "imitate":
+the policy imitates actions in proportion to exp(alpha * progress), as with OGBench's
+option "awr".
 
 The paper's goals are states. Here a goal is a part of a state, so goals have an encoder
 of their own, and a step from each state to the goal that it achieves costs 0.
@@ -51,10 +52,11 @@ OFFSET, BETA = 50.0, 0.1
 class QRLHyperparameters(OfflineHyperparameters):
     """Hyperparameters of QRL.
 
-    `imitation` is OGBench's alpha for cubes and play, and `num_components` is half of
-    OGBench's. For noisy data, OGBench has an alpha of 0.03. With that, the policy is
-    too fast at the goal and leaves it again: its loss divides costs by their mean, and
-    our tasks take fewer steps than OGBench's, so the slope of one step weighs more.
+    `imitation` is what OGBench calls alpha, with its value for cube tasks and play
+    data; `num_components` is half of OGBench's. For noisy data, OGBench has 0.03. With
+    that, our policy is too fast at the goal and leaves it again. A probable reason is
+    that its loss divides costs by their mean: our tasks take fewer steps, so the mean
+    is smaller, and the saving of one step weighs more against imitation.
     """
 
     algo: Literal["qrl"] = "qrl"
@@ -175,7 +177,8 @@ class IQE(nn.Module):
         The arguments have the shape (..., components * INTERVALS).
         """
         x, y = (values.unflatten(-1, (-1, INTERVALS)) for values in (x, y))
-        # From the lowest start on, an interval adds its part beyond the ends so far.
+        # In the order of their starts, each interval adds to the union the part beyond
+        # the largest end of the intervals before it.
         start, order = x.sort(dim=-1)
         end = torch.maximum(x, y).gather(-1, order)
         covered = torch.cat((start[..., :1], end.cummax(-1).values[..., :-1]), -1)
