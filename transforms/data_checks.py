@@ -244,9 +244,9 @@ class DataCheck:
     def _check_rewards(self, rows: TensorDictBase) -> None:
         """Checks that the stored rewards are those of `reward_fn`.
 
-        If they differ, this check looks for a factor and a constant with stored =
-        factor * `reward_fn` + constant. If it finds them, the rewards were scaled,
-        which is an error. Otherwise it warns.
+        If they differ, this check fits a factor and a constant: stored reward = factor
+        * `reward_fn` + constant. An exact fit shows that the rewards were scaled or
+        shifted, so the check raises an error. Without such a fit, the check warns.
 
         Raises:
             ValueError: the rewards were scaled or shifted.

@@ -175,7 +175,8 @@ class EpisodeObserver:
         """``terminated``, ``truncated`` and ``done``, (n, 1) bool."""
         terminated = torch.zeros_like(success)
         if self._terminate_on_success:
-            terminated = success & (step_count > 0)  # none ends before a step
+            # No episode ends before its first step.
+            terminated = success & (step_count > 0)
         if self._has_failure:
             failure = self._task.failure(self._simulation)
             terminated = terminated | failure & (step_count > 0)

@@ -64,8 +64,8 @@ struct inertia {
     struct matrix top_left, top_right, bottom_left;
 };
 
-/* What the three visits compute for each link. In arrays of MAX_LINKS + 1 entries,
-   entry 0 is the base and entry i + 1 is link i. */
+/* Results of the three visits of each link. Arrays of MAX_LINKS + 1 entries begin with
+   the base, so that entry i + 1 belongs to link i. */
 struct work {
     struct matrix rotation[MAX_LINKS + 1];   /* from the parent */
     struct matrix from_world[MAX_LINKS + 1]; /* rotation */

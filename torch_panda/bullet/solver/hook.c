@@ -4,8 +4,8 @@
  * It replaces pointers in memory. It changes no machine code and no file. The loader made
  * the pages of the vtables read-only, so `store` makes a page writable for a moment.
  *
- * What is not replaced
- * --------------------
+ * Functions that are not replaced
+ * -------------------------------
  * The percentages are shares of the time of a step of 16 Push environments with all
  * replacements, measured with perf. The share of a function includes the functions that
  * it calls.

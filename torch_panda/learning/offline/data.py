@@ -23,8 +23,7 @@ class OfflineData:
         data: Transitions (n,) in the order of time, with ``observation``, ``action``,
             ``desired_goal``, ``("collector", "traj_ids")``, and under ``next``
             ``observation``, ``achieved_goal``, ``desired_goal``, ``reward``,
-            ``terminated`` and ``done``. All rows of an episode are
-            consecutive.
+            ``terminated`` and ``done``. The rows of an episode are consecutive.
         env: Environment of the task.
         goals: Strategies of the goals; the first one is that of the values.
         discount: Discount of the strategy "geometric".
