@@ -1,6 +1,6 @@
 """Recipes: the options of the presets of ``train`` for each task.
 
-``--preset tuned`` learns a task in the least time by the clock. ``--preset
+``--preset tuned`` learns a task in the least wall-clock time. ``--preset
 sample-efficient`` learns it in the fewest environment steps, with more gradient steps.
 
 An option that is not in a recipe keeps its default, which is the value of the panda-gym
@@ -32,18 +32,19 @@ OBJECT: dict[str, Any] = {
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
 }
-# Options that the legend of a plot does not name. Runs of one task and algorithm that
-# differ only in these options belong to the same line of a plot.
+# Options that `find_changes` leaves out. The legend of a plot names the algorithm
+# beside the result of `find_changes`. Runs of one task and algorithm that differ only
+# in the other options listed here belong to the same line.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
     *("out", "resume", "device", "video", "imports"),
 }
-# Options that need a robot whose control type is "ee". Other robots leave them out.
+# Options that need the control type "ee". `find_recipe` drops them for other robots.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
 RECIPES: dict[type[Task], dict[str, Any]] = {
     Reach: {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
-    # With 0 to 50 % random actions, learning needs half as many steps as with 30 to
-    # 100 %.
+    # The first environment takes no random actions, and the last one takes 50 %. If
+    # they take 30 and 100 %, as in `OBJECT`, learning needs twice as many steps.
     Push: {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
     # The goals are out of the arm's reach and rarely achieved, so half of the hindsight
     # goals are desired goals of other transitions. There are few random actions,
@@ -108,9 +109,9 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     },
 }
 
-# Changes to these recipes where success ends an episode, as in -v3. There, a puck that
-# slides through its goal succeeds. So Slide needs fewer environment
-# steps. It takes more gradient steps per environment step, and explores by random
+# Changes to these recipes for ids whose episodes end with success, such as -v3. There,
+# a puck that slides through its goal succeeds. So Slide needs fewer environment steps.
+# The recipe takes more gradient steps per environment step, and explores towards random
 # points.
 CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
     Slide: {
@@ -124,8 +125,9 @@ CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
         "eval_interval": 10_000,
     },
 }
-# The changes that "sample-efficient" makes to the recipe of any task. Without
-# any one of them, Push has less success after 20,000 steps.
+# The changes that "sample-efficient" makes to the recipe of any task. Push has less
+# success after 20,000 steps if one of the first three is left out. The fourth keeps the
+# learning rate constant where a recipe anneals it, as that of PickAndPlace does.
 SAMPLE_EFFICIENT: dict[str, Any] = {
     "exploration": "points",
     "updates_per_step": 2.0,
@@ -154,8 +156,8 @@ def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
         preset: "tuned", or "sample-efficient".
 
     Returns:
-        Options by name. For a task of a user, "tuned" has none, and "sample-efficient"
-        has those that it changes for all tasks.
+        The options that differ from their defaults, by name. For a user's own task,
+        "tuned" changes none, and "sample-efficient" those of `SAMPLE_EFFICIENT`.
 
     Raises:
         ValueError: The id is unknown.
