@@ -6,7 +6,7 @@ import torch
 import torch_panda
 from tests.learning.episodes import play_randomly
 from torch_panda.learning import buffers
-from torch_panda.learning.buffers import has_moved, make_buffer, select_episodes
+from torch_panda.learning.buffers import has_moved, make_buffer, select_sequences
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_kinds_of_hindsight(stack, her, expected):
     data = play_randomly(stack)
     own = data["desired_goal"][:, 0]
     buffer = make_buffer(stack, 1000, her=her, seed=0)
-    buffer.extend(select_episodes(data, 1.0).reshape(-1))
+    buffer.extend(select_sequences(data, 1.0).reshape(-1))
     first, second = relabelled(buffer.sample(4000), own).T
     result = [first & ~second, second & ~first, first & second]
     # Hindsight goals equal achieved goals, which never equal the original ones here.
@@ -47,7 +47,7 @@ def test_desired_goals_of_others(stack):
     data = play_randomly(stack)
     own = data["desired_goal"][:, 0]
     buffer = make_buffer(stack, 1000, desired_ratio=0.5, seed=0)
-    buffer.extend(select_episodes(data, 1.0).reshape(-1))
+    buffer.extend(select_sequences(data, 1.0).reshape(-1))
     batch = buffer.sample(4000)
     goal, episode = batch["desired_goal"], batch["collector", "traj_ids"]
     is_desired = (goal[:, None] == own).all(-1)
@@ -60,7 +60,7 @@ def test_desired_goals_of_others(stack):
 
 def test_stored_copies(stack):
     buffer = make_buffer(stack, 400, her="augment")
-    buffer.extend(select_episodes(play_randomly(stack), 1.0).reshape(-1))
+    buffer.extend(select_sequences(play_randomly(stack), 1.0).reshape(-1))
     assert len(buffer) == 5 * 400
 
 
@@ -86,9 +86,9 @@ def test_episodes_in_which_nothing_moved(stack):
     goal[2, :3, 2] += 0.05  # before the objects have settled
     assert has_moved(data).tolist() == [False, True, False, False]
     torch.manual_seed(0)
-    kept = [len(select_episodes(data.clone(), 0.25)) for _ in range(200)]
+    kept = [len(select_sequences(data.clone(), 0.25)) for _ in range(200)]
     assert abs(sum(kept) / 200 - (1 + 3 / 4)) < 0.2
-    assert len(select_episodes(data, 1.0)) == 4
+    assert len(select_sequences(data, 1.0)) == 4
     assert data["next", "done"][:, -1].all()
 
 

@@ -1,4 +1,4 @@
-"""Replay buffers with hindsight, and the choice of the episodes to store."""
+"""Replay buffers with hindsight, and the choice of the transitions to store."""
 
 from typing import Literal
 
@@ -14,12 +14,14 @@ Hindsight = Literal["relabel", "parts", "augment", "none"]
 
 # Both numbers are from the panda-gym paper (arXiv 2106.13687).
 K = 4  # hindsight goals per original goal; the HER paper's k
-BUFFER_SIZE = 1_000_000  # capacity in original transitions
-SETTLING_STEPS = 4  # steps in which Slide's puck, which starts in the air, falls
-# Smallest change of an achieved goal that counts as motion. The unit is [m], or 1 for
-# the entries of a quaternion.
+BUFFER_SIZE = 1_000_000  # capacity, not counting relabelled copies
+# Steps at the start of an episode in which Slide's puck falls onto the table. They do
+# not count as motion.
+SETTLING_STEPS = 4
+# An achieved goal has moved if one of its numbers changed by more than this: [m] for
+# positions, without unit for quaternions.
 MIN_MOTION = 0.01
-POSITION_SIZE = 3  # numbers of each object in a goal
+POSITION_SIZE = 3  # each object takes this many numbers of a goal
 STORED_KEYS: list[NestedKey] = [
     "observation",
     "desired_goal",
@@ -89,16 +91,17 @@ def make_buffer(
 
 
 def has_moved(data: TensorDictBase) -> Tensor:
-    """Find the episodes in which the achieved goal changed.
+    """Find the sequences in which the achieved goal changes.
 
-    If an object does not move in an episode, all hindsight goals of this episode are
-    achieved from the start. Such episodes teach little (arXiv 2012.08850).
+    If no object moves in an episode, all its hindsight goals are achieved from the
+    start. Such episodes teach little (arXiv 2012.08850). A sequence of several episodes
+    nearly always counts as changed, because every reset places the objects anew.
 
     Args:
-        data: Episodes [num_envs, steps].
+        data: Successive steps of each environment, [num_envs, steps].
 
     Returns:
-        Whether the goal changed, (num_envs,) bool.
+        Whether the goal changes in each sequence, (num_envs,) bool.
     """
     goal = data["next", "achieved_goal"]
     goal = goal[:, min(SETTLING_STEPS, goal.shape[1] // 2) :]
@@ -106,15 +109,17 @@ def has_moved(data: TensorDictBase) -> Tensor:
     return (change > MIN_MOTION).flatten(1).any(1)
 
 
-def select_episodes(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase:
-    """Select the episodes and the entries to store.
+def select_sequences(data: TensorDictBase, keep_unmoved: float) -> TensorDictBase:
+    """Select the sequences and the entries to store.
 
     Args:
-        data: Episodes [num_envs, steps].
-        keep_unmoved: Fraction of the episodes without motion that is kept.
+        data: Successive steps of each environment, [num_envs, steps], from its reset
+            on. They are several episodes if success ends episodes.
+        keep_unmoved: Probability with which a sequence is kept in which the achieved
+            goal does not change (see `has_moved`).
 
     Returns:
-        Episodes [n, steps] with the entries `STORED_KEYS`.
+        The n selected sequences, [n, steps], with the entries `STORED_KEYS`.
     """
     # The collector resets all environments before the next batch, so episodes that are
     # still running end here.

@@ -1,8 +1,11 @@
-"""The training loop: episodes of parallel environments, then gradient steps.
+"""The training loop: steps of parallel environments, then gradient steps.
 
-Each iteration runs one episode in every environment, and then takes
-``updates_per_step`` gradient steps per environment step. A run is saved between two
-iterations only. No episode is unfinished then, so ``--resume`` continues the run bit
+Each iteration resets all environments, steps each of them for the length of an episode,
+and then takes ``updates_per_step`` gradient steps per environment step. If success ends
+episodes, an environment plays several of them in one iteration.
+
+A run is saved between two iterations only. The next iteration begins with a reset, so
+the state of the environments need not be saved, and ``--resume`` continues the run bit
 for bit. Gradient steps use OMP_NUM_THREADS threads, by default one.
 """
 
@@ -22,7 +25,7 @@ from tqdm import tqdm
 
 from torch_panda.envs.randomization import Randomization
 from torch_panda.learning.agents import make_agent
-from torch_panda.learning.buffers import make_buffer, select_episodes
+from torch_panda.learning.buffers import make_buffer, select_sequences
 from torch_panda.learning.checkpoint import (
     SAVE_INTERVAL,
     Checkpoint,
@@ -37,10 +40,12 @@ from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
-# Longest episode [steps] of a run in which some episodes start in the middle of the
-# task: these need fewer steps, and all environments of a run have the same limit.
+# Upper bound on the steps of an iteration if some episodes start in the middle of the
+# task. Such episodes need fewer steps than whole ones. The bound also cuts the whole
+# ones, because all environments take the same number of steps.
 MAX_STEPS_FROM_MIDDLE = 50
-# Of the episodes in which no object moves, all presets but "paper" store this fraction.
+# Fraction of the sequences without motion (see `has_moved`) that the replay buffer
+# stores. The preset "paper" stores all of them.
 KEEP_UNMOVED = 0.1
 
 
@@ -102,7 +107,7 @@ class Run:
             states = states_at_objects(args.env_id, seed=args.seed)
             env = TransformedEnv(env, StartFrom(states, args.start_at_object))
         # A batch [num_envs, steps] begins with a reset of all environments. Episodes
-        # that last longer than `steps` steps are cut.
+        # that are still running at its end are cut.
         self.collector = Collector(
             env,
             self.agent.explore,
@@ -159,11 +164,11 @@ class Run:
         bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
         bar.set_description(f"{args.env_id} {args.algo}")
         finished = stopped = progress.steps >= args.total_steps
-        episodes = iter(self.collector)
+        batches = iter(self.collector)
         while not stopped:
             started, before = time.perf_counter(), progress.steps
             reseed(self.env)  # so that a resumed run has the same episodes
-            data = next(episodes)
+            data = next(batches)
             progress.steps += data.numel()
             self.store(data)
             losses = self.learn()
@@ -181,9 +186,9 @@ class Run:
         return finished
 
     def store(self, data: TensorDictBase) -> None:
-        """Add episodes [num_envs, steps] to the buffer and to the normaliser."""
+        """Add a batch [num_envs, steps] to the buffer and to the normaliser."""
         keep_unmoved = 1.0 if self.args.preset == "paper" else KEEP_UNMOVED
-        data = select_episodes(data, keep_unmoved)
+        data = select_sequences(data, keep_unmoved)
         if len(data):
             indices = self.buffer.extend(data.reshape(-1))
             # Reading rows back relabels them. As in Baselines, the normaliser's
