@@ -29,15 +29,15 @@ class Args(Hyperparameters):
 
     preset: Preset = "paper"
     """defaults of the other options: those of the panda-gym paper ("paper"), the task's
-    recipe for the least time by the clock ("tuned"), or its recipe for the fewest
-    environment steps ("sample-efficient"). The last two also skip nine of ten episodes
-    in which no object moved"""
+    recipe for the least wall-clock time ("tuned"), or its recipe for the fewest
+    environment steps ("sample-efficient"). The last two also keep episodes in which no
+    object moved out of the replay buffer, except for a random tenth"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
     """hindsight goals, four for each original goal: relabel transitions when they are
-    sampled ("relabel"), the same for each object's part of the goal separately
-    ("parts"), or store relabelled copies ("augment"). "none" uses no hindsight"""
+    sampled ("relabel"), the same with a separate draw for each object's part of the
+    goal ("parts"), or store relabelled copies ("augment"). "none" uses no hindsight"""
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of other transitions. The
     rest are goals achieved later in the same episode"""
@@ -53,11 +53,11 @@ class Args(Hyperparameters):
     batch_size: Positive = 256
     """transitions per gradient step"""
     anneal_lr: bool = False
-    """let the learning rate fall linearly to 0"""
+    """let the learning rate fall linearly to 0 during the training"""
     start_at_object: Ratio = 0.0
     """fraction of training episodes that start in the middle of the task: the hand is
     at an object or holds it, or the first cube of Stack is at its goal. If it is above
-    0, all episodes last at most 50 steps"""
+    0, all training episodes last at most 50 steps"""
     randomize: Factor = 1.0
     """draw the masses and frictions of objects and table for every training episode,
     between 1 / factor and factor times the task's values"""
@@ -74,7 +74,8 @@ class Args(Hyperparameters):
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
-    """continue the run in the folder; the other options must be the same"""
+    """continue the run in the folder. Only --out, --video, --import and --logger may
+    differ from the options with which it was started"""
     device: str = "cpu"
     """device of the networks and the replay buffer"""
     video: bool = True
