@@ -18,8 +18,8 @@ from torch_panda.registry import make
 
 Tasks = Literal["random", "fixed"]
 
-# Number of random actions at the start of each episode of a fixed task. Without them
-# all episodes of a task would be the same.
+# Number of random actions at the beginning of each episode from a fixed start. Without
+# them all episodes from one start would be the same.
 RANDOM_ACTIONS = 3
 
 
@@ -33,9 +33,9 @@ class Evaluation:
         at_start: Whether each episode starts with its goal reached, (n,) bool.
         returns: Sum of the rewards of each episode, (n,).
         lengths: Number of steps of each episode, (n,).
-        tasks: Results of each fixed task by its name, empty for random episodes. The
-            other attributes hold the episodes of all tasks. Each task has the same
-            number of them.
+        tasks: Results of each of the `evaluation_tasks` by its name; empty for random
+            starts. The other attributes hold the episodes of all five, which have the
+            same number of episodes.
     """
 
     success: Tensor
@@ -100,11 +100,12 @@ def evaluate(
         seed: Seed of the episodes; None draws a random seed.
         num_envs: Number of environments stepped in parallel. No more than ``episodes``
             are used.
-        tasks: "random" lets the task draw starts and goals. "fixed" starts from the
-            five `torch_panda.evaluation_tasks` and reports the success of each of them.
-            Then ``episodes`` is rounded up to a multiple of five, because every task
-            gets the same number of episodes. Each episode begins with `RANDOM_ACTIONS`
-            random actions, drawn from ``seed``, so that the episodes of a task differ.
+        tasks: "random" draws the start and the goal of each episode. "fixed" takes them
+            from the five `torch_panda.evaluation_tasks`, and also reports the success
+            from each of these starts. ``episodes`` is then rounded up to a multiple of
+            five, so that each start gets the same number of episodes. Each episode
+            begins with `RANDOM_ACTIONS` random actions, drawn from ``seed``, so that
+            the episodes from one start differ.
         **options: Other arguments of `make`, such as ``task_options`` and ``device``.
 
     Raises:
@@ -167,7 +168,8 @@ def evaluate_fixed_starts(
     starts = TensorDict.stack(list(states.values())).to(env.device)
     parts: list[Evaluation] = []
     for first in range(0, episodes, num_envs):
-        # Repeats of the first episodes fill up the last batch. `_join` drops them.
+        # If episodes are missing for a full batch at the end, the first ones are
+        # repeated. `_join` drops the repeats.
         numbers = torch.arange(first, first + num_envs) % episodes
         start = env.reset(starts[numbers % len(states)], set_state=True)
         randomized = _RandomStart(policy, actions[numbers])
@@ -180,7 +182,7 @@ def evaluate_fixed_starts(
 
 
 class _RandomStart(TensorDictModuleBase):
-    """Replaces the first actions of a policy, by actions (num_envs, steps, n)."""
+    """A policy with other first actions, ``actions`` (num_envs, steps, n)."""
 
     def __init__(self, policy: TensorDictModuleBase, actions: Tensor) -> None:
         super().__init__()

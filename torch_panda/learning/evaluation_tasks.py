@@ -7,7 +7,8 @@ from torch_panda.registry import make
 
 NUM_STARTS = 41  # starts from which the tasks are chosen
 SEED = 0
-# Name of each task, and how its distance between start and goal ranks among all starts.
+# Name of each task, and the quantile of its distance between start and goal among the
+# distances of all starts.
 QUANTILES = {
     "very_near": 0.05,
     "near": 0.25,
@@ -21,7 +22,7 @@ def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
     """Return five named start states of a task, each with its goal.
 
     They are selected from `NUM_STARTS` random starts of the task, by the distance
-    between achieved and desired goal. This works for registered tasks of your own, too.
+    between achieved and desired goal. Tasks that you registered have them, too.
 
     Args:
         env_id: Id of the task.
