@@ -74,7 +74,7 @@ def other_process(tmp_path):
 def test_a_folder_that_another_process_uses_is_refused(tmp_path, other_process, resume):
     (tmp_path / "resume.pt").touch()
     name = f"process {other_process.pid} on {socket.gethostname()}"
-    with pytest.raises(SystemExit, match=f"^{name} writes into {tmp_path}: stop this"):
+    with pytest.raises(SystemExit, match=f"^{name} writes into {tmp_path}: stop that"):
         train.main(Args(out=tmp_path, resume=resume))
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints of runs, from which a run resumes bit for bit, and locks of folders."""
+"""State of a run, from which it resumes bit for bit, and locks of folders."""
 
 import json
 import os
@@ -21,7 +21,9 @@ from torch_panda.learning.recipes import find_changes
 LOCK = "run.lock"  # file that the process of a run keeps locked
 # A folder with one of these files holds a run.
 RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
-SAVE_INTERVAL = 20_000  # environment steps, or imitation updates, between two saves
+# Steps between two saves: environment steps, or gradient steps of imitation and of
+# offline learning.
+SAVE_INTERVAL = 20_000
 # Options that may change when a run is resumed.
 FREE_OPTIONS = {"resume", "out", "video", "imports", "logger"}
 
@@ -52,10 +54,10 @@ class Progress:
 
 
 class Stored(Protocol):
-    """The data of a run.
+    """The data that a run learns from: a replay buffer or a data set.
 
-    A replay buffer is saved and restored. A data set is not saved; resuming a run
-    checks that it is the same data set.
+    A replay buffer is saved and restored. Of a data set only the hash is saved, so that
+    a resumed run can check that the data are the same.
     """
 
     def state_dict(self) -> dict[str, Any]:
@@ -67,7 +69,11 @@ class Stored(Protocol):
 
 @dataclass
 class Checkpoint:
-    """The complete state of a run between two iterations, and its file ``path``."""
+    """The complete state of a run between two iterations.
+
+    Its file ``path`` is called resume.pt. The file checkpoint.pt beside it holds the
+    policy alone, for `load_policy`.
+    """
 
     path: Path
     args: Any  # options of the run, a dataclass
@@ -76,7 +82,7 @@ class Checkpoint:
     progress: Progress
 
     def save(self) -> None:
-        """Write the state into ``path``, and the policy into checkpoint.pt beside it.
+        """Write the state into resume.pt, and the policy into checkpoint.pt.
 
         Raises:
             OSError: A file cannot be written.
@@ -122,7 +128,7 @@ def crossed(interval: int, before: int, after: int) -> bool:
 
 
 def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
-    """Options that must be the same when a run is resumed, as JSON values."""
+    """Return the options that may not change when a run is resumed, as JSON values."""
     options = json.loads(json.dumps(asdict(args), default=str))
     return {key: value for key, value in options.items() if key not in FREE_OPTIONS}
 
@@ -130,7 +136,7 @@ def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
 def check_same(
     folder: Path, saved: Mapping[str, object], options: Mapping[str, object]
 ) -> None:
-    """Check that a run or a data set is resumed with the options that it had.
+    """Check that a run or a data set is continued with the options of its start.
 
     Raises:
         ValueError: An option differs from the saved one.
@@ -208,7 +214,7 @@ def lock_folder(out: Path) -> Iterator[None]:
     except Timeout:
         name = process.read_text() if process.exists() else "another process"
         raise ValueError(
-            f"{name} writes into {out}: stop this process first, or choose another "
+            f"{name} writes into {out}: stop that process first, or choose another "
             "folder with --out"
         ) from None
     try:
