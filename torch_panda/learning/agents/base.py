@@ -25,9 +25,9 @@ TAU = 0.05  # weight of the online networks when the target networks are updated
 class Agent(nn.Module, ABC):
     """A policy with its exploration and its learning algorithm.
 
-    A subclass makes its networks in the constructor and then calls `assemble`. It also
-    defines `backward` and `move_targets`. The input of the networks is the "state": the
-    tensor that the normaliser computes from observations and goals.
+    The constructor of a subclass makes the networks and then calls `assemble`. A
+    subclass also defines `backward` and `move_targets`. The input of the networks is
+    the "state": the tensor that the normaliser computes from observations and goals.
 
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
@@ -35,9 +35,10 @@ class Agent(nn.Module, ABC):
         normalizer: Computes states from observations and goals.
         state_size: Size of a state.
         gamma: Discount factor.
+        min_return: Lower bound of the discounted return; None for dense rewards.
         policy: Module from ``observation`` and ``desired_goal`` to ``action``, which is
             deterministic under ``ExplorationType.DETERMINISTIC``.
-        explore: The policy with the exploration noise of the algorithm.
+        explore: The same module with the exploration noise of the algorithm.
         optimizer: Optimizer of all trained parameters.
         updates: Number of gradient steps so far, without those of imitation.
 
@@ -86,7 +87,7 @@ class Agent(nn.Module, ABC):
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
     def random_points(self) -> RandomPointModule:
-        """Make the exploration towards random points, for exploration "points"."""
+        """Make the module of the exploration "points"."""
         spaces = self.spaces
         gripper_size = int(spaces.has_free_gripper)
         return RandomPointModule(
@@ -161,7 +162,9 @@ class Agent(nn.Module, ABC):
         """
         rows = self._prepare(Transitions.from_tensordict(demos))
         inputs = dict(zip(POLICY_INPUTS, (rows.observation, rows.goal), strict=True))
-        # The loss compares actions before `from_fine`.
+        # `_prepare` has converted the demonstrated actions to those of the networks. So
+        # compare them with the output of the actor, before it is converted for the
+        # environment.
         normalize, actor = self.policy.module[:2]  # type: ignore[index]  # a ModuleList
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = normalize(demos.empty().update(inputs))
@@ -173,11 +176,12 @@ class Agent(nn.Module, ABC):
         return loss.detach()
 
     def _prepare(self, rows: Transitions) -> Transitions:
-        """Augment a batch, and convert its actions to those of the networks."""
+        """Augment a batch, penalise failures, and convert actions for the networks."""
         rows = augment(rows, self.spaces.geometry, self.hp.augmentation)
         if self.min_return is not None and self.min_return > -math.inf:
-            # A failure that ends an episode is as bad as never reaching the goal.
-            # Otherwise an agent would fail on purpose, to save the rewards of -1.
+            # A failure that ends an episode gets the return of never reaching the goal.
+            # With its reward of -1, an agent would fail on purpose, to avoid the
+            # rewards of -1 in the steps that follow.
             failed = rows.terminated & (rows.reward < 0)
             reward = torch.where(failed, self.min_return, rows.reward)
             rows = rows._replace(reward=reward)
@@ -191,9 +195,10 @@ class Agent(nn.Module, ABC):
             group["lr"] = factor * LEARNING_RATE
 
 
-# How firmly the fingers hold a cube depends on tenths of a millimetre. Such a distance
-# is 0.001 of the fingers' action, which is less than the error of a network. The cube
-# root of 0.001 is 0.1, which a network can learn. So networks output cube roots.
+# How firmly the fingers hold a cube depends on tenths of a millimetre. An action of 1
+# moves each finger by 10 cm, so a tenth of a millimetre is an action of 0.001. This is
+# less than the error of a network. The cube root of 0.001 is 0.1, which a network can
+# learn. So the networks output the cube root of the fingers' action.
 
 
 def to_fine(action: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ class DDPG(Agent):
     """
 
     num_critics = 1
-    actor_interval = 1  # gradient steps of the critics for each one of the actor
+    actor_interval = 1  # gradient steps of the critics per gradient step of the actor
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
@@ -115,7 +115,8 @@ class DDPG(Agent):
             difference = (action - rows.action)[-num_demos:]
             imitation_loss = (difference.square() * is_preferred).mean()
             actor_loss = actor_loss + BC_WEIGHT * imitation_loss
-        # Only for the actor: the critics already have the gradients of their own loss.
+        # Compute gradients for the actor only. The critics have those of their own
+        # loss.
         actor_loss.backward(inputs=self.actor_parameters)
         return {"critic_loss": critic_loss, "actor_loss": actor_loss}
 
