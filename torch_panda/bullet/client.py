@@ -399,8 +399,9 @@ class PhysicsClient:
         """Set the friction [N m] or [N] of a joint that nothing else controls.
 
         Bullet imitates friction by a motor. The motor's target velocity is 0, and its
-        maximum force is ``force``. Without this call, the
-        maximum force of this motor is about 1 N.
+        maximum force is ``force``. Without this call, the motor may apply an impulse of
+        1 N m s or 1 N s in every substep. At the default time step of 2 ms, this is a
+        maximum of 500 N m or 500 N.
 
         Raises:
             ValueError: the force is negative or not finite.
@@ -425,8 +426,9 @@ class PhysicsClient:
         not 0. (One of them suffices in pybullet; Bullet's own default needs both.)
         Resets restore the filter that was set while the scene was built.
 
-        Bullet removes the link from the broad phase and inserts it again as the last
-        link. The link thereby loses its present overlaps and contacts.
+        Bullet removes the link from the broad phase and inserts it again, after all
+        links that are in it already. The link thereby loses its present overlaps and
+        contacts.
         """
         command = capi.filter_init(self.connection.handle)
         capi.filter_set_group_mask(command, body, link, group, mask)
