@@ -15,7 +15,7 @@ from torch_panda.bullet import native
 FOLDER = Path(native.__file__).parent
 SOURCES = ("client.h", "client.c", "environment.c", "loop.c", "reset.c")
 # Hash of the C sources without comments and white space, by version.
-HASHES = {4: "361170d2bcfcfd37"}
+HASHES = {4: "d4732624d1cb67ec"}
 
 
 def hash_of_sources():
