@@ -62,8 +62,9 @@ class NativeLoop:
         )
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
-        # The field `expected` holds the status that Bullet should have answered, 0 if
-        # nothing failed, or a marker: DIVERGED or CLIENT_CLOSED.
+        # Outcome of each client's last step or reset. The field `expected` is 0 if
+        # nothing failed, DIVERGED if the state is not finite, CLIENT_CLOSED, or the
+        # status code that a failed command should have returned.
         self._failures = (native.Failure * n)()
         # A ctypes struct keeps alive the objects that it points to, except tensors.
         self._batch = native.Batch(
@@ -76,7 +77,7 @@ class NativeLoop:
         )
         self._control = native.Control()
         self._motor_control: MotorControl | None = None  # the source of _control
-        self._setpoint: Doubles | None = None  # the last one
+        self._setpoint: Doubles | None = None  # of the last step
         self._setpoint_address = 0
         self._loop: int | None = None
         self._process = os.getpid()

@@ -1,4 +1,4 @@
-"""A pool of threads that share the clients of a vector step."""
+"""A pool of threads that divide the clients of a simulation among themselves."""
 
 import os
 import queue
@@ -95,8 +95,9 @@ class WorkerPool:
     def run(self, work: Work, indices: Sequence[int]) -> None:
         """Call ``work(index)`` for every index, and return when all calls are done.
 
-        Ctrl-C raises only when all work is done, so that no client remains in the
-        middle of a step.
+        A first Ctrl-C raises when all work is done, so that no client remains in the
+        middle of a step. A second Ctrl-C raises at once, and `wait` waits for the rest
+        of the work.
 
         Raises:
             WorkerError: ``work`` raised for at least one index. All other calls were
@@ -130,7 +131,7 @@ class WorkerPool:
     def wait(self) -> None:
         """Wait until the last job is done.
 
-        It may still run although `run` has ended, if a second Ctrl-C interrupted `run`.
+        If a second Ctrl-C interrupted `run`, threads may still be working on its job.
         """
         if self._last_job is not None and self._process == os.getpid():
             self._last_job.wait()

@@ -20,7 +20,7 @@ from torch_panda.bullet.state import SimulationState
 
 
 class VectorSimulation:
-    """Steps ``num_envs`` clients of one scene in parallel threads.
+    """Builds one scene in ``num_envs`` clients, and steps them in parallel threads.
 
     Args:
         build: Function that builds the scene in a client. It is called for one client
@@ -30,7 +30,7 @@ class VectorSimulation:
         physics: Parameters of the integration.
 
     Raises:
-        BulletError: ``build`` built another scene in a later client.
+        BulletError: ``build`` built a different scene in a later client.
         TypeError: ``build`` did not return a `Scene`.
         ValueError: the environment variable ``TORCH_PANDA_LOOP`` is neither "native"
             (threads of C step the clients) nor "ctypes" (Python threads step them),
@@ -38,10 +38,10 @@ class VectorSimulation:
 
     Attributes:
         scene: Body ids of the scene.
-        state: Tensors with the state of all clients. Steps and resets overwrite them:
-            copy what you keep. Those that tasks read are also attributes of the
-            simulation, for example ``simulation.ee_position`` (num_envs, 3) [m]; see
-            `SimulationState`.
+        state: Tensors with the state of all clients; see `SimulationState`. Steps and
+            resets overwrite them: copy the ones that you keep. The tensors that tasks
+            read are also attributes of the simulation, for example
+            ``simulation.ee_position`` (num_envs, 3) [m].
         n_substeps: Substeps per step.
         ctrl_dt: Length of a step [s].
     """
@@ -76,7 +76,8 @@ class VectorSimulation:
                 self._clients.append(PhysicsClient(physics=physics))
                 self._broad_phases.append(self._build_same_scene(self._clients[-1]))
             self.state = state = SimulationState(self.scene, num_envs)
-            # Tasks, robots and sensors read these tensors here.
+            # Tasks, robots and sensors read these tensors as attributes of the
+            # simulation.
             self.joint_position = state.joint_position
             self.joint_velocity = state.joint_velocity
             self.ee_position = state.ee_position
@@ -154,9 +155,9 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # Python threads may still be running an earlier step with another kind
-                # of control, because a second Ctrl-C makes `WorkerPool.run` return
-                # before its threads finish. Wait for them.
+                # Wait for the Python threads. After a first Ctrl-C, `WorkerPool.run`
+                # waits until they are done before it raises. After a second one it
+                # raises at once, and the threads may still use clients now.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -188,12 +189,14 @@ class VectorSimulation:
     def reset(self, envs: Sequence[int], vary: Work | None = None) -> None:
         """Move the bodies of clients to the start of an episode.
 
-        The caller writes the start into the tensors of `state` first. A reset moves the
-        bodies to the poses, velocities and joint positions in these tensors.
+        Before the call, write the start into the tensors of `state`. The reset moves
+        the bodies there. It then overwrites these tensors, except ``marker_pose``, with
+        the state that Bullet reports.
 
-        Bullet's own state also has a broad phase, which depends on earlier steps.
-        `BroadPhase` restores it, so that an episode depends on its start and its
-        actions only.
+        The reset also restores Bullet's broad phase, a tree of the bodies' bounding
+        boxes and a list of the boxes that overlap. The broad phase depends on earlier
+        steps, and Bullet solves contacts in its order. Because it is restored, an
+        episode depends on its start and its actions only. See `BroadPhase`.
 
         Args:
             envs: Indices of the clients to reset.
@@ -244,7 +247,7 @@ class VectorSimulation:
             client.close()
 
     def _build_same_scene(self, client: PhysicsClient) -> BroadPhase:
-        """Build the scene in a further client, and refuse another scene."""
+        """Build the scene in a later client; raise if it differs from the first."""
         scene = _build_scene(self._scene_builder, client)
         first, other = (self.scene, *self._blueprint), (scene, *client.blueprint)
         for expected, actual in zip(first, other, strict=False):
@@ -263,7 +266,7 @@ class VectorSimulation:
         return BroadPhase(client)
 
     def _check_joints(self) -> None:
-        """Check that the scene lists as many joints as Bullet's state of the robot."""
+        """Check that the scene lists as many joints as Bullet's robot has."""
         scene = self.scene
         count = len(self._clients[0].state(scene.robot).joint_positions)
         if count != len(scene.joints):
