@@ -32,10 +32,10 @@ from torch_panda.rotations import rotate_vector
 # inserted one are always those of links already inserted, and never those of links
 # that are still at this position.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
-# `restore` restores the lowest 8 bits of the number of detections. A detection reads
-# one bit of it per level of the tree, and the trees of the shipped tasks have up to 11
-# levels. Only the lowest 6 bits had an effect in 120 episodes, and every further bit
-# would double the detections of a reset, so 8 bits are enough.
+# `restore` restores the number of detections modulo this cycle, that is, its lowest 8
+# bits. A detection reads one bit per level of the tree, and the trees of the shipped
+# tasks have up to 11 levels. But restoring k bits takes up to 2**k - 1 detections per
+# reset. Only the lowest 6 bits had an effect in 120 episodes, so 8 leave a margin.
 _DETECTION_CYCLE = 256
 
 _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
@@ -91,7 +91,8 @@ class BroadPhase:
         All bodies are first moved far away. Then one link after another is inserted at
         the pose at which it was built, in the order in which the links were built. Its
         old overlaps and contacts are lost. The links that are still far away do not
-        affect where a link is inserted, so the new tree depends on this order only.
+        affect where in the tree a link is inserted, so the tree is the same after every
+        reset.
         """
         client = self._client
         client.load(self._away)
@@ -105,10 +106,10 @@ class BroadPhase:
         client.detect_collisions()
         for body in self._overlapping:
             client.set_collision_filter(body, -1, *_NO_CONTACTS)
-        # Advance the number of detections to the next value whose lowest bits are those
-        # after building. While nothing overlaps, a detection takes about 1 us.
-        past = client.num_detections - self._num_detections
-        client.detect_collisions(-past % _DETECTION_CYCLE)
+        # Advance the number of detections until it exceeds the number after building by
+        # a multiple of the cycle. While nothing overlaps, a detection takes about 1 us.
+        num_since_built = client.num_detections - self._num_detections
+        client.detect_collisions(-num_since_built % _DETECTION_CYCLE)
         for body, link, group_mask, snapshot in self._links:
             client.load(snapshot)
             client.set_collision_filter(body, link, *group_mask)
@@ -134,8 +135,8 @@ class BroadPhase:
         While Bullet's URDF importer builds a body, it inserts the AABB of each link as
         if the link's centre of mass were at the origin of the link's frame. At the end,
         it moves the links to their poses without updating their AABBs. A link's AABB is
-        therefore displaced by the distance from its centre of mass to the origin of its
-        frame. The snapshot of a link holds the whole body with this displacement.
+        therefore displaced by the vector from its centre of mass to the origin of its
+        frame. In the link's snapshot, the whole body is displaced by this vector.
 
         The importer also inserts a link in another orientation if the link's inertial
         frame is rotated. This method does not imitate that, because no shipped robot
