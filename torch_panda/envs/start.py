@@ -112,7 +112,7 @@ class EpisodeStarts:
         """
         pose = self._task.marker_pose(goal)
         if type(self._task).marker_pose is not Task.marker_pose:
-            check_rotations("desired_goal", pose, envs)
+            check_rotations("the marker pose for the desired_goal", pose, envs)
         return pose
 
     def place_markers(self, envs: list[int]) -> None:
