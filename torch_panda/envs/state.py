@@ -24,12 +24,12 @@ BODY_KEYS = (
     "object_joint_position",
     "object_joint_velocity",
 )
-# All entries that a state may have.
-ALL_KEYS = (*BODY_KEYS, "desired_goal", "step_count", *PHYSICS_KEYS)
+# All entries that a plain state may have.
+PLAIN_KEYS = (*BODY_KEYS, "desired_goal", "step_count", *PHYSICS_KEYS)
 # Key under which `StateTransform` puts a whole state.
 NESTED_STATE = "state"
 # Entries that only an exact state has.
-EXACT_KEYS = (*(START + key for key in ALL_KEYS), ACTIONS, NUM_ACTIONS)
+EXACT_KEYS = (*(START + key for key in PLAIN_KEYS), ACTIONS, NUM_ACTIONS)
 
 
 class StartState(NamedTuple):
