@@ -1,4 +1,4 @@
-"""Runs the episodes of a robot at a task. Plain torch, without torchrl."""
+"""Runs episodes of a robot and a task in plain torch, without torchrl."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -52,10 +52,11 @@ _BYTES_PER_ENV = 44e6
 class Episodes:
     """n environments of one robot and one task; see `RobotTaskEnv` for the arguments.
 
-    All tensors are on the CPU and have n rows. If ``num_envs`` is None, then n is 1,
-    and only the actions and states that a caller passes have the batch shape ().
+    All tensors are on the CPU. They have n rows, except the actions and states that a
+    caller passes. Those have the batch shape of a `RobotTaskEnv`: (n,), or () if
+    ``num_envs`` is None. Then n is 1.
 
-    A call while another thread is inside raises `BulletError`.
+    A call raises `BulletError` while a call of another thread is running.
 
     Attributes:
         simulation: The Bullet clients and their state.
@@ -191,15 +192,15 @@ class Episodes:
         Args:
             envs: Environments that start an episode; None means all. Environments that
                 were never reset, or whose last reset failed, are always included.
-            state: The state to start from, as `get_state` returns it, or some of its
-                entries: tensors of shape (*batch_shape, ...).
+            state: The state to start from: tensors of shape (*batch_shape, ...), all or
+                some of the entries that `RobotTaskEnv.get_state` returns.
 
         Returns:
             The observed entries of all environments.
 
         Raises:
             ValueError: The state is wrong.
-            BulletError: The environment is closed, or another thread is inside.
+            BulletError: The environment is closed, or another thread is using it.
         """
         with self._guard:
             self._check_open()
@@ -243,7 +244,7 @@ class Episodes:
 
         Raises:
             BulletError: The environment is closed or needs a reset; another thread is
-                inside; or the step diverges and ``on_divergence`` is "raise".
+                using it; or the step diverges and ``on_divergence`` is "raise".
             ValueError: The action has a wrong shape or is not finite.
             TypeError: The action has an integer dtype.
         """
@@ -265,7 +266,7 @@ class Episodes:
             return observed
 
     def get_state(self, *, exact: bool = False) -> Observed:
-        """The physical state; see `RobotTaskEnv.get_state`."""
+        """The physical state, (n, ...) by key; see `RobotTaskEnv.get_state`."""
         with self._guard:
             self._check_was_reset()
             state = {key: value.clone() for key, value in self._starts.state().items()}
@@ -292,7 +293,7 @@ class Episodes:
         """Context manager that keeps other threads out, as `reset` and `step` do.
 
         Raises:
-            BulletError: The environment is closed, or another thread is inside.
+            BulletError: The environment is closed, or another thread is using it.
         """
         with self._guard:
             self._check_open()
@@ -400,7 +401,7 @@ class Episodes:
             step_mask[acting] = True
             self._history.record(action, step_mask)
             self._advance(action, acting)
-            # Sensors need only the last action of each environment.
+            # Sensors report the present only, so read them after the last action.
             self._observer.after_step(last)
         self._starts.step_count[envs] = start_state.values["step_count"]
         start_state.check_arrival(envs, self._starts.state())
@@ -416,7 +417,8 @@ class Episodes:
                 f"the physics of environments {envs} diverged: their state was not "
                 f"finite; they are at the start of their next episode"
             )
-        self._starts.step_count[envs] = self.max_episode_steps  # truncates the step
+        # Makes ``truncated`` true, so that torchrl resets these environments.
+        self._starts.step_count[envs] = self.max_episode_steps
 
     # ---- checks ------------------------------------------------------------------
 
