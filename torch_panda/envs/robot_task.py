@@ -55,8 +55,8 @@ class RobotTaskEnv(EnvBase):
     the step. If a reset fails in one environment, all environments of this reset need
     another reset.
 
-    An environment belongs to one thread at a time: a call while another thread is
-    inside raises `BulletError`.
+    One thread at a time may use an environment: a call raises `BulletError` while a
+    call of another thread is running.
 
     The state of Bullet cannot be copied, so a pickle holds only the class, the
     arguments, and the seed of the constructor or of the last `set_seed`. An unpickled
@@ -85,8 +85,8 @@ class RobotTaskEnv(EnvBase):
         physics: How Bullet integrates: "exact" as in panda-gym, "fast", or parameters.
         sensors: Sensors to observe beside ``observation``, each under its own keys. A
             sensor without arguments may be given by its name.
-        observe_state: Whether to observe ``observation``. The goals are always
-            observed.
+        observe_state: Whether the outputs have ``observation``. Set False, for example,
+            to learn from pictures only. The goals are always observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: What happens when a step leaves an environment in a state that
             is not finite. The environment always starts its next episode. "raise" then
@@ -249,7 +249,7 @@ class RobotTaskEnv(EnvBase):
         Args:
             tensordict: May hold ``_reset``, a mask of the environments to reset, and a
                 state to start from: the result of `get_state`, or some of its entries.
-                It is not changed.
+                The call does not change it.
             set_state: Whether to start from this state. Joints that the state leaves
                 out are neutral, velocities are zero, and objects and goals are sampled.
                 None starts from the state if the tensordict holds one.
@@ -321,7 +321,7 @@ class RobotTaskEnv(EnvBase):
     @property
     @_cache_value
     def _step_mdp(self) -> NextRoot:
-        """Moves the entries under ``next`` to the root, faster than torchrl's."""
+        """Moves the entries under ``next`` to the root, faster than torchrl does."""
         return NextRoot(self)
 
     def rollout(
@@ -344,14 +344,15 @@ class RobotTaskEnv(EnvBase):
         """
         if policy is None and kwargs.get("actions") is None:
             # `rand_action` makes tensordict look for pandas at every call. Where pandas
-            # is not installed, this takes 0.1 of the 0.3 ms between two steps.
+            # is not installed, this takes about 0.1 ms per step.
             policy, kwargs["trust_policy"] = RandomPolicy(self.action_spec), True
         return super().rollout(max_steps, policy, callback, **kwargs)
 
     def set_env_seed(self, env: int, seed: int) -> None:
-        """Give environment ``env`` the episodes of environment 0 under ``seed``.
+        """Seed one environment.
 
-        For interfaces that seed environments one by one, such as Gymnasium's.
+        From its next reset, it plays the episodes that environment 0 plays with
+        ``seed``. Interfaces such as Gymnasium's seed environments one by one.
 
         Raises:
             ValueError: The index is out of range, or the seed is negative.
@@ -406,7 +407,7 @@ class RobotTaskEnv(EnvBase):
         include that of the environment.
 
         Raises:
-            ValueError: The ``state_dict`` holds another number of environments.
+            ValueError: The ``state_dict`` holds a different number of environments.
         """
         if not state_dict:
             return None
@@ -448,7 +449,7 @@ class RobotTaskEnv(EnvBase):
             one index or an environment of batch size [].
 
         Raises:
-            BulletError: The environment is closed, or another thread is inside.
+            BulletError: The environment is closed, or another thread is using it.
             ValueError: An index is out of range, or its environment needs a reset.
             TypeError: An index is not an integer.
         """
@@ -585,8 +586,8 @@ class RobotTaskEnv(EnvBase):
         """Write a start into the caller's tensordict, as in torchrl.
 
         torchrl's own method also adds missing ``done`` entries and checks that no
-        episode is done at its start. The new start always has these entries, and none
-        is done. The extra work would take as long as the rest of the method.
+        episode is done at its start. `_reset` always returns these entries, and they
+        are false. The extra work would take as long as the rest of the method.
         """
         if tensordict is None or tensordict._get_str("done", None) is None:
             return super()._reset_proc_data(tensordict, tensordict_reset)
@@ -602,7 +603,7 @@ class RobotTaskEnv(EnvBase):
     # ---- tensors in and out ----------------------------------------------------------
 
     def _read_mask(self, tensordict: TensorDictBase, key: str) -> Tensor | None:
-        """A mask of environments, (n, 1) bool, or None if there is none."""
+        """The mask under a key, (n, 1) bool, or None if the key is missing."""
         mask = tensordict.get(key, None)
         if mask is None:
             return None

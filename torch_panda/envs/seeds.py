@@ -13,8 +13,8 @@ class EpisodeSeeds:
     """Random generators by (seed, environment, episode number).
 
     Attributes:
-        seed: The last seed of all environments. None means one that was drawn from the
-            operating system.
+        seed: The seed of the constructor or of the last `restart`. None means that the
+            seed was drawn from the operating system.
     """
 
     def __init__(self, num_envs: int, seed: int | None) -> None:
@@ -36,7 +36,7 @@ class EpisodeSeeds:
         self._episodes = [0] * len(self._episodes)
 
     def restart_one(self, env: int, seed: int) -> None:
-        """Give one environment the episodes that environment 0 has under a seed.
+        """Seed one environment; see `RobotTaskEnv.set_env_seed`.
 
         Raises:
             ValueError: The index is out of range, or the seed is negative.
@@ -76,7 +76,7 @@ class EpisodeSeeds:
         """Continue with the seeds and episode numbers that `state` returned.
 
         Raises:
-            ValueError: The state is that of another number of environments.
+            ValueError: The state belongs to a different number of environments.
         """
         streams, episodes = state["streams"], state["episodes"]
         if len(episodes) != len(self._episodes):
