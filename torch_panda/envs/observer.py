@@ -15,8 +15,8 @@ from torch_panda.robots import Robot
 from torch_panda.sensors import Entry, JointState, Observer, Sensor, join_entries
 from torch_panda.tasks import Task
 
-# Number of the first observations that are checked for NaN and infinity. The check is
-# too expensive for every step.
+# The first 20 observations are checked for NaN and infinity. The check is too expensive
+# for every step.
 _NUM_CHECKED = 20
 
 
@@ -112,8 +112,8 @@ class EpisodeObserver:
             observed, has_outcome = self._observe_goals(goal), False
         else:
             observed, has_outcome = self._compiled.observe(goal, step_count)
-        # C code computes success, ends and reward, unless the task has functions of
-        # its own for them.
+        # `has_outcome`: C code has computed success, ends and reward, and they are
+        # valid; see `CompiledObserver.observe`. C code does not call the task's hooks.
         if not has_outcome or self._has_reward or self._has_failure:
             self._add_outcome(observed, step_count, action)
         if action is None:
