@@ -16,12 +16,12 @@ START = "start_"  # prefix of the keys of the state at the start of the episode
 ACTIONS = "actions"
 NUM_ACTIONS = "num_actions"
 
-# Steps that no running episode needs are dropped when there are this many.
-_CHUNK = 1000
+# Steps that no running episode needs are dropped once there are more than this many.
+_MAX_UNUSED_STEPS = 1000
 # Longest episode that has an exact state [steps]. This limit bounds the memory of
 # episodes that never end.
 _MAX_STEPS = 20_000
-# First step of an episode that became too long, so that its actions were dropped.
+# Replaces the index of an episode's first step after its actions were dropped.
 _DROPPED = -1
 
 
@@ -54,7 +54,7 @@ class History:
                 start[env] = present[env]
         for env in envs:
             self._first_steps[env] = len(self._steps)
-        if (unused := min(self._first_steps)) > _CHUNK:
+        if (unused := min(self._first_steps)) > _MAX_UNUSED_STEPS:
             del self._steps[:unused]
             self._first_steps = [first - unused for first in self._first_steps]
 

@@ -11,7 +11,7 @@ _RESOLVE_CODE = EnvBase._resolve_set_state.__code__
 
 
 class StateSupport:
-    """The answer of ``_supports_set_state``. Its truth test is true or raises an error.
+    """The answer of ``_supports_set_state``, whose truth test may raise an error.
 
     torchrl asks an environment whether its resets may start from a state. The wrappers
     `TransformedEnv`, `SerialEnv` and `ParallelEnv` give the answer of the environment

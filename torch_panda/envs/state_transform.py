@@ -12,9 +12,9 @@ from torch_panda.envs.state import NESTED_STATE
 class StateTransform(Transform):
     """Observes the state under ``state``, and lets resets start from it.
 
-    torchrl's `TransformedEnv` and `ParallelEnv` pass only those entries of a reset on
-    to the environment that ``state_spec`` names. This transform adds the state to
-    ``state_spec``. It also works in the workers of a `ParallelEnv`::
+    torchrl's `TransformedEnv` and `ParallelEnv` pass on only the entries of a reset
+    that ``state_spec`` names. This transform adds the state to ``state_spec``. It also
+    works in the workers of a `ParallelEnv`::
 
         env = TransformedEnv(make(...), Compose(StateTransform(), StepCounter()))
         td = env.rollout(10)[..., -1]
