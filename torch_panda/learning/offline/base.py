@@ -1,9 +1,9 @@
 """Base class of the agents that learn offline, and the losses that several share.
 
-The protocol of an agent: `fit` computes the mean and deviation of the data, `update`
-takes one gradient step on a batch of `OfflineData`, and `policy` acts. Agents differ in
-their ``goals``, which are strategies of `torch_panda.transforms.GoalSampler`, and in
-their `losses`, which name the equations of their paper.
+`fit` computes the mean and deviation of the data, `update` takes one gradient step on a
+batch of `OfflineData`, and `policy` acts. Agents differ in their ``goals``, which are
+strategies of `torch_panda.transforms.GoalSampler`, and in their `losses`. The docstring
+of each loss cites the equation of its paper.
 
 In the papers a goal is a state g. Here a goal is the part of a state that the task
 cares about, such as the position of a cube, because the policy gets ``desired_goal``.
@@ -29,7 +29,8 @@ from torch_panda.learning.spaces import Spaces
 from torch_panda.transforms.strategies import StrategyOption
 
 MAX_WEIGHT = 100.0  # largest weight of a row in advantage-weighted regression
-# OGBench's mixture of goals of value functions (arXiv 2410.20092, appendix D).
+# OGBench's mixture of strategies that draw the goals of value functions (arXiv
+# 2410.20092, appendix D).
 VALUE_GOALS = {"current": 0.2, "geometric": 0.5, "random": 0.3}
 
 
@@ -72,11 +73,11 @@ class Batch(NamedTuple):
         a: Actions, (n, action size).
         s_next: Observations after the step, (n, observation size).
         achieved: Goals achieved by ``s_next``, (n, goal size).
-        r: Rewards for the value goals: 0 if ``s_next`` reaches it and -1 if not, (n,).
-        mask: 0 where ``s_next`` reaches the value goal, so that the return ends. Else
-            1, (n,).
-        g: Goals of values, (n, goal size).
-        g_actor: Goals of policies, (n, goal size).
+        r: Rewards: 0 if ``s_next`` reaches the goal ``g``, and -1 if not, (n,).
+        mask: 0 if ``s_next`` reaches the goal ``g``, so that the return ends, and 1 if
+            not, (n,).
+        g: Goals for the losses of the value functions, (n, goal size).
+        g_actor: Goals for the losses of the policies, (n, goal size).
     """
 
     s: Tensor
@@ -120,7 +121,7 @@ class OfflineAgent(nn.Module, ABC):
             [-1, 1], deterministic.
         optimizer: Optimizer of all networks that learn.
         updates: Number of gradient steps so far.
-        value_goal: Strategy of the goals of values.
+        value_goal: Strategy that draws the goals of the value functions.
     """
 
     Hyperparameters: ClassVar[type[OfflineHyperparameters]]
@@ -138,7 +139,7 @@ class OfflineAgent(nn.Module, ABC):
 
     @property
     def goals(self) -> dict[str, StrategyOption]:
-        """Strategies by which `GoalSampler` draws goals for values and policies."""
+        """Strategies by which `GoalSampler` draws goals, by the key of the goals."""
         return {"value_goal": self.value_goal, "actor_goal": self.hp.actor_goal}
 
     def assemble(self, actor: nn.Module) -> None:
@@ -164,7 +165,7 @@ class OfflineAgent(nn.Module, ABC):
         self.normalizer.update(observation, goal)
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
-        """Add further entries of the data to a sampled batch; here none."""
+        """Add further entries of the data to a sampled batch; by default none."""
         return batch
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -190,7 +191,7 @@ class OfflineAgent(nn.Module, ABC):
         """
 
     def move_targets(self) -> None:
-        """Move the target networks towards their networks, by ``tau``; here none."""
+        """Move the target networks, if there are any, towards their networks."""
 
 
 class DeterministicPolicy(nn.Module):
