@@ -6,10 +6,10 @@ imitate the data in proportion to exp(alpha * advantage), with the action-free v
 GCIVL.
 
 The paper's goals are states, so one value function judges waypoints and goals. Here a
-goal is a part of a state, such as the position of a cube. It does not change while the
-hand approaches the cube, so it cannot tell the waypoints of the approach apart.
-Therefore a waypoint w is a whole observation, and there are two value functions:
-V(s, phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
+goal is a part of a state, such as the position of a cube. While the hand approaches the
+cube, the cube's position stays the same, so it cannot tell the waypoints of the
+approach apart. Therefore a waypoint w is a whole observation, and there are two value
+functions: V(s, phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
 """
 
 import copy
@@ -91,23 +91,25 @@ class HIQL(OfflineAgent):
         )
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
-        """Draw the high level's goal, and waypoints of both policies and the values.
+        """Draw a goal for the high level, and one waypoint for each of three losses.
 
-        Row t of the data leads to the state s_t+1, so the state k steps after s_t is
-        s' of row t + k - 1. The high
-        level's waypoint does not lie beyond its goal, and the low level's waypoint does
-        not lie beyond the end of the episode.
+        The three losses are those of the high-level policy, the low-level policy and
+        the values of waypoints. Row t of the data leads to the state s_t+1, so the
+        state k steps after s_t is s' of row t + k - 1. The waypoint of the high level
+        does not lie beyond its goal, and the waypoint of the low level does not lie
+        beyond the end of the episode.
         """
         t = batch["index"]
         last = data.last[t]
-        # The high level's goal: a later state of the episode.
+        # The goal of the high level is achieved in this row, later in the episode.
         if self.hp.actor_goal == "future":
             goal_row = t + (torch.rand(t.shape) * (last - t + 1)).long()
         else:
             goal_row = draw_geometric_rows(t, last, self.hp.discount)
         waypoint_row = t + self.hp.subgoal_steps - 1
-        # The waypoint of the values is s' of this row, a later s' (with probability
-        # proportional to discount**k), or a random s', in the ratios of VALUE_GOALS.
+        # The waypoint of the values is s' of this row, s' of a later row (k steps later
+        # with probability proportional to discount**k), or s' of a random row. The
+        # probabilities of the three are those of VALUE_GOALS.
         geometric = draw_geometric_rows(t, last, self.hp.discount)
         random = torch.randint(len(data), t.shape)
         weights = torch.tensor([*VALUE_GOALS.values()])
@@ -136,8 +138,8 @@ class HIQL(OfflineAgent):
         }
 
     def represent(self, phi: nn.Module, s: Tensor, w: Tensor) -> Tensor:
-        """phi([s; w]) with the length sqrt(rep_dim), (n, rep_dim)."""
-        return with_length_sqrt_n(phi(s, self.normalizer.state(w)))
+        """phi([s; w]), scaled to the Euclidean norm sqrt(rep_dim), (n, rep_dim)."""
+        return normalize_length(phi(s, self.normalizer.state(w)))
 
     def goal_value_loss(self, b: Batch) -> Tensor:
         """Action-free expectile regression of V(s, g) (eq. 4)."""
@@ -152,7 +154,7 @@ class HIQL(OfflineAgent):
     def waypoint_value_loss(
         self, s: Tensor, s_next: Tensor, w: Tensor, is_at_w: Tensor
     ) -> Tensor:
-        """The same for V(s, phi(s, w)), which trains phi (section 5.2)."""
+        """Expectile regression of V(s, phi(s, w)), which trains phi (section 5.2)."""
         phi, value = self.target["phi"], self.target["waypoint_value"]
         with torch.no_grad():
             v_next = value(s_next, self.represent(phi, s_next, w))
@@ -182,12 +184,12 @@ class HIQL(OfflineAgent):
         return weighted_regression(log_probs, v_next - v, self.hp.low_alpha)
 
     def move_targets(self) -> None:
-        """Move the targets of phi and of both values towards them."""
+        """Move the target networks of phi and of both values towards the networks."""
         move_towards(self.target, self.online, self.hp.tau)
 
 
 class HierarchicalActor(nn.Module):
-    """Acts towards the waypoint that the high level names.
+    """Acts towards the waypoint whose representation the high level outputs.
 
     Args:
         normalizer: Standardises observations.
@@ -204,7 +206,7 @@ class HierarchicalActor(nn.Module):
 
     def forward(self, s: Tensor, g: Tensor) -> Tensor:
         """The mean action, (..., action size)."""
-        z = with_length_sqrt_n(self.high_actor(s, g))
+        z = normalize_length(self.high_actor(s, g))
         return self.low_actor(self.normalizer.state(s), z)
 
 
@@ -214,6 +216,6 @@ def draw_geometric_rows(t: Tensor, last: Tensor, discount: float) -> Tensor:
     return t + torch.from_numpy(steps)
 
 
-def with_length_sqrt_n(z: Tensor) -> Tensor:
-    """Scale vectors (..., n) to the length sqrt(n)."""
+def normalize_length(z: Tensor) -> Tensor:
+    """Scale vectors (..., n) to the Euclidean norm sqrt(n)."""
     return z * (sqrt(z.shape[-1]) / z.norm(dim=-1, keepdim=True).clamp(min=1e-6))
