@@ -56,12 +56,12 @@ class GoalMemory:
     its goals move to a larger block.
 
     A new transition continues the open trajectory with the same id. (A trajectory is
-    open until a transition of it is done.) But a second collector may reuse an id that
-    the first one left open. The memory detects this by the root goal, which is the
+    open until one of its transitions is done.) But a second collector may reuse an id
+    that the first one left open. The memory detects this by the root goal, which is the
     achieved goal before a step. Within a trajectory, the root goal equals the goal that
-    the previous step achieved. If it differs, a new trajectory begins. Data in which
-    the two are never equal do not permit this check, so it is off until they are equal
-    for the first time.
+    the previous step achieved. If the two differ, a new trajectory begins. In some data
+    the two differ everywhere, so the memory checks them only after it has seen them
+    equal once.
     """
 
     def __init__(self) -> None:
@@ -75,8 +75,8 @@ class GoalMemory:
         self._ring = np.zeros(0, _POSITION)  # index: serial number % ring size
         self._trajectories = np.zeros(64, _TRAJECTORY)  # index: trajectory number
         self._free_numbers = [*range(64)]  # trajectory numbers that are not in use
-        # Column 0 holds achieved goals. Column 1 holds desired goals, if they are
-        # needed. The shape is (rows, 1 or 2, *goal).
+        # Column 0 holds achieved goals. Column 1 holds desired goals, if a strategy
+        # draws from them. The shape is (rows, 1 or 2, *goal).
         self._goals: Goals = np.zeros((0, 1), dtype=np.float32)
         self._num_rows = 0  # rows of `_goals` that belong to a block, used or free
         self._free_blocks: dict[int, list[int]] = {}  # block size -> first rows
@@ -235,7 +235,7 @@ class GoalMemory:
         Args:
             serials: Serial numbers of the transitions, (n,).
             mixture: Strategies that choose where each goal comes from.
-            generator: Generator of the random draws, torch's if None.
+            generator: Generator of the random draws; None means torch's global one.
 
         Returns:
             The goals, (n, *goal).

@@ -4,6 +4,11 @@ The stored steps of a trajectory are numbered from `first` to `end - 1`. For a
 transition at step `step`, most strategies choose one of these steps. Only "random" and
 "desired" take goals from other trajectories.
 
+A strategy may also be a user's function `(step, first, end, generator) -> goal step`.
+Its steps are int32 tensors (n,) on the CPU. They count from the oldest stored step of
+the trajectory, so `first` is always 0. `generator` is None for torch's global
+generator.
+
 "future", "final", "episode" and "random" are the strategies of Andrychowicz et al. 2017
 (arXiv 1707.01495), section 4.5. "geometric" draws from the discounted future of a
 transition, as contrastive RL does (Eysenbach et al. 2022, arXiv 2206.07568).
@@ -20,15 +25,14 @@ from torch import Generator, Tensor
 
 Integers = NDArray[np.integer[Any]]
 Rows = slice | Integers
-# A user's function: (step, first, end, generator) -> goal step. All steps are int32
-# tensors (n,) on the CPU, and count from the oldest stored step of the trajectory.
+# A user's function, see the docstring of this module.
 StrategyFunction = Callable[[Tensor, Tensor, Tensor, Generator | None], Tensor]
 Strategy = str | StrategyFunction
 StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
 RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
-# These strategies never draw an earlier step than the transition's own. A buffer
-# overwrites old transitions first, so it still holds the steps that they draw.
+# These strategies draw the transition's own step or a later one. A buffer overwrites
+# old transitions first, so it still holds these steps.
 LOOKING_AHEAD = ("current", "future", "geometric", "final")
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
@@ -91,7 +95,7 @@ class Mixture:
 
 
 def draw_uniform(n: int, generator: Generator | None) -> NDArray[np.float64]:
-    """Draws n numbers from [0, 1) on the CPU, with torch's generator if it is None."""
+    """Draws n numbers from [0, 1) on the CPU. None means torch's global generator."""
     u = torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")
     return u.numpy()
 
@@ -135,7 +139,7 @@ def choose_steps(
         first: Oldest stored step of each transition's trajectory, (n,).
         end: One more than the last stored step of each trajectory, (n,).
         discount: Discount per step of "geometric".
-        generator: Generator of the random draws, torch's if None.
+        generator: Generator of the random draws; None means torch's global generator.
 
     Raises:
         ValueError: a user's function did not return integers from `first` to `end - 1`.
