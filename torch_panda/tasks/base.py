@@ -101,9 +101,9 @@ class Task(Configured, ABC):
     that a task leaves out is never called, so it costs nothing.
 
     Args:
-        reward_type: "sparse" rewards success with 0 and all else with -1; "dense"
-            rewards with minus the distance to the goal.
-        distance_threshold: A goal is reached at a smaller distance.
+        reward_type: "sparse" gives 0 for success and -1 otherwise; "dense" gives minus
+            the distance to the goal.
+        distance_threshold: Distance below which a goal is reached.
 
     Raises:
         ValueError: An argument is out of range.
@@ -125,8 +125,8 @@ class Task(Configured, ABC):
     Relative inputs and data augmentation in training need it and ``goal_entries``.
     The position of each object must precede its other quantities."""
     sampled_goal_height: ClassVar[float | None] = None
-    """Height of all sampled goals [m], in a task whose objects sink below this height
-    before they rest, as in Slide. None in all other tasks."""
+    """Height of all sampled goals [m], in a task whose objects come to rest below this
+    height, as in Slide. None in all other tasks."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
@@ -268,9 +268,9 @@ class Task(Configured, ABC):
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation, (num_envs, observation_dim) float64.
 
-        The robot's part precedes it in ``observation``. If a task declares this method
-        and `achieved_goal` with `bullet.selects_state`, C code observes instead of
-        them, which saves about 50 microseconds per step.
+        The robot's part precedes it in ``observation``. If a task decorates this method
+        and `achieved_goal` with `bullet.selects_state`, C code does the work of both,
+        which saves about 50 microseconds per step.
         """
         return simulation.ee_position[:, :0]
 
@@ -290,7 +290,7 @@ class Task(Configured, ABC):
             objects: The objects at the start of the episodes.
 
         Returns:
-            The objects at rest, after the task was done.
+            The objects at rest, with the goals reached.
 
         Raises:
             NotImplementedError: The default does not apply to this task.

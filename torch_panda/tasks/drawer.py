@@ -1,4 +1,4 @@
-"""Drawer: open or close a drawer up to a position of its handle."""
+"""Drawer: open or close a drawer until its handle is at a point."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ URDF = Path(__file__).with_name("drawer.urdf")
 SLIDE = 0  # index of the drawer's joint
 TRAVEL = 0.25  # distance from closed to open [m]
 HANDLE = (-0.06, 0.0, 0.06)  # position when closed, cabinet frame [m]
-# The marker is thicker than the handle, so that it is visible around a handle there.
+# The marker is thicker than the handle, so it stays visible when the handle is inside.
 MARKER = Box((0.009, 0.074, 0.014))
 
 # The table is longer than panda-gym's, because the cabinet stands at its far end.
@@ -34,7 +34,7 @@ class Drawer(Task):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         cabinet_x_range: Range of the cabinet's position along x [m].
         cabinet_y_range: Range of the cabinet's position along y [m].
         min_change: Smallest distance between start and goal, at most 0.125 [m].
@@ -105,7 +105,7 @@ class Drawer(Task):
         return pose[:, :3] + rotate(pose[:, 3:], handle)
 
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
-        """The cabinet at its place, open so far that its handle is at the goal."""
+        """The cabinet where it is, with the drawer's handle at the goal."""
         pose = objects.pose[:, 0]
         closed = pose[:, :3] + rotate(pose[:, 3:], pose.new_tensor(HANDLE))
         outwards = rotate(pose[:, 3:], pose.new_tensor((-1.0, 0.0, 0.0)))

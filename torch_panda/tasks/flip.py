@@ -36,7 +36,7 @@ class Flip(Task):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance.
+        distance_threshold: Distance below which a goal is reached.
         obj_xy_range: Edge length of the square of start positions [m].
         object_mass: Mass of the cube [kg].
         object_friction: Lateral friction of the cube.

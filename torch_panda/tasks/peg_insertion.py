@@ -43,7 +43,7 @@ class PegInsertion(Task):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         depth: Depth of the goal in the hole [m].
         clearance: Difference between the widths of hole and peg [m].
         hole_xy_range: Edge length of the square of positions of the hole [m].

@@ -18,7 +18,7 @@ class PickAndPlace(Push):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         goal_xy_range: Edge length of the box of goals along x and y [m].
         goal_z_range: Height of the box of goals [m].
         obj_xy_range: Edge length of the square of start positions [m].
@@ -33,7 +33,7 @@ class PickAndPlace(Push):
     object_friction: float = 5.0
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a position of the cube, 30 % of them on the table, (3,)."""
+        """Draw a position of the cube, (3,); 30 % of the positions are on the table."""
         height = rng.uniform(0.0, self.goal_z_range)
         if rng.random() < GOALS_ON_TABLE:
             height = 0.0

@@ -31,7 +31,7 @@ class Push(Task):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         goal_xy_range: Edge length of the square of goals [m].
         obj_xy_range: Edge length of the square of start positions [m].
         object_mass: Mass of the cube [kg].
@@ -43,7 +43,7 @@ class Push(Task):
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = OBJECT_LAYOUT
-    # Height at which panda-gym creates the marker, before the first goal [m].
+    # Height at which panda-gym creates the marker, before it draws a goal [m].
     marker_height = CUBE_SIZE / 2
 
     goal_xy_range: float = 0.3

@@ -19,7 +19,7 @@ class Reach(Task):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         goal_range: Edge length of the cube of goals [m].
         table_friction: Lateral friction of the table.
     """

@@ -33,7 +33,7 @@ class Slide(Task):
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         goal_xy_range: Edge length of the square of goals [m].
         goal_x_offset: x coordinate of the centre of this square [m].
         obj_xy_range: Edge length of the square of start positions [m].
@@ -80,7 +80,7 @@ class Slide(Task):
         return Bodies(objects=(puck,), markers=(marker,))
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
-        """Draw a position of the puck out of reach, (3,)."""
+        """Draw a position of the puck in the square of goals, (3,)."""
         return sample_on_table(
             rng,
             self.goal_xy_range,

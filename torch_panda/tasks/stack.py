@@ -29,15 +29,16 @@ UPPER_HEIGHT = 3 * CUBE_SIZE / 2
 class Stack(Task):
     """Stack two cubes at a point on the table.
 
-    A goal holds the position of the lower cube and then that of the upper cube. The
-    upper cube starts one cube's height above the table, so it may start on the lower
-    cube.
+    A goal holds the position of the lower cube, and then the position of the upper
+    cube. The upper cube starts one cube's height above the table, so it may start on
+    the lower cube.
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
-        distance_threshold: A goal is reached at a smaller distance [m].
+        distance_threshold: Distance below which a goal is reached [m].
         per_object: Whether each cube must be within the threshold, as in the paper.
-            Otherwise the norm of both distances must be, as in panda-gym 3.
+            Otherwise the distance between the whole goals (6 numbers) must be within
+            it, as in panda-gym 3.
         goal_xy_range: Edge length of the square of goals [m].
         obj_xy_range: Edge length of the square of start positions [m].
         lower_color: Colour of the lower cube and its marker.
@@ -101,7 +102,10 @@ class Stack(Task):
         return simulation.object_pose[:, :, :3].flatten(1)
 
     def success_distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """The larger distance of the two cubes, or the norm of both, (..., 1)."""
+        """The larger of both cubes' distances, or the whole distance, (..., 1).
+
+        ``per_object`` chooses between them.
+        """
         if not self.per_object:
             return self.distance(achieved_goal, desired_goal)
         offset = (achieved_goal - desired_goal).unflatten(-1, (2, 3))
