@@ -52,11 +52,11 @@ ABOVE_THE_TABLE: Workspace = ((-_FAR, -_FAR, 0.0), (_FAR, _FAR, _FAR))
 class Robot(Configured):
     """A robot arm on a fixed base, with or without a gripper, described by a URDF.
 
-    One object describes the robot for all environments of a simulation. An action holds
-    the numbers of the arm, whose meaning is the control type. If there is a gripper
-    that is not blocked, the last number opens the fingers. The robot observes the
-    end-effector's position [m] and velocity [m/s] and, with a free gripper, the
-    distance between the fingers [m].
+    One object describes the robot for all environments of a simulation. An action
+    begins with the numbers for the arm, whose meaning depends on the control type. If
+    there is a gripper that is not blocked, one more number opens and closes the
+    fingers. The robot observes the end-effector's position [m] and velocity [m/s] and,
+    with a free gripper, the distance between the fingers [m].
 
     Args:
         urdf: Path of the URDF, or its name among the files that pybullet ships.
@@ -199,8 +199,8 @@ class Robot(Configured):
 
         Raises:
             FileNotFoundError: The URDF does not exist.
-            ValueError: The URDF has another number of movable joints, or has no link or
-                joint with a given index.
+            ValueError: The number of movable joints in the URDF is not that of
+                ``joint_forces``, or the URDF has no link or joint with a given index.
         """
         body = client.load_urdf(
             self.urdf,
@@ -289,7 +289,8 @@ class Robot(Configured):
         """Set the motors of the robot in one client.
 
         It runs in the thread that steps the client. A subclass overrides it if
-        `motor_control` cannot describe its control. Its steps then go through Python.
+        `motor_control` cannot describe its control. Python threads then step the
+        clients.
 
         Args:
             client: The client.
@@ -319,7 +320,7 @@ class Robot(Configured):
         return self.control if overrides else self.motor_control
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position and velocity of the end-effector, and the fingers' width.
+        """Position and velocity of the end-effector, and the fingers' distance.
 
         Returns:
             (num_envs, 6) float64, or (num_envs, 7) with a free gripper.

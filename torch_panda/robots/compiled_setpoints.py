@@ -24,8 +24,9 @@ class CompiledSetpoints:
         self._state = simulation.state.rows
         arm, is_ee = robot.num_arm_joints, robot.control_type == "ee"
         # A setpoint has the position of the hand, or of the arm's joints (the first
-        # columns of the state), displaced by the scaled action. Then come the fingers:
-        # at their neutral positions if the gripper is blocked, else as the action says.
+        # columns of the state), displaced by the scaled action. The positions of the
+        # other joints follow: the neutral ones, or with a free gripper as the action
+        # says.
         num_displaced = 3 if is_ee else arm
         resting = () if robot.has_free_gripper else robot.neutral_joint_position[arm:]
         self._actuation = native.Actuation(

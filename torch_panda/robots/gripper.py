@@ -19,8 +19,8 @@ class Gripper:
         width: Distance between the fully open fingers [m].
         scale: Change of the distance for an action of 1 [m].
         followers: Indices of joints that a real gripper couples mechanically to the
-            others. Bullet does not couple them, so their setpoint is the present
-            position of the others.
+            others. Bullet does not couple them, so their setpoints are the positions
+            that match the present distance between the fingers.
 
     Raises:
         ValueError: The lengths of ``closed`` and ``opened`` differ, no joint moves, all
