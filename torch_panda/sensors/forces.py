@@ -1,7 +1,7 @@
 """Force sensors.
 
-They read the values of the last substep (2 ms) of a step, which is not an average over
-the step. After a reset all of them are zero, because no time has passed.
+They report the values of the last substep of a step, not averages over the step. After
+a reset all values are zero, because no time has passed.
 """
 
 from abc import abstractmethod
@@ -113,8 +113,8 @@ class FingerContact(ForceSensor):
 class JointTorque(ForceSensor):
     """Torque [N m] of the motor of each movable joint, or force [N] of a sliding one.
 
-    The robot needs another control type than "joint_torque". Bullet reports the torques
-    of its motors, but not the torques that such actions apply.
+    A robot with the control type "joint_torque" cannot have this sensor: Bullet reports
+    the torques of its motors, but not the torques that such actions apply.
     """
 
     name = "joint_torque"
