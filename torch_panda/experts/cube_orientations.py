@@ -37,7 +37,9 @@ def same_half(quaternion: Tensor) -> Tensor:
 def turn(axis: int, angle: Tensor) -> Tensor:
     """Rotations about a world axis by angles [rad] (..., 1), (..., 4)."""
     parts = [torch.zeros_like(angle)] * 3
-    half = angle.double() / 2  # rounded later, so that libraries' last bits drop out
+    # Math libraries differ in the last bits of sines. Rounding to the dtype of `angle`
+    # removes these bits.
+    half = angle.double() / 2
     parts[axis] = half.sin().to(angle)
     return torch.cat((*parts, half.cos().to(angle)), -1)
 

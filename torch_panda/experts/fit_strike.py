@@ -15,7 +15,7 @@ from torch_panda.registry import make
 
 ENV_ID, NUM_ENVS, ROUNDS = "PandaSlide-v1", 64, 40
 STEPS = 70  # steps after which every puck lies still
-STRENGTHS = (0.4, 1.05)
+STRENGTHS = (0.4, 1.05)  # range of the random strengths
 DISTANCES = (0.1, 0.95)  # range of distances for the fit [m]
 
 
@@ -83,7 +83,8 @@ def main() -> None:
     strikes = torch.cat([strike_at_random(seed) for seed in tqdm(range(ROUNDS))])
     start, aim, distance, strength, deviation = strikes.split((3, 2, 1, 1, 1), 1)
     test = torch.arange(len(strikes)) % 5 == 0
-    # `effect` is the displacement of the puck's end by an error of 1 [m].
+    # `effect`: how far an error of 1 in the value displaces the point where the puck
+    # stops [m].
     for name, polynomial, values, effect in (
         ("STRENGTH", STRENGTH, strength, 2 * distance.sqrt() / 0.95),
         ("DEVIATION", DEVIATION, deviation, distance),

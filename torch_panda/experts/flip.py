@@ -41,8 +41,8 @@ TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m
 SUCCESS, DONE = 0.2, 0.17  # distances at which the task succeeds, and the hand stops
 # Costs of a plan: each quarter turn about y, each about z, a swing as the last move,
 # the distance to the goal after the plan, and the part of this distance above `GOOD`,
-# or above `GOOD_LYING` if no swing comes last. A plan that
-# ends too far from the goal costs 1 more.
+# or above `GOOD_LYING` if no swing comes last. A plan that does not end in success
+# costs 1 more.
 PITCH_COST, YAW_COST, SWING_COST, LEFT_COST, MISS_COST = 0.3, 0.15, 0.1, 0.2, 6.0
 GOOD, GOOD_LYING = 0.15, 0.13
 # Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
@@ -123,7 +123,8 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
 def descend(ee: Tensor, point: Tensor) -> Tensor:
     """Descend to a point, with open fingers that pass on both sides of a cube."""
     offset = point - ee
-    # Along x the fingers pass on both sides of the cube. Along y they would hit it.
+    # The fingers pass the cube on both sides even if the hand is off by 3 cm along x.
+    # If it is off by more than 1 cm along y, a finger would hit the cube: stay above.
     off = (offset[..., 1:2].abs() - 0.01).clamp(min=0.0)
     off = off + (offset[..., :1].abs() - 0.03).clamp(min=0.0)
     rise = offset[..., 2:] + (5 * (off - 0.006)).clamp(0.0, 0.06)
