@@ -26,16 +26,17 @@
  *    are finite. The sum starts at +0, a sum that starts at +0 never becomes -0, and
  *    adding a zero of either sign to any other number returns this number.
  * 2. Velocities whose unit response is exactly zero, for the same reason. Velocities
- *    start at +0 or as sums, so none is -0. If one is -0, Bullet solves the group.
+ *    start at +0 or as sums, so none should be -0. If one is, Bullet solves the group.
  * 3. The second accumulator. The solver's m_deltaVelocities and the body's m_deltaV
  *    begin equal and receive the same additions, so one is computed and copied to the
  *    other. If they do not begin equal, Bullet solves the group.
  * 4. atan2, sin and cos where the friction limit is 0. They only scale this zero.
  *
- * These reasons hold for finite numbers only. An infinity or a NaN in an impulse or a
- * velocity would stay infinite or NaN until the last iteration, because limits are
- * finite. It is therefore enough to check the result. If it is not finite, it is thrown
- * away, and Bullet's function solves the group from the start.
+ * These reasons hold for finite numbers only. It is enough to check the numbers after
+ * the last iteration. Limits are finite, so an impulse is finite or NaN. An impulse that
+ * is NaN stays NaN, and a velocity that is infinite or NaN never becomes finite again.
+ * If a number is not finite, the result is thrown away, and Bullet's function solves the
+ * group from the start.
  *
  * Bullet also solves every group with something that is not implemented here: rows or
  * constraints of rigid bodies, rows between a body and the world, and numbers that

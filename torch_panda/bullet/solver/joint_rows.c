@@ -17,9 +17,9 @@
  * unit impulses at all joints once per group. This is the same, because nothing that the
  * responses depend on changes while rows are created.
  *
- * The row of an upper limit has a negative unit impulse, as B. Its response is the
- * negative of the response to a positive one, because every operation rounds a number
- * and its negative alike.
+ * In the row of an upper limit, the unit impulse is negative and acts on body B. The
+ * response to it is the negative of the response to a positive unit impulse, because
+ * every operation rounds a number and its negative alike.
  *
  * The other numbers of a row are computed as Bullet computes them, except that sums
  * leave out the zeros of the Jacobian. This changes no bit while all numbers are finite.
