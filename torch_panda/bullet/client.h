@@ -59,10 +59,11 @@ struct link { /* _Link of broad_phase.py */
     int body, link, group, mask, snapshot;
 };
 
-/* BroadPhase of broad_phase.py, which explains the restoring. A restored client has as
-   many collision detections as after its scene was built, `num_detections`, modulo
-   `cycle`. `away` and `built` are snapshots with the bodies far away and as built. `pair`
-   has the first two bodies, whose overlap brings the cursor back to the start. */
+/* BroadPhase of broad_phase.py, which explains how a reset restores the broad phase.
+   `num_detections` is the number of collision detections when the scene was built; a
+   reset restores it modulo `cycle`. `away` and `built` are snapshots with the bodies far
+   away and as built. `pair` has the first two bodies, whose overlap brings the cursor
+   back to the start. */
 struct broad_phase {
     int64_t num_detections;
     int cycle, away, built, num_links, pair_size, pair[2];
