@@ -16,7 +16,7 @@ class LoadURDF(NamedTuple):
     """Loads a URDF.
 
     Attributes:
-        body: Id that the new body got.
+        body: Id of the new body.
         file: Path of the file. If a tool was added, it is the copy with the tool.
         position: Position of the base, world frame [m].
         orientation: Orientation of the base, quaternion xyzw.
@@ -34,7 +34,7 @@ class CreateBody(NamedTuple):
     """Creates a body of one shape.
 
     Attributes:
-        body: Id that the new body got.
+        body: Id of the new body.
         shape: Shape of the body; None for an invisible marker.
         mass: Mass [kg]; 0 for a body that never moves.
         position: Position of its centre, world frame [m].

@@ -59,7 +59,7 @@ class Connection:
             Handle of the status, valid until the next command.
 
         Raises:
-            BulletError: the client is closed, or Bullet answered with another code.
+            BulletError: the client is closed, or Bullet answered with a different code.
         """
         status: int = capi.submit(self.handle, command)
         return check_status(status, expected, action)
@@ -88,7 +88,7 @@ def check_status(status: int | None, expected: int, action: str) -> int:
     """Return a status unchanged if its code is the expected one.
 
     Raises:
-        BulletError: Bullet answered with another code, or not at all.
+        BulletError: Bullet answered with a different code, or not at all.
     """
     code = capi.status_type(status) if status else None
     if code != expected:
