@@ -21,7 +21,7 @@ from torch_panda.bullet.state import SimulationState
 
 
 class NativeLoop:
-    """Steps and resets clients with the functions of ``loop.c``, and owns its threads.
+    """Steps and resets clients in threads of ``loop.c``, which this object owns.
 
     Args:
         clients: The clients.

@@ -9,7 +9,7 @@ Work = Callable[[int], None]
 
 
 class _Job:
-    """One parallel loop: the indices that threads take, and the errors they met."""
+    """One parallel loop: the indices that threads take, and the errors of the work."""
 
     def __init__(self, work: Work, indices: Sequence[int], num_threads: int) -> None:
         self.work = work

@@ -42,7 +42,7 @@ class VectorSimulation:
             resets overwrite them: copy the ones that you keep. The tensors that tasks
             read are also attributes of the simulation, for example
             ``simulation.ee_position`` (num_envs, 3) [m].
-        n_substeps: Substeps per step.
+        n_substeps: Number of substeps per step.
         ctrl_dt: Length of a step [s].
     """
 
@@ -136,7 +136,7 @@ class VectorSimulation:
         """Set the motors, advance time and read the state.
 
         If the native loop is in use and ``control`` is a `MotorControl`, threads of C
-        do this. Otherwise Python threads do it. They compute the same numbers.
+        do this. Otherwise Python threads do it. Both compute the same numbers.
 
         Args:
             control: Control of the robots.
