@@ -76,9 +76,6 @@ class BufferTransform(envs.Transform):
         ValueError: an argument has a value that is not accepted.
     """
 
-    # The memory exists in one process only. Because of this attribute, torchrl calls
-    # `share_memory_`, which raises, if processes share the buffer.
-    requires_shared_write_state = True
     goal_parts: tuple[int, ...] | None = None
     _shown: tuple[str, ...]  # names of the attributes in the repr
 
