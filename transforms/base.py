@@ -41,11 +41,11 @@ ENVIRONMENT_ERROR = (
 class BufferTransform(envs.Transform):
     """A transform of a replay buffer that gives transitions other goals.
 
-    It remembers the goals of the transitions that the buffer stores, and it checks the
+    It remembers the goals of the transitions that the buffer stores. It also checks the
     first batches for entries that were computed from the desired goal, because these
-    would be wrong beside another goal (see `data_checks`).
-    Subclasses decide when they draw goals: when a batch is sampled
-    (`SampleTimeTransform`) or when an episode ends (`HindsightAugment`).
+    would contradict another goal (see `data_checks`). Subclasses decide when they draw
+    goals: when a batch is sampled (`SampleTimeTransform`) or when an episode ends
+    (`HindsightAugment`).
 
     Args:
         reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
@@ -68,8 +68,8 @@ class BufferTransform(envs.Transform):
             shape [*environments, time].
         single_env: Whether data of one dimension and without ids are successive steps
             of one environment.
-        seed: Seed of the transform's own random generator. By default it draws from
-            torch's global generator.
+        seed: Seed of a random generator of the transform's own; None means torch's
+            global generator.
 
     Raises:
         TypeError: an argument is unknown.
@@ -131,7 +131,8 @@ class BufferTransform(envs.Transform):
             accepted.remove("strategy")
         suggestion, has_ratio = None, "her_ratio" in accepted
         is_count = isinstance(value, int) and value > 0
-        # Translate the arguments of Stable-Baselines3 and of the other transforms.
+        # Translate the arguments of Stable-Baselines3 and of the other transforms, for
+        # example k=4 of HindsightAugment to her_ratio=0.8 of HindsightRelabel.
         if name in ("k", "n_sampled_goal") and is_count and has_ratio:
             suggestion = f"her_ratio={value / (value + 1):.3g}"
         elif name == "her_ratio" and isinstance(value, float) and 0 < value < 1:
@@ -221,8 +222,8 @@ class BufferTransform(envs.Transform):
             DONE,
         )
         if batch.ndim > 1:
-            # Put time first, because storages are filled in order of time. Serial
-            # numbers then rise in the order in which rows are overwritten.
+            # Put time first, because a storage [environments, time] fills up along
+            # time. Serial numbers then rise in the order in which rows are overwritten.
             flat = batch.select(self.trajectory_key, *keys, strict=False)
             flat = flat.movedim(-1, 0).reshape(-1)
         root_goal, achieved, desired, next_desired, done = (
@@ -259,7 +260,7 @@ class BufferTransform(envs.Transform):
         owner = self._memory.buffer
         if owner is not None and owner() is not buffer:
             if owner() is not None:
-                gc.collect()  # frees it if only a reference cycle still holds it
+                gc.collect()  # frees the owner if only a reference cycle still holds it
             if owner() is not None:
                 raise RuntimeError(
                     f"this {type(self).__name__} already belongs to another replay "
@@ -309,7 +310,7 @@ class BufferTransform(envs.Transform):
     def _get_ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
         """Returns the trajectory id of each row, (n,).
 
-        Rows without ids get the number of their environment.
+        If the data have no ids, each row gets the number of its environment.
 
         Args:
             flat: Transitions in order of time, (n,).
