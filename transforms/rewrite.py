@@ -1,4 +1,4 @@
-"""Writes other goals into transitions, and recomputes rewards and ends for them."""
+"""Writes other goals into transitions, and recomputes all that depends on the goal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ class Rewriter:
     def evaluate(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor
     ) -> dict[NestedKey, Tensor]:
-        """Computes the entries that depend on the goal for other goals.
+        """Computes reward, success and ends of transitions with other goals.
 
         Args:
             batch: Transitions, (m,).
@@ -112,7 +112,9 @@ class Rewriter:
         if self.terminated_fn is not None:
             done, terminated = batch.get(DONE), batch.get(TERMINATED)
             # In data of torchrl's trainers, "truncated" is true in every row, and
-            # "done" only where an episode ends. So a truncated row must have both.
+            # "done" only where an episode ends. So a row counts as truncated only if
+            # both are true. In data without "truncated", it counts if it is done but
+            # not terminated.
             truncated = batch.get(TRUNCATED, ~terminated) & done
 
             def reaches(desired: Tensor) -> Tensor:
