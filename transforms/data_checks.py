@@ -65,8 +65,9 @@ class DataCheck:
     - `_check_affine`: is an entry an affine function of the goals, such as the
       difference of desired and achieved goal?
 
-    Rows are collected until their goals differ. Then all three run. Because they cost
-    time, they end once they ran `MIN_CHECKS` times and saw enough different goals.
+    Rows are collected until their goals differ. Then all three checks run. Because they
+    cost time, they stop after `MIN_CHECKS` runs if they saw enough different goals, and
+    after `MAX_TOTAL_ROWS` rows in any case.
 
     Args:
         rewriter: Functions and keys of the transform.
@@ -151,7 +152,7 @@ class DataCheck:
         return achieved.flatten(1), rows.get(rewriter.goal_key).flatten(1)
 
     def _check_copies(self, rows: TensorDictBase) -> None:
-        """Refuses entries that contain the desired goal in successive columns.
+        """Refuses entries that contain the desired goal in adjacent columns.
 
         Raises:
             ValueError: an entry contains a copy.
@@ -169,7 +170,7 @@ class DataCheck:
             # Compare in the less precise type, because a copy may have been rounded.
             dtypes = desired.dtype, entry.dtype
             dtype = min(dtypes, key=lambda x: (not x.is_floating_point, x.itemsize))
-            # All successions of goal_dim columns: (n, successions, goal_dim).
+            # All windows of goal_dim adjacent columns: (n, windows, goal_dim).
             columns = entry[is_not_achieved].flatten(1).to(dtype)
             windows = columns.unfold(1, goal_dim, 1)
             is_equal = (windows == desired[:, None].to(dtype)).all(-1).all(0)
@@ -183,20 +184,20 @@ class DataCheck:
     def _check_affine(self, rows: TensorDictBase) -> bool:
         """Refuses entries that are affine functions of achieved and desired goal.
 
-        The desired goal is constant in each episode. An affine function has 2 *
-        goal_dim + 1 coefficients per column. If no object has moved
-        yet, the achieved goal is also constant in each episode, so an episode gives
-        only one equation. With at most 2 * goal_dim + 1 distinct desired goals, some
-        affine function fits any column that is constant in each episode, and the fit
-        proves nothing. So the check waits for more goals. From then on, it refuses a
-        column if an affine function fits it, with three exceptions:
+        An affine function has 2 * goal_dim + 1 coefficients per column. The desired
+        goal is constant in each episode. If no object has moved yet, the achieved goal
+        is constant too, so an episode gives only one equation. With at most 2 *
+        goal_dim + 1 distinct desired goals, some affine function fits any column that
+        is constant in each episode, and the fit proves nothing. So the check waits for
+        more goals. From then on, it refuses a column if an affine function fits it,
+        with three exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.
         - The column belongs to a scaled copy of one of the base environment's entries,
-          such as a normalised observation. The reason is that some columns of an
-          observation are constant in each episode, as the desired goal is, so that an
-          affine function may fit them by chance.
+          such as a normalised observation. An observation may rightly contain numbers
+          of the goal: in PegInsertion, the position of the hole has the x and y of the
+          desired goal.
 
         Returns:
             Whether the rows had enough different goals for this check.
@@ -266,8 +267,8 @@ class DataCheck:
             return error > precision * abs(factor)
 
         def differs(factor: float, constant: float) -> bool:
-            # Goals that were rounded change the reward of single rows. So tolerate 5 %
-            # of all rows, and half of a group.
+            # Rounding of the stored goals changes the reward of single rows. So
+            # tolerate 5 % of all rows, and half of a group.
             is_wrong = find_wrong_rows(factor, constant).double()
             worst_group = max(float(is_wrong[group].mean()) for group in groups)
             return float(is_wrong.mean()) > 0.05 or worst_group > 0.5
@@ -276,7 +277,8 @@ class DataCheck:
             return
         at_low, at_high = (stored[group].median() for group in groups[:2])
         factor = float((at_high - at_low) / (high - low).clamp(min=1e-12))
-        if low == high:  # one value cannot determine two numbers: assume no constant
+        # A single value of reward_fn cannot determine both numbers: assume constant 0.
+        if low == high:
             factor = float(at_low / low) if low else 0.0
         constant = float(at_low) - factor * float(low)
         if factor and not differs(factor, constant):
