@@ -49,7 +49,7 @@ class HindsightAugment(BufferTransform):
     def _inv_call(  # type: ignore[override]  # buffers accept None
         self, tensordict: TensorDictBase
     ) -> TensorDictBase | None:
-        """Takes new transitions, and returns those to store: of all ended episodes."""
+        """Holds back new transitions, and returns the rows of all ended episodes."""
         buffer, method = find_buffer()
         if method == "add" or not tensordict.ndim:
             raise ValueError(
@@ -83,7 +83,8 @@ class HindsightAugment(BufferTransform):
 
         The transitions of unfinished episodes are kept for a later call.
         """
-        num_remembered = 0  # transitions since the oldest one that is held back
+        # Number of transitions from the oldest one that is held back to the newest.
+        num_remembered = 0
         if self._unfinished:
             oldest = int(self._unfinished[0].get(SERIAL_KEY).min())
             num_remembered = self._memory.count - oldest

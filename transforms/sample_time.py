@@ -25,9 +25,11 @@ class SampleTimeTransform(BufferTransform):
     Args:
         reward_fn: See `BufferTransform`.
         unit: Rows that share a goal. "row" draws a goal for each row. "slice" draws one
-            goal for all rows of a sampled slice, from the view of its last row.
+            goal for all rows of a sampled slice, as for its last row, so that a
+            "future" goal lies in the future of all of them.
         capacity: Number of transitions to remember, for a transform that is called
-            without a buffer. With a buffer, it is the number that the buffer holds.
+            without a buffer. With a buffer, the transform remembers the transitions
+            that the buffer holds.
         **options: Other arguments of `BufferTransform`.
     """
 
@@ -46,7 +48,8 @@ class SampleTimeTransform(BufferTransform):
             raise ValueError(f"capacity must be a positive integer, got {capacity}")
         self.unit, self.capacity = unit, capacity
         self._is_first_sample = True
-        # Transitions that the buffer held before the last write, and those written.
+        # Number of transitions in the buffer before the last write, and number of
+        # transitions of this write.
         self._last_write = 0, 0
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -119,8 +122,8 @@ class SampleTimeTransform(BufferTransform):
         """Returns the serial number of the oldest transition that the buffer holds."""
         stored, (before, written) = self._count_stored(buffer), self._last_write
         size = 0 if buffer is None else getattr(buffer.storage, "max_size", 0)
-        # Another thread may be between `_inv_call` and the storage: then the last write
-        # is remembered, but not stored yet.
+        # If another thread is in the middle of `extend`, its transitions may be
+        # remembered, but not stored yet.
         if stored == before < size:
             stored += written
         return self._memory.count - stored

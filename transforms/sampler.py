@@ -99,8 +99,8 @@ class GoalSampler(SampleTimeTransform):
         oldest = self._memory.oldest
         drawn = {}
         # Another thread may have overwritten rows since they were sampled. `clip` keeps
-        # their serial numbers valid, so they get arbitrary goals, which are replaced
-        # below.
+        # their serial numbers valid. The goals drawn for these rows are wrong, and are
+        # replaced below.
         for key, mixture in self._mixtures.items():
             goals = self._memory.draw(
                 last_serials.clip(oldest), mixture, self._generator
