@@ -18,7 +18,7 @@ def check_logger(name: LoggerName) -> None:
     """Check that the library of a logger is installed.
 
     Raises:
-        ValueError: It is not.
+        ValueError: The library is not installed.
     """
     if name != "none" and find_spec(name) is None:
         raise ValueError(f"{name} is not installed: {install_command(name)}")

@@ -7,7 +7,7 @@ from torch_panda.learning.hyperparameters import Network
 
 # Units of each hidden layer.
 HIDDEN_SIZE = 256  # as in the panda-gym paper
-WIDE_SIZE = 448  # the file of a policy stays below 2 MB, to ship it
+WIDE_SIZE = 448  # keeps the file of a policy below 2 MB, so that it can be shipped
 
 
 def make_mlp(inputs: int, outputs: int, network: Network) -> MLP:

@@ -1,4 +1,4 @@
-"""Standardised inputs of the networks: observation, goal, and differences of both."""
+"""Standardised inputs of the networks: observation, goal, and relative inputs."""
 
 import torch
 from torch import Tensor, nn
@@ -8,7 +8,7 @@ from torch_panda.learning.spaces import Spaces
 
 CLIP_OBSERVATION = 200.0  # from the panda-gym paper
 CLIP_NORMALIZED = 5.0  # from the HER of OpenAI Baselines
-FINE_LIMIT = 0.03  # "fine" inputs are differences that are clipped at this limit [m]
+FINE_LIMIT = 0.03  # "fine" inputs are offsets, clipped to this distance per axis [m]
 
 
 class Normalizer(nn.Module):
@@ -16,8 +16,14 @@ class Normalizer(nn.Module):
 
     Args:
         spaces: Sizes and layout of observations and goals.
-        relative_inputs: Whether differences of positions are inputs too; see
+        relative_inputs: Which offsets between positions are inputs too; see
             `Hyperparameters.relative_inputs`.
+
+    Attributes:
+        goal_columns: Columns of the inputs that hold the goal.
+        state_columns: Columns of the inputs that do not depend on the goal.
+        mean: Mean of each input, (state size,).
+        std: Standard deviation of each input, at least 0.01, (state size,).
     """
 
     count: Tensor
@@ -64,12 +70,16 @@ class Normalizer(nn.Module):
         self.std.copy_(variance.sqrt())
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Standardise observations and goals, (..., size) each."""
+        """Standardise observations and goals, (..., size) each.
+
+        Returns:
+            ``(..., state size)``.
+        """
         normalized = (self._inputs(observation, goal) - self.mean) / self.std
         return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def state(self, observation: Tensor) -> Tensor:
-        """Standardise observations (..., size) with the inputs that need no goal.
+        """Standardise observations (..., size) and the offsets that need no goal.
 
         Returns:
             ``(..., len(self.state_columns))``.

@@ -26,14 +26,15 @@ Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
 LINES = 4  # largest number of lines in a panel
 COLUMNS = 3  # largest number of panels side by side
-OFFLINE = ", offline"  # ending of a panel's title whose steps are gradient steps
+OFFLINE = ", offline"  # suffix of a title if the steps of the panel are gradient steps
 LABEL_WIDTH = 56  # characters after which a label is wrapped
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 DASHES = ("-", "--", ":", "-.")
-# The first algorithm in the alphabet has no marker.
+# Markers of the algorithms in alphabetical order. The first algorithm has none.
 MARKERS = ("", "s", "^", "D", "v", "P", "X", "*")
-PRESETS = ("tuned", "paper")  # have the first looks, so that figures agree
+# These get the first colours and dashes, so that they look the same in all figures.
+PRESETS = ("tuned", "paper")
 
 Curves = dict[str, list[Curve]]
 """The curves of all seeds, by the label of the way to train."""
@@ -88,7 +89,7 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
         axes.remove()
     for axes, (title, lines) in zip(grid.flat, panels, strict=False):
         draw_panel(axes, lines, metric, looks)
-        # Offline tasks have panels of their own, see `read_runs`.
+        # `read_runs` gives offline runs panels of their own.
         kind = "gradient" if OFFLINE in title else "environment"
         _label(axes, title, metric, f"{kind} steps")
     save(figure, path)
@@ -125,8 +126,8 @@ def choose_looks(panels: list[list[Line]]) -> dict[Line, dict[str, str]]:
     """Colour, dashes and marker of each line, the same in all panels.
 
     Colour and dashes depend on the way to train, and the marker on the algorithm. The
-    first 28 ways differ. The ways of a panel have different colours where the ways that
-    they share with earlier panels allow it.
+    first 28 ways differ in colour or dashes. The ways of one panel have different
+    colours, unless two of them already have the same colour from other panels.
     """
     unused = [(color, dashes) for dashes in DASHES for color in COLORS]
     chosen: dict[str, tuple[str, str]] = {}
@@ -159,7 +160,7 @@ def draw_panel(
 ) -> None:
     """Draw lines with a band over their seeds."""
     for line, curves in lines.items():
-        # Unfinished seeds are shorter, so use the steps that all seeds have.
+        # Unfinished runs are shorter, so draw only the steps that all seeds have.
         points = [{row["step"]: row[metric] for row in curve} for curve in curves]
         steps = sorted(set.intersection(*map(set, points)))
         values = np.array([[curve[step] for step in steps] for curve in points])
@@ -169,7 +170,7 @@ def draw_panel(
         look: dict[str, Any] = dict(looks[line])
         if len(steps) == 1:
             look["marker"] = look["marker"] or "o"
-        # Markers at most every tenth of the panel's diagonal.
+        # markevery=0.1 draws a marker at most every tenth of the panel's diagonal.
         axes.plot(steps, median, label=label, markersize=4, markevery=0.1, **look)
         axes.fill_between(steps, low, high, color=look["color"], alpha=0.2, lw=0)
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))

@@ -27,7 +27,7 @@ def pretrain(
     learning_rate: float = 1.0,
     stop: object = False,
 ) -> None:
-    """Take the gradient steps of imitation that a run has not taken yet, and save it.
+    """Take the remaining gradient steps of imitation, and save the run.
 
     The learning rate falls linearly to 0.
 
