@@ -15,9 +15,9 @@ from torch_panda.transforms.strategies import StrategyOption
 class OfflineData:
     """The transitions of whole episodes, and a buffer that samples them.
 
-    Rewards do not depend on those of the data: a transition has the reward 0 if it
-    reaches its value goal and -1 if not, and reaching the goal ends the return.
-    All draws come from torch's global random generator, whose state a run saves.
+    The rewards of the data are replaced: a sampled transition has the reward 0 if it
+    reaches its value goal, and -1 if not. Reaching the goal ends the return. All draws
+    come from torch's global random generator, whose state a run saves.
 
     Args:
         data: Transitions (n,) in the order of time, with ``observation``, ``action``,
@@ -25,9 +25,10 @@ class OfflineData:
             ``observation``, ``achieved_goal``, ``desired_goal``, ``reward``,
             ``terminated`` and ``done``. The rows of an episode are consecutive.
         env: Environment of the task.
-        goals: Strategies of the goals; the first one is that of the values.
+        goals: Strategy for each key under which goals are drawn. The first key holds
+            the value goals.
         discount: Discount of the strategy "geometric".
-        data_hash: Hash of the data, which a resumed run compares.
+        data_hash: Hash of the data. A resumed run compares it with the saved hash.
 
     Attributes:
         rows: The transitions, (n,).
@@ -47,9 +48,9 @@ class OfflineData:
         def reward(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
             return env.is_success(achieved_goal, desired_goal).float() - 1.0
 
-        # Number the episodes 0, 1, ... in the order of the rows, so that entry i of the
-        # rows where episodes end belongs to episode i. `exclude` copies,
-        # so the caller's data stay as they are.
+        # Number the episodes 0, 1, ... in the order of the rows. Episode i then ends in
+        # row `ends.nonzero()[i]`. `exclude` returns a shallow copy, so the caller's
+        # data stay as they are.
         ids = data["collector", "traj_ids"]
         ends = torch.ones_like(ids, dtype=torch.bool)
         ends[:-1] = ids[1:] != ids[:-1]
@@ -81,20 +82,20 @@ class OfflineData:
         """Draw transitions and their goals.
 
         Returns:
-            Transitions (batch_size,) with a goal under each key of the strategies, and
-            ``index``, their rows of the data.
+            Transitions (batch_size,) with a goal under each key of ``goals``, and with
+            their row numbers in the data under ``index``.
         """
         return self._buffer.sample(batch_size)
 
     def state_dict(self) -> dict[str, str]:
-        """The hash of the data, in place of the data themselves."""
+        """The hash of the data, which is saved instead of the data."""
         return {"hash": self.data_hash}
 
     def load_state_dict(self, state: dict[str, str]) -> None:
-        """Compare the data with those of a saved run.
+        """Check that the data are those of a saved run.
 
         Raises:
-            ValueError: They differ.
+            ValueError: The hashes differ.
         """
         if state["hash"] != self.data_hash:
             raise ValueError(

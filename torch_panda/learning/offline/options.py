@@ -10,7 +10,7 @@ from torch_panda.learning.logger import LoggerName, check_logger
 from torch_panda.learning.offline import OFFLINE_AGENTS, OfflineHyperparameters
 from torch_panda.learning.user_modules import Imports
 
-KINDS = ("noisy", "play", "random")  # of `torch_panda.datasets.generate`
+KINDS = ("noisy", "play", "random")  # kinds of `torch_panda.datasets.generate`
 
 
 @dataclass
@@ -23,10 +23,11 @@ class OfflineArgs(OfflineHyperparameters):
     """id of the environment, shipped or registered by --import"""
     data: str = "noisy"
     """data to learn from: "noisy", "play" or "random" generates a data set, see
-    `torch_panda.datasets.generate`, and keeps it in data.pt of the run's folder. Else
-    a file of `record`, a data.pt of another run, or the folder of a data set"""
+    `torch_panda.datasets.generate`, and keeps it in data.pt of the run's folder. Any
+    other value is the path of a file of `record`, of the data.pt of another run, or of
+    the folder of a data set"""
     transitions: Positive = 1_000_000
-    """transitions to generate"""
+    """transitions to generate, rounded up to whole episodes"""
     total_steps: Positive = 100_000
     """gradient steps"""
     num_envs: Positive = 16
@@ -40,7 +41,8 @@ class OfflineArgs(OfflineHyperparameters):
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
-    """continue the run in that folder, with the same other options"""
+    """continue the run in the folder. Only --out, --video, --import and --logger may
+    differ from the options with which it was started"""
     logger: LoggerName = "none"
     """also log each evaluation to TensorBoard (folder "tensorboard" of the run) or to
     Weights & Biases (project "torch_panda")"""
@@ -52,7 +54,7 @@ class OfflineArgs(OfflineHyperparameters):
 
 @cache
 def make_args_class(algo: str) -> type[OfflineArgs]:
-    """The options of an algorithm, with its hyperparameters.
+    """Make the class of the options of an algorithm, with its hyperparameters.
 
     Raises:
         ValueError: There is no such algorithm.
@@ -63,7 +65,7 @@ def make_args_class(algo: str) -> type[OfflineArgs]:
             "choose one of them, or leave out --offline"
         )
     cls = OFFLINE_AGENTS[algo].Hyperparameters
-    # The algorithm's class comes first, so that its defaults hold.
+    # The algorithm's class comes first, so that its defaults take precedence.
     return dataclass(type("OfflineArgs", (cls, OfflineArgs), {}))
 
 

@@ -37,7 +37,7 @@ from torch_panda.learning.offline.base import (
 )
 from torch_panda.learning.spaces import Spaces
 
-INTERVALS = 8  # of each component of the quasimetric
+INTERVALS = 8  # intervals in each component of the quasimetric
 # As in the paper's code: root mean square by which the cost of a step may exceed 1, and
 # the learning rate of lambda.
 EPSILON = 0.25
@@ -52,11 +52,11 @@ OFFSET, BETA = 50.0, 0.1
 class QRLHyperparameters(OfflineHyperparameters):
     """Hyperparameters of QRL.
 
-    `imitation` is what OGBench calls alpha, with its value for cube tasks and play
-    data; `num_components` is half of OGBench's. For noisy data, OGBench has 0.03. With
-    that, our policy is too fast at the goal and leaves it again. A probable reason is
-    that its loss divides costs by their mean: our tasks take fewer steps, so the mean
-    is smaller, and the saving of one step weighs more against imitation.
+    `imitation` is OGBench's alpha, with its value for cube tasks and play data.
+    `num_components` is half of OGBench's. For noisy data, OGBench has an alpha of 0.03.
+    With this value, our policy is too fast at the goal and leaves it again. A probable
+    reason is that the policy's loss divides costs by their mean. Our tasks take fewer
+    steps, so the mean is smaller, and one saved step weighs more against imitation.
     """
 
     algo: Literal["qrl"] = "qrl"
@@ -75,7 +75,7 @@ class QRLHyperparameters(OfflineHyperparameters):
 class QRL(OfflineAgent):
     """A quasimetric d(s, g), and a policy pi(a | s, g) that follows it.
 
-    With "descend" also a model of latent dynamics.
+    If the policy descends d, there is also a model of latent dynamics.
     """
 
     Hyperparameters: ClassVar = QRLHyperparameters
@@ -141,7 +141,7 @@ class QRL(OfflineAgent):
         return weighted_regression(log_probs, before - after, self.hp.alpha)
 
     def dynamics_loss(self, z: Tensor, a: Tensor, z_next: Tensor) -> Tensor:
-        """Distance of z + T(z, a) from z', both ways (section 3.4).
+        """Distances from z + T(z, a) to z' and back (section 3.4).
 
         This loss also trains the encoder and the quasimetric.
         """

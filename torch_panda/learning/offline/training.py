@@ -1,7 +1,8 @@
 """The loop of offline learning: gradient steps on a data set, and evaluations.
 
-Between two steps, the state of a run is its weights and torch's random generator, so
-`--resume` continues it bit for bit.
+Between two steps, the state of a run consists of the networks, the optimizer and
+torch's random generator. All three are saved, so `--resume` continues a run bit for
+bit.
 """
 
 import os
@@ -22,7 +23,7 @@ from torch_panda.learning.offline.options import OfflineArgs
 from torch_panda.learning.spaces import read_spaces
 from torch_panda.registry import make
 
-FIT_ROWS = 100_000  # transitions of which the normaliser takes the statistics
+FIT_ROWS = 100_000  # transitions from which the normaliser computes its statistics
 
 
 class OfflineRun:
