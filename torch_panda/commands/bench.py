@@ -62,12 +62,13 @@ class Args:
     ids: tuple[str, ...] = ("PandaPush-v3",)
     """environments to measure; `python -m torch_panda info` lists the ids"""
     num_envs: tuple[Positive, ...] = (16,)
-    """numbers of environments that are stepped in parallel"""
+    """numbers of environments stepped in parallel"""
     num_threads: Positive | None = None
     """number of threads of contenders that use threads; None means one per core, and at
     most one per environment"""
     others: tuple[Other, ...] = get_args(Other)
-    """contenders beside torch_panda; one whose libraries are missing is not measured"""
+    """contenders beside torch_panda. A contender whose libraries are missing is left
+    out"""
     rounds: Positive = 7
     """number of turns of each contender; the table shows the median"""
     steps: Positive = 50
@@ -85,7 +86,7 @@ class Args:
 
 @dataclass(frozen=True)
 class Setting:
-    """A workload that all contenders run. `Args` explains the options."""
+    """A workload that all contenders run. `Args` explains the attributes."""
 
     env_id: str
     num_envs: int
@@ -166,8 +167,8 @@ def _make_ours(setting: Setting, **options: Any) -> Running:  # noqa: ANN401 (op
 def _make_bare_bullet(setting: Setting) -> Running:
     """Make environments that only run our native loop with Bullet's own solver.
 
-    The first episode of random actions computes setpoints. The later episodes repeat
-    these setpoints, so nothing but the loop is measured.
+    The setpoints of the first episode are computed from random actions. Later episodes
+    repeat these setpoints, so that only the loop is measured.
     """
     if loop_name() != "native":
         raise RuntimeError("torch_panda was installed without its native loop")
@@ -276,7 +277,8 @@ class Contender(NamedTuple):
     Attributes:
         title: Name in the table.
         make: Makes the environments of a setting.
-        solver: Value of the environment variable `SOLVER_VARIABLE`; None leaves it.
+        solver: Value for the environment variable `SOLVER_VARIABLE`; None does not set
+            the variable.
     """
 
     title: str
@@ -316,7 +318,8 @@ def measure(name: str, setting: Setting, steps: int) -> Measurement:
         Exception: The contender's own error, or ``BrokenProcessPool`` if its process
             died.
     """
-    # A forked server imports this module only once, and has no threads yet.
+    # With "forkserver", a server process imports this module once and forks every turn.
+    # It has no threads, which would not survive a fork.
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
     with ProcessPoolExecutor(1, mp_context=context) as pool:
@@ -425,7 +428,7 @@ def compare(
                     try:
                         measurement = measure(name, setting, steps)
                         results.setdefault((setting, name), []).append(measurement)
-                    except Exception as error:  # of any library
+                    except Exception as error:  # a library may raise any error
                         running.remove((setting, name))
                         title = CONTENDERS[name].title
                         failures.append(f"{title}: {type(error).__name__}: {error}")

@@ -129,7 +129,7 @@ class Learner:
             for data in self.collector:
                 before, progress.steps = progress.steps, progress.steps + data.numel()
                 self.learn(data)
-                # See `make_unique`.
+                # `make_unique` has put the number of the worker into the ids.
                 worker = int(data[TRAJECTORY_KEY].flatten()[0]) % args.num_workers
                 self.send_weights(worker)
                 bar.update(data.numel())
@@ -141,7 +141,7 @@ class Learner:
                     break
 
     def learn(self, data: TensorDictBase) -> None:
-        """Store the batch of a worker, and take the gradient steps that are now due."""
+        """Store a worker's batch, and take the gradient steps that are then due."""
         stored = self.buffer[self.buffer.extend(data.reshape(-1))]
         self.agent.normalizer.update(stored["observation"], stored["desired_goal"])
         due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
@@ -268,7 +268,7 @@ def main(args: Args) -> None:
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)
-        # Plots should not name options that say where a run was computed.
+        # Plots need not name the options that say on which machines a run was computed.
         default = Args(
             env_id=args.env_id,
             address=args.address,

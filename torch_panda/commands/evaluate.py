@@ -30,10 +30,10 @@ class Args:
     episodes: Positive = 200
     """number of episodes"""
     tasks: Tasks = "random"
-    """starts and goals: those that the task draws ("random"), or the five evaluation
-    tasks ("fixed"), whose success is printed one by one"""
+    """starts and goals of the episodes: drawn at random ("random"), or those of the
+    five evaluation tasks ("fixed"), whose success is printed one by one"""
     num_envs: Positive = 32
-    """number of environments that are stepped in parallel"""
+    """number of environments stepped in parallel"""
     num_threads: Positive | None = None
     """number of threads that step the environments; None means one per core"""
     seed: Seed = 1_000

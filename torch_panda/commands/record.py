@@ -38,7 +38,7 @@ from torch_panda.learning.files import prepare, save
 from torch_panda.learning.limits import Finite, Positive, Seed, Weight, check_limits
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
-# Pictures, which are no part of the hash.
+# Entries of pictures, which the hash leaves out.
 PIXELS = ("pixels", ("next", "pixels"))
 
 
@@ -53,7 +53,7 @@ class Args:
     seed: Seed = 0
     """seed of the environments, or of the data set"""
     num_envs: Positive = 32
-    """number of environments that are stepped in parallel"""
+    """number of environments stepped in parallel"""
     num_threads: Positive | None = None
     """number of threads that step the environments; None means one per core"""
     noise_eps: Weight = 0.0
@@ -275,7 +275,7 @@ def write_episodes(args: Args, out: Path, parts: Parts) -> str:
     """Write the episodes of all parts as a data set.
 
     Returns:
-        Where it is, and how to read it.
+        The folder of the data set, and how to read it.
     """
     options = {**make_options(args), **fixed_options(args.kind)}
     with torch_panda.make(args.env_id, **options) as env:

@@ -64,7 +64,7 @@ class Args:
     batch_size: Positive = 1024
     """transitions per gradient step"""
     num_envs: Positive = 64
-    """number of environments that are stepped in parallel"""
+    """number of environments stepped in parallel"""
     seed: Seed = 0
     """seed of the environments and the sampling"""
     imports: Imports = ()
@@ -109,10 +109,10 @@ class Refinement:
             self.checkpoint.load()
 
     def run(self, stop: object = False) -> bool:
-        """Play, then imitate, until the end or until ``stop`` is true.
+        """Play and then imitate, until all steps are taken or until ``stop`` is true.
 
         Returns:
-            Whether the end was reached.
+            Whether all steps were taken.
 
         Raises:
             ValueError: No episode ended at a goal that the task could draw.
@@ -145,7 +145,7 @@ class Refinement:
         return True
 
     def play(self, stop: object) -> None:
-        """Play episodes, relabel them, and store those that succeed then."""
+        """Play episodes, relabel them, and store those that reach their new goal."""
         progress, last = self.progress, self.args.steps
         bar = tqdm(desc="playing", initial=progress.steps, total=last, unit="step")
         while progress.steps < last and not stop:
@@ -180,9 +180,10 @@ def relabel(
     Args:
         episode: The transitions, (steps,).
         task: Task, for its function `is_success`.
-        varies: Which entries of drawn goals differ between episodes, (goal_dim,) bool.
-            The other entries are not replaced. For example, a resting puck of Slide is
-            lower than all goals, so the height of the goal is kept.
+        varies: Whether each entry of the task's goals differs between episodes,
+            (goal_dim,) bool. The other entries are not replaced. For example, the
+            resting puck of Slide is lower than all goals, so the height of the goal is
+            kept.
 
     Returns:
         A copy of the episode, or None if its end does not succeed with the new goal.

@@ -50,7 +50,7 @@ DATA_FILE = "data.pt"  # file of a run's folder with the data that it generated
 
 @dataclass
 class Mode:
-    """The options that determine which other options there are."""
+    """The options that decide which other options exist; see `parse`."""
 
     offline: bool = False
     algo: str = ""
