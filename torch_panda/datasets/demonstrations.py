@@ -42,11 +42,11 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     else:
         content = files.read(path, "demonstrations", STORED_KEYS, finite=STORED_KEYS)
         try:
-            # (n,), or [episodes, steps] of the kinds other than expert.
+            # The batch shape is (n,), or [episodes, steps] for the data of `generate`.
             shape = content["action"].shape[:-1]
             demos = TensorDict(content, shape).select(*STORED_KEYS)
         except (AttributeError, RuntimeError, TypeError) as error:
-            # Lengths or types differ.
+            # The entries are not tensors, or their lengths differ.
             raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")

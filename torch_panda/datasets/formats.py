@@ -1,7 +1,7 @@
 """Formats of data sets of other libraries, and the interface of their modules.
 
-These formats store the seed of each episode. ``reset(seed=...)`` of
-`torch_panda.gymnasium_envs.GoalEnv` starts the episode again.
+These formats store the seed of each episode. With this seed, ``reset(seed=...)`` of
+`torch_panda.gymnasium_envs.GoalEnv` starts the same episode.
 """
 
 from collections.abc import Callable

@@ -170,9 +170,9 @@ def episode_seed(seed: int, number: int) -> int:
 
 
 def _spawn(seed: int, number: int) -> tuple[int, np.random.Generator]:
-    """Seed of an episode's environment, and the generator of everything else."""
+    """Seed of an episode's environment, and generator of its other random draws."""
     env_seed, other_seed = np.random.SeedSequence((seed, number)).spawn(2)
-    # set_env_seed takes an int64.
+    # `set_env_seed` takes an int64, so drop one of the 64 bits.
     value = int(env_seed.generate_state(1, np.uint64)[0] >> 1)
     return value, np.random.default_rng(other_seed)
 
@@ -248,7 +248,7 @@ class _Episodes:
         after["success"] = self._env.is_success(*goals)
 
     def _change_goals(self, row: TensorDictBase) -> None:
-        """Draw new goals where the expert has finished with the pursued one."""
+        """Draw a new goal where the expert has held or given up the pursued one."""
         success = row["next", "success"].squeeze(-1)
         self._steps_at_goal = torch.where(success, self._steps_at_goal + 1, 0)
         self._steps_since_goal += 1

@@ -29,7 +29,7 @@ class Writer:
         folder: Folder to create.
         env_id: Id of the environment that is recorded.
         env: The environment; it must observe ``pixels``.
-        kind: Not stored.
+        kind: Not used, because the format does not store the kind of data.
 
     Raises:
         ValueError: The folder exists already.
@@ -129,7 +129,7 @@ def read(path: Path) -> TensorDict:
 
     achieved, desired = column(GOALS, torch.float32).chunk(2, dim=-1)
     number = column("episode_index", torch.int64).squeeze(-1)
-    # Keep transitions whose next observation is the next frame.
+    # Keep the transitions whose next frame belongs to the same episode.
     kept = number[:-1] == number[1:]
     observed = {
         "observation": column(STATE, torch.float32),

@@ -48,7 +48,10 @@ class Writer:
         self.episodes: list[EpisodeBuffer] = []
 
     def add(self, episode: TensorDictBase, seed: int) -> None:
-        """Add an episode: observations and success have one more entry than actions."""
+        """Add an episode.
+
+        Observations and success have one more entry than actions, for the first state.
+        """
         success = torch.cat((episode["success"][:1], episode["next", "success"]))
         self.episodes.append(
             EpisodeBuffer(

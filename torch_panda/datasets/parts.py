@@ -1,4 +1,4 @@
-"""Parts of a data set that is being generated, in a folder until all are there."""
+"""A folder that keeps the parts of a data set until all of them are generated."""
 
 import json
 import shutil
@@ -14,11 +14,11 @@ RECIPE = "recipe.json"  # file of the options that determine the data
 
 
 class Parts:
-    """The folder of the finished parts, each a file named by its first episode.
+    """The folder of the finished parts. The name of a file is its first episode.
 
     Args:
         folder: The folder.
-        recipe: Options that determine the data, as JSON has them.
+        recipe: Options that determine the data, in the types that JSON has.
         resume: Whether to continue with the parts that the folder holds.
 
     Raises:
@@ -53,7 +53,7 @@ class Parts:
         return int(paths[-1].stem) + len(_read(paths[-1]))
 
     def add(self, part: TensorDictBase) -> None:
-        """Save a part [episodes, steps]; the first one creates the folder.
+        """Save a part [episodes, steps]. The first part creates the folder.
 
         Raises:
             OSError: The file cannot be written.
