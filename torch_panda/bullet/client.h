@@ -155,7 +155,7 @@ struct gripper { /* Gripper of gripper.py, if it has two joints */
 };
 
 /* Data from which the library computes Robot.setpoint. A setpoint has the targets of the
-   hand or the arm, then those of the fingers. */
+   hand or the arm, then the targets of the fingers. */
 struct actuation {
     int row_size;
     int column, num_displaced; /* numbers in the row that an action displaces */

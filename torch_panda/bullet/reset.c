@@ -60,8 +60,9 @@ static int restore(struct batch *batch, int env) {
     for (int k = 0; k < broad_phase->pair_size; k++)
         if (!set_filter(batch, env, broad_phase->pair[k], -1, 0, 0)) return 0;
     int cycle = broad_phase->cycle;
-    int past = (client->num_detections - broad_phase->num_detections) % cycle;
-    if (!detect(batch, env, (cycle - past) % cycle)) return 0;
+    int num_since_built =
+        (int)((client->num_detections - broad_phase->num_detections) % cycle);
+    if (!detect(batch, env, (cycle - num_since_built) % cycle)) return 0;
     for (int k = 0; k < broad_phase->num_links; k++) {
         const struct link *link = &broad_phase->links[k];
         if (!load_snapshot(batch, env, link->snapshot)) return 0;
