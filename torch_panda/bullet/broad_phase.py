@@ -28,9 +28,9 @@ from torch_panda.rotations import rotate_vector
 
 # Position to which `restore` moves all bodies before it inserts their links into the
 # tree of AABBs again, one by one [m]. Bullet inserts an AABB beside the closest AABBs
-# of the tree. This position is so far from the scene that the AABBs closest to a newly
-# inserted one are always those of links already inserted, and never those of links
-# that are still at this position.
+# of the tree. This position is so far from the scene that a new AABB is always beside
+# AABBs that were already inserted again, and never beside AABBs that are still at this
+# position.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
 # `restore` restores the number of detections modulo this cycle, that is, its lowest 8
 # bits. A detection reads one bit per level of the tree, and the trees of the shipped
@@ -138,11 +138,11 @@ class BroadPhase:
         therefore displaced by the vector from its centre of mass to the origin of its
         frame. In the link's snapshot, the whole body is displaced by this vector.
 
-        The importer also inserts a link in another orientation if the link's inertial
-        frame is rotated. This method does not imitate that, because no shipped robot
-        has such a link. For a robot that has one, all resets still lead to the same
-        broad phase. It differs from the broad phase that Bullet has after importing the
-        robot, so episodes may differ from those of plain pybullet.
+        The importer also inserts a link with a different orientation if the link's
+        inertial frame is rotated. This method does not imitate that, because no shipped
+        robot has such a link. For a robot that has one, all resets still lead to the
+        same broad phase. It differs from the broad phase that Bullet has after
+        importing the robot, so episodes may differ from episodes in plain pybullet.
         """
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):
