@@ -152,7 +152,7 @@ def _check_tree(file: str, robot: ElementTree.Element) -> None:
 def _read_joint(
     file: str, joint: ElementTree.Element, links: list[str]
 ) -> tuple[str, str]:
-    """Names of a joint's parent and child link. Refuse what Bullet could not build."""
+    """Names of a joint's parent and child link. Raise if Bullet could not build it."""
     owner = f"{file}: joint {joint.get('name')!r}"
     joint_type = joint.get("type")
     if joint_type not in _JOINT_TYPES:

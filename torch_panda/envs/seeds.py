@@ -58,8 +58,8 @@ class EpisodeSeeds:
     def physics_seed(self, env: int) -> np.random.SeedSequence:
         """The seed of the physics of the last episode for which `next_generator` ran.
 
-        Goals and objects are drawn from that generator. This seed makes another stream,
-        so that randomized physics do not change the drawn goals and objects.
+        Goals and objects are drawn from that generator. This seed starts a different
+        stream, so that randomized physics do not change the drawn goals and objects.
         """
         episode = (*self._streams[env], self._episodes[env] - 1)
         return np.random.SeedSequence(episode, spawn_key=(1,))

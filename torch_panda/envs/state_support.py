@@ -57,7 +57,7 @@ class StateSupport:
             name = type(env).__name__
             raise ValueError(
                 f"the state would not reach the environment, because torchrl's {name} "
-                f"passes on only what its state_spec names: add "
+                f"passes on only the entries that its state_spec names: add "
                 "torch_panda.envs.StateTransform to the environment (of each worker), "
                 f"and give the state under the key {NESTED_STATE!r}, as in "
                 f"reset(TensorDict({{{NESTED_STATE!r}: state}}, env.batch_size), "

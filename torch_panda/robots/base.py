@@ -66,7 +66,7 @@ class Robot(Configured):
         ee_orientation: Orientation that the end-effector keeps under the control type
             "ee", quaternion xyzw, world frame.
         num_arm_joints: Number of movable joints that belong to the arm, which are the
-            first ones; None means all but those of the gripper. Further joints keep
+            first ones; None means all joints except the gripper's. Further joints keep
             their start positions.
         control_type: Meaning of the arm's numbers. "ee": displacement of the
             end-effector along x, y and z of the world. "ee_pose": this displacement and
