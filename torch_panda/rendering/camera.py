@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from torch_panda.rotations import rotate_vector
 
-# Depth of the background, up to rounding.
+# Depths from here on are background, whose depth is 1 up to rounding.
 _BACKGROUND_DEPTH = np.float32(1 - 1e-6)
 
 

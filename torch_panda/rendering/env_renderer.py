@@ -16,8 +16,8 @@ class EnvRenderer:
     """Draws one environment at a time, in a copy of the scene with visual shapes.
 
     The physics clients therefore need no visual shapes, and one renderer serves many
-    environments. The renderer "tiny" always draws the markers. For ``renderer`` and
-    ``mesh_cell``, see `VisualClient`.
+    environments. Markers are always drawn by "tiny", also if ``renderer`` is "egl". For
+    ``renderer`` and ``mesh_cell``, see `VisualClient`.
     """
 
     def __init__(

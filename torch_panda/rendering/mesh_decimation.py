@@ -106,8 +106,9 @@ def merge_vertices(
     keys = np.column_stack((cube[flat[:, 0]], color[flat[:, 1]]))
     keys, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1, 3)
-    # Remove triangles that shrank to a line or a point. Then remove duplicates: turn
-    # each triangle so that its lowest cube comes first, and keep one of equal ones.
+    # Remove triangles that shrank to a line or a point. Then remove duplicates: rotate
+    # the corners of each triangle so that the cube with the lowest number comes first,
+    # and keep one of the triangles that are now equal.
     in_cubes = keys[faces, 0]
     has_area = (in_cubes != np.roll(in_cubes, 1, axis=1)).all(axis=1)
     faces, in_cubes = faces[has_area], in_cubes[has_area]
@@ -156,7 +157,7 @@ def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
 
 
 def _texture_of(path: Path) -> Path | None:
-    """The first texture in the materials of an .obj file; Bullet uses no other."""
+    """The first texture in the materials of an .obj file, as Bullet uses only one."""
     for library in _values(path, "mtllib"):
         materials = path.with_name(library)
         if materials.is_file():

@@ -20,8 +20,8 @@ MESH_CELL = 0.003  # edge length of the cells in which vertices are merged [m]
 YELLOW = (255, 190, 0)
 
 Floats = npt.NDArray[np.float64]
-# Of a movable joint: node of the link that it moves, origin and rotation in the
-# parent's frame, axis, and whether the link slides instead of turning.
+# A movable joint: node of the link that it moves, origin and rotation in the parent's
+# frame, axis, and whether it is prismatic (otherwise revolute).
 Joint = tuple[Any, Floats, SO3, Floats, bool]
 
 
@@ -69,7 +69,7 @@ class WebBodies:
         marker_pose: Floats,
         arrows: Floats,
     ) -> None:
-        """Show the bodies of one environment, and arrows.
+        """Show the bodies of one environment, and arrows for contact forces.
 
         Args:
             joint_position: Positions of the robot's joints (n_joints,) [rad] or [m].
@@ -78,10 +78,10 @@ class WebBodies:
             marker_pose: Poses of the markers (n_markers, 7).
             arrows: Starts and ends of arrows (n, 2, 3), world frame [m].
         """
-        for (node, origin, rotation, axis, slides), q in zip(
+        for (node, origin, rotation, axis, is_prismatic), q in zip(
             self._joints, joint_position, strict=True
         ):
-            if slides:
+            if is_prismatic:
                 node.position = origin + rotation @ (axis * q)
             else:
                 node.wxyz = (rotation @ SO3.exp(axis * q)).wxyz
@@ -139,9 +139,9 @@ class WebBodies:
             axis = joint.find("axis")
             direction = _numbers(None if axis is None else axis.get("xyz"), (1, 0, 0))
             if joint.get("name") in movable:
-                slides = joint.get("type") == "prismatic"
+                is_prismatic = joint.get("type") == "prismatic"
                 handles[str(joint.get("name"))] = (
-                    node, origin, rotation, direction, slides,
+                    node, origin, rotation, direction, is_prismatic,
                 )  # fmt: skip
             return names[link]
 
@@ -168,7 +168,7 @@ class WebBodies:
         return handles
 
     def _add_shape(self, name: str, body: CreateBody) -> Any:  # noqa: ANN401 (viser's)
-        """Add a body of one shape; return its node, or None if it is invisible."""
+        """Add a body. Return its node, or None for an invisible marker."""
         visual, shape = body.visual, body.shape
         if isinstance(shape, Box) and visual.texture is not None and not body.is_marker:
             return self._tree.add_mesh_trimesh(
