@@ -118,7 +118,7 @@ class GoalFunctions:
         desired_goal: ArrayLike,
         info: Any = None,  # noqa: ANN401
     ) -> NDArray[np.bool_]:
-        """Always false, (...): a goal never truncates an episode, only its length."""
+        """Always false, (...): only the length of an episode truncates it."""
         goals = _tensor(achieved_goal), _tensor(desired_goal)
         return _array(torch.zeros_like(self.torch_env.is_success(*goals)))
 
@@ -128,5 +128,5 @@ def _tensor(goal: ArrayLike) -> Tensor:
 
 
 def _array(values: Tensor) -> NDArray[Any]:
-    """Convert (..., 1) to an array (...), or to a numpy scalar if that is ()."""
+    """Convert (..., 1) to an array (...), or (1,) to a numpy scalar."""
     return values.squeeze(-1).numpy()[()]

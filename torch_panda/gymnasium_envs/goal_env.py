@@ -29,7 +29,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         env: An id, or a `RobotTaskEnv` of batch size []. An environment that is made
-            from an id never truncates an episode, because ``gymnasium.make`` does.
+            from an id leaves truncation to the ``TimeLimit`` of ``gymnasium.make``.
         render_mode: "rgb_array" or None.
         render_camera: Camera of `render`; None means panda-gym's view in 720 x 480
             pixels.

@@ -153,8 +153,8 @@ class GoalVectorEnv(
         step_mask = ~ended.unsqueeze(1) if resets_now else None
         after = episodes.step(arrays.action(actions), step_mask)
         if resets_now:
-            # The reset returns entries of all environments. Those of the environments
-            # that took the step are the same as before.
+            # The reset returns the entries of all environments. The entries of those
+            # that took the step are the same as after the step.
             after |= episodes.reset(_indices(ended))
         outcome = (
             after["reward"].squeeze(1).double().numpy(),

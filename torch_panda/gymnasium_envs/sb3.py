@@ -25,8 +25,8 @@ class SB3VecEnv(VecEnv):
     """A `GoalVectorEnv` for Stable-Baselines3.
 
     All environments share one object, ``vector_env``. `get_attr` and `env_method`
-    therefore read its attributes and call its methods, and return a list in which the
-    same result stands once per index.
+    therefore read its attributes and call its methods once, and repeat the result for
+    each index.
 
     Args:
         env: An id, or a `RobotTaskEnv` of batch size [num_envs].
