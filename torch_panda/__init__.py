@@ -85,5 +85,6 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401
     return getattr(import_module(_MODULES[name]), name)
 
 
-# So that `gymnasium.register_envs(torch_panda)` reads as for any other package.
+# Importing the package registers the ids, so that Gymnasium users can write
+# `gymnasium.register_envs(torch_panda)`, as for other packages.
 register_with_gymnasium()

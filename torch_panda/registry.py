@@ -326,7 +326,7 @@ def register(
 
 
 def find_registration(env_id: str) -> Registration:
-    """Robot, task and episode length of an id.
+    """Return the registration of an id.
 
     Raises:
         ValueError: The id is unknown.
