@@ -2,9 +2,13 @@
 
 With a new random action in every step, the hand hardly leaves its place. If it repeats
 one random action for many steps, it drifts away from the table. Here the hand moves to
-a random point in the region of the objects, and then to the next point. The cube of
-Push then moves in 52 % of the episodes, compared with 23 % for random actions.
+a random point, and then to the next point. Half of the points are near an object, so
+that the hand pushes it on its way. If all actions explore, the cube of Push moves in
+79 % of the episodes. It moves in 53 % if all points are anywhere over the table, and in
+23 % if the actions are random.
 """
+
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +18,11 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 # Corners of the box of points: the middle of the table, world frame [m].
 LOWEST_POINT, HIGHEST_POINT = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
+# Half of the points are near an object: at most OBJECT_DISTANCE from its centre along x
+# and along y, and up to the heights in OBJECT_HEIGHTS below and above its centre [m].
+NEAR_OBJECTS = 0.5
+OBJECT_DISTANCE = 0.1
+OBJECT_HEIGHTS = (-0.02, 0.06)
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point
 NOISE = 0.2  # standard deviation of the Gaussian noise on actions towards a point
@@ -41,6 +50,8 @@ class RandomPointModule(TensorDictModuleBase):
             three entries of ``observation`` are its position [m].
         num_arm_actions: Number of entries of an action that move the arm. They come
             first.
+        objects: Indices in ``observation`` at which the positions of objects start [m].
+            Without objects, all points are anywhere over the table.
     """
 
     steps_left: Tensor
@@ -56,6 +67,7 @@ class RandomPointModule(TensorDictModuleBase):
         action_scale: float,
         moves_joints: bool,
         num_arm_actions: int,
+        objects: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.in_keys = ["observation", "action"]
@@ -70,6 +82,7 @@ class RandomPointModule(TensorDictModuleBase):
         )
         self.action_scale = action_scale
         self.moves_joints = moves_joints
+        self.objects = tuple(objects)
         self.register_buffer("steps_left", torch.zeros(num_envs, dtype=torch.int64))
         self.register_buffer("point", torch.zeros(num_envs, num_arm_actions))
         gripper_size = action_size - num_arm_actions
@@ -79,7 +92,7 @@ class RandomPointModule(TensorDictModuleBase):
         """Replace the actions of the environments that move to a point."""
         if exploration_type() not in (ExplorationType.RANDOM, None):
             return tensordict
-        self._start_moves()
+        self._start_moves(tensordict["observation"])
         arm = self._move(tensordict["observation"])
         action = torch.cat((arm, self.gripper), dim=-1)
         action = (action + NOISE * torch.randn_like(action)).clamp(-1.0, 1.0)
@@ -89,7 +102,7 @@ class RandomPointModule(TensorDictModuleBase):
             "action", torch.where(moves, action, tensordict["action"])
         )
 
-    def _start_moves(self) -> None:
+    def _start_moves(self, observation: Tensor) -> None:
         """Draw which environments without a point get one, and draw the points."""
         draws = torch.rand_like(self.start_probability)
         starts = (self.steps_left == 0) & (draws < self.start_probability)
@@ -99,11 +112,28 @@ class RandomPointModule(TensorDictModuleBase):
         if self.moves_joints:
             point = JOINT_RANGE * (2 * torch.rand_like(self.point) - 1)
         else:
-            low, high = map(self.point.new_tensor, (LOWEST_POINT, HIGHEST_POINT))
-            point = low + (high - low) * torch.rand_like(self.point)
+            point = self._draw_points(observation)
         gripper = 2 * torch.rand_like(self.gripper) - 1
         self.point.copy_(torch.where(starts.unsqueeze(-1), point, self.point))
         self.gripper.copy_(torch.where(starts.unsqueeze(-1), gripper, self.gripper))
+
+    def _draw_points(self, observation: Tensor) -> Tensor:
+        """Draw a point for the hand in each environment, (num_envs, 3) [m]."""
+        low, high = map(self.point.new_tensor, (LOWEST_POINT, HIGHEST_POINT))
+        point = low + (high - low) * torch.rand_like(self.point)
+        if not self.objects:
+            return point
+        starts = torch.tensor(self.objects, device=point.device)
+        choice = torch.randint(len(starts), (len(point), 1), device=point.device)
+        axes = torch.arange(3, device=point.device)
+        centre = observation.gather(-1, starts[choice] + axes)
+        lowest, highest = OBJECT_HEIGHTS
+        low = point.new_tensor((-OBJECT_DISTANCE, -OBJECT_DISTANCE, lowest))
+        high = point.new_tensor((OBJECT_DISTANCE, OBJECT_DISTANCE, highest))
+        near = centre + low + (high - low) * torch.rand_like(point)
+        near[:, 2].clamp_(min=0.0)  # not below the table
+        is_near = torch.rand_like(point[:, :1]) < NEAR_OBJECTS
+        return torch.where(is_near, near, point)
 
     def _move(self, observation: Tensor) -> Tensor:
         """Return the arm's actions towards the points, before noise and clipping."""

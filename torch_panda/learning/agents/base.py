@@ -90,12 +90,15 @@ class Agent(nn.Module, ABC):
         """Make the module of the exploration "points"."""
         spaces = self.spaces
         gripper_size = int(spaces.has_free_gripper)
+        geometry = spaces.geometry
         return RandomPointModule(
             torch.linspace(*self.hp.random_eps, spaces.num_envs),
             action_size=spaces.action_size,
             action_scale=spaces.action_scale,
             moves_joints=spaces.moves_joints,
             num_arm_actions=spaces.action_size - gripper_size,
+            # The first position of an observation is the hand's.
+            objects=() if geometry is None else geometry.positions[1:],
         )
 
     def update(
