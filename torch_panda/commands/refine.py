@@ -151,7 +151,7 @@ class Refinement:
         while progress.steps < last and not stop:
             reseed(self.env)
             policy = self.agent.policy
-            # torchrl makes the members of this enum strings.
+            # mypy takes the members of this enum for strings.
             exploration = ExplorationType.DETERMINISTIC
             episodes = play(self.env, policy, exploration)  # type: ignore[arg-type]
             relabelled = [

@@ -67,7 +67,7 @@ def add_noise(
 def play(
     env: torch_panda.RobotTaskEnv,
     expert: TensorDictModuleBase,
-    # torchrl makes the members of this enum strings.
+    # mypy takes the members of this enum for strings.
     exploration: ExplorationType = ExplorationType.RANDOM,  # type: ignore[assignment]
 ) -> list[TensorDictBase]:
     """Play one new episode in every environment.

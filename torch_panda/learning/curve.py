@@ -33,8 +33,8 @@ class Curve:
         out: Folder of curve.csv, curve.png and checkpoint.pt.
         device: Device of the environments' outputs.
         logger: Also gets each row, under the names of the columns.
-        offline: Whether the agent learns offline. Its steps are gradient steps, and
-            its policy is also evaluated from the five fixed tasks.
+        offline: Whether the agent learns offline. If so, steps are gradient steps, and
+            the policy is also evaluated from the five `evaluation_tasks`.
     """
 
     def __init__(
@@ -123,7 +123,6 @@ def draw_seed() -> int:
 def reseed(env: RobotTaskEnv) -> None:
     """Seed the next episodes from torch's global generator.
 
-    A checkpoint saves the state of this generator. So a resumed run has the same
-    episodes.
+    A run saves the state of this generator. So a resumed run has the same episodes.
     """
     env.set_seed(draw_seed())
