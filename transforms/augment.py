@@ -27,8 +27,8 @@ class HindsightAugment(BufferTransform):
             episode.
 
     Raises:
-        TypeError: an argument is unknown.
-        ValueError: an argument has a value that is not accepted.
+        TypeError: An argument is unknown.
+        ValueError: An argument has a value that is not accepted.
     """
 
     _shown = ("strategy", "k")

@@ -72,8 +72,8 @@ class BufferTransform(envs.Transform):
             global generator.
 
     Raises:
-        TypeError: an argument is unknown.
-        ValueError: an argument has a value that is not accepted.
+        TypeError: An argument is unknown.
+        ValueError: An argument has a value that is not accepted.
     """
 
     goal_parts: tuple[int, ...] | None = None
@@ -163,8 +163,8 @@ class BufferTransform(envs.Transform):
                 environment's functions.
 
         Raises:
-            TypeError: an option is unknown.
-            ValueError: the environment lacks a function that is not among the options,
+            TypeError: An option is unknown.
+            ValueError: The environment lacks a function that is not among the options,
                 or the environment's transforms normalise a goal.
         """
         goal_keys = {
@@ -253,7 +253,7 @@ class BufferTransform(envs.Transform):
         """Binds the transform to the buffer.
 
         Raises:
-            RuntimeError: the transform belongs to another buffer.
+            RuntimeError: The transform belongs to another buffer.
         """
         if buffer is None:
             return
@@ -288,9 +288,9 @@ class BufferTransform(envs.Transform):
         """Checks that hindsight is possible with the buffer's transforms and its data.
 
         Raises:
-            RuntimeError: the buffer has a `MultiStepTransform`.
-            KeyError: entries are missing in the data.
-            ValueError: the goals have a wrong type, or do not fit `goal_parts`.
+            RuntimeError: The buffer has a `MultiStepTransform`.
+            KeyError: Entries are missing in the data.
+            ValueError: The goals have a wrong type, or do not fit `goal_parts`.
         """
         if any(isinstance(t, envs.MultiStepTransform) for t in get_chain(self)):
             raise RuntimeError(MULTI_STEP_ERROR)

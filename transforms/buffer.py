@@ -19,7 +19,7 @@ def find_buffer() -> tuple[ReplayBuffer | None, str]:
         calling, as in `transform.forward(batch)`: None and "".
 
     Raises:
-        RuntimeError: the buffer replaces stored rows (`rb[i] = ...`).
+        RuntimeError: The buffer replaces stored rows (`rb[i] = ...`).
     """
     frame = inspect.currentframe()
     while frame is not None:

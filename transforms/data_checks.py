@@ -34,7 +34,7 @@ def check_goals_agree(batch: TensorDictBase, rewriter: Rewriter) -> None:
     """Checks that every transition has the same desired goal before and after it.
 
     Raises:
-        ValueError: the two goals of a transition differ.
+        ValueError: The two goals of a transition differ.
     """
     goals, next_goals = batch.get(rewriter.goal_key), batch.get(rewriter.next_goal_key)
     if torch.equal(goals, next_goals):
@@ -96,7 +96,7 @@ class DataCheck:
         """Checks transitions, of any batch shape.
 
         Raises:
-            ValueError: an entry or the rewards would be wrong after relabelling.
+            ValueError: An entry or the rewards would be wrong after relabelling.
         """
         if self._is_finished:
             return
@@ -155,7 +155,7 @@ class DataCheck:
         """Refuses entries that contain the desired goal in adjacent columns.
 
         Raises:
-            ValueError: an entry contains a copy.
+            ValueError: An entry contains a copy.
         """
         achieved, desired = self._get_goals(rows)
         # If the goal is achieved, an observation of the object may rightly equal it.
@@ -250,7 +250,7 @@ class DataCheck:
         shifted, so the check raises an error. Without such a fit, the check warns.
 
         Raises:
-            ValueError: the rewards were scaled or shifted.
+            ValueError: The rewards were scaled or shifted.
         """
         rewriter = self._rewriter
         stored, goals = rows.get(rewriter.reward_key), rows.get(rewriter.goal_key)

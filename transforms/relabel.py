@@ -43,8 +43,8 @@ class HindsightRelabel(SampleTimeTransform):
             of relabelled rows.
 
     Raises:
-        TypeError: an argument is unknown.
-        ValueError: an argument has a value that is not accepted.
+        TypeError: An argument is unknown.
+        ValueError: An argument has a value that is not accepted.
     """
 
     _shown = ("strategy", "her_ratio", "unit", "goal_parts")

@@ -50,7 +50,7 @@ class Rewriter:
         """Checks that the batch has all entries that this class reads or rewrites.
 
         Raises:
-            KeyError: entries are missing.
+            KeyError: Entries are missing.
         """
         needed = [self.next_achieved_key, self.goal_key, self.next_goal_key]
         needed += [self.reward_key, DONE]
@@ -146,7 +146,7 @@ def call_goal_function(
         stored: The entry that the values belong to, (m, 1).
 
     Raises:
-        ValueError: the function did not return a tensor (n, 1).
+        ValueError: The function did not return a tensor (n, 1).
     """
     with torch.no_grad():  # the function may be a learned network
         values = function(achieved, desired)

@@ -185,7 +185,7 @@ class SampleTimeTransform(BufferTransform):
             `TensorStorage` of a buffer with this transform. The tensors are not copied.
 
         Raises:
-            RuntimeError: the transform has remembered other transitions before.
+            RuntimeError: The transform has remembered other transitions before.
         """
         if self._memory.count:
             raise RuntimeError(
@@ -218,7 +218,7 @@ def _check_layout(
         is_padded: Whether some rows are padding.
 
     Raises:
-        RuntimeError: the buffer would write them in another order, or has padding that
+        RuntimeError: The buffer would write them in another order, or has padding that
             cannot be removed.
     """
     ndim, writer = buffer.storage.ndim, type(buffer.writer)

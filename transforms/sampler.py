@@ -42,8 +42,8 @@ class GoalSampler(SampleTimeTransform):
             `BufferTransform` except `strategy`.
 
     Raises:
-        TypeError: an argument is unknown.
-        ValueError: an argument has a value that is not accepted.
+        TypeError: An argument is unknown.
+        ValueError: An argument has a value that is not accepted.
     """
 
     _shown = ("strategies", "discount", "unit")

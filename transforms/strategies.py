@@ -55,7 +55,7 @@ class Mixture:
         """Makes a mixture from one strategy, or from strategies mapped to weights.
 
         Raises:
-            ValueError: a strategy is unknown, a weight is not positive and finite, or
+            ValueError: A strategy is unknown, a weight is not positive and finite, or
                 the discount is not within [0, 1].
         """
         if not 0 <= discount <= 1:
@@ -142,7 +142,7 @@ def choose_steps(
         generator: Generator of the random draws; None means torch's global generator.
 
     Raises:
-        ValueError: a user's function did not return integers from `first` to `end - 1`.
+        ValueError: A user's function did not return integers from `first` to `end - 1`.
     """
     if strategy == "current":
         return step

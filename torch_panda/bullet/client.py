@@ -77,7 +77,7 @@ class PhysicsClient:
         physics: Parameters of the integration.
 
     Raises:
-        ImportError: the C API of the installed pybullet is not the supported one.
+        ImportError: The C API of the installed pybullet is not the supported one.
         BulletError: Bullet could not create a client.
 
     Attributes:
@@ -207,7 +207,7 @@ class PhysicsClient:
             visual: How renderers draw the box.
 
         Raises:
-            ValueError: the mass is negative or not finite.
+            ValueError: The mass is negative or not finite.
         """
         return self._create_body(Box(_vector(half_extents)), mass, position, visual)
 
@@ -341,7 +341,7 @@ class PhysicsClient:
         A coefficient that is None stays as it is.
 
         Raises:
-            ValueError: a coefficient is negative or not finite.
+            ValueError: A coefficient is negative or not finite.
         """
         self.set_dynamics(
             body, link, lateral_friction=lateral, spinning_friction=spinning
@@ -376,7 +376,7 @@ class PhysicsClient:
                 [N s/m].
 
         Raises:
-            ValueError: a number is negative or not finite.
+            ValueError: A number is negative or not finite.
         """
         numbers = {
             "mass": mass,
@@ -404,7 +404,7 @@ class PhysicsClient:
         maximum of 500 N m or 500 N.
 
         Raises:
-            ValueError: the force is negative or not finite.
+            ValueError: The force is negative or not finite.
         """
         check_not_negative(force=force)
         handle, info = self.connection.handle, capi.JointInfo()

@@ -36,7 +36,7 @@ class Connection:
         """Bullet's handle of the client.
 
         Raises:
-            BulletError: the client is closed.
+            BulletError: The client is closed.
         """
         if self._handle is None:
             raise client_closed()
@@ -59,7 +59,7 @@ class Connection:
             Handle of the status, valid until the next command.
 
         Raises:
-            BulletError: the client is closed, or Bullet answered with a different code.
+            BulletError: The client is closed, or Bullet answered with a different code.
         """
         status: int = capi.submit(self.handle, command)
         return check_status(status, expected, action)

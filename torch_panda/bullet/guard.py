@@ -12,7 +12,7 @@ class ThreadGuard:
     may enter again.
 
     Raises:
-        BulletError: another thread is inside.
+        BulletError: Another thread is inside.
     """
 
     def __init__(self) -> None:

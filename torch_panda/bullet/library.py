@@ -48,7 +48,7 @@ def bind(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any: 
     """Declare a C function with its name, its result type and its argument types.
 
     Raises:
-        ImportError: the library does not export the name.
+        ImportError: The library does not export the name.
     """
     try:
         function = getattr(library, name)

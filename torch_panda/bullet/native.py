@@ -242,7 +242,7 @@ class Library:
         path: Path of the compiled file.
 
     Raises:
-        OSError: the file cannot be loaded.
+        OSError: The file cannot be loaded.
     """
 
     def __init__(self, path: str) -> None:
@@ -315,8 +315,8 @@ def loop_name() -> LoopName:
     Without the library, this warns once per process that the Python loop is slower.
 
     Raises:
-        ImportError: the library was compiled from sources of another version.
-        ValueError: the environment variable names an unknown loop, or names "native"
+        ImportError: The library was compiled from sources of another version.
+        ValueError: The environment variable names an unknown loop, or names "native"
             although there is no library.
     """
     name = os.environ.get(LOOP_VARIABLE) or None

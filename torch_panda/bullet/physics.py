@@ -36,7 +36,7 @@ class PhysicsParams:
             least squares.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: An argument is out of range.
     """
 
     timestep: float = 1 / 500
@@ -104,7 +104,7 @@ def read_physics(physics: "PhysicsParams | PhysicsName") -> PhysicsParams:
     """Look up a preset by its name; `PhysicsParams` are returned unchanged.
 
     Raises:
-        ValueError: there is no preset of this name.
+        ValueError: There is no preset of this name.
     """
     if isinstance(physics, PhysicsParams):
         return physics

@@ -32,7 +32,7 @@ class VectorSimulation:
     Raises:
         BulletError: ``build`` built a different scene in a later client.
         TypeError: ``build`` did not return a `Scene`.
-        ValueError: the environment variable ``TORCH_PANDA_LOOP`` is neither "native"
+        ValueError: The environment variable ``TORCH_PANDA_LOOP`` is neither "native"
             (threads of C step the clients) nor "ctypes" (Python threads step them),
             or it is "native" and the C library is missing.
 

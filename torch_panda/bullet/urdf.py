@@ -51,7 +51,7 @@ def find_urdf(path: str | Path) -> str:
         path: Path of the file, or its path among the files that pybullet ships.
 
     Raises:
-        FileNotFoundError: the file is in neither place.
+        FileNotFoundError: The file is in neither place.
     """
     spec = importlib.util.find_spec("pybullet_data")
     assert spec is not None and spec.origin is not None  # part of pybullet's wheel
@@ -68,7 +68,7 @@ def parse_urdf(file: str | Path) -> ElementTree.Element:
     Text before and after the element is ignored, as by Bullet's own parser.
 
     Raises:
-        ValueError: the file has no <robot> element, or is not XML.
+        ValueError: The file has no <robot> element, or is not XML.
     """
     text = Path(file).read_text(errors="replace")
     first, end = re.search(r"<robot\b", text), "</robot>"
@@ -240,7 +240,7 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     The tool is the last link of the copy and is named "tool".
 
     Raises:
-        ValueError: the URDF has no link of the name to which the tool is fixed.
+        ValueError: The URDF has no link of the name to which the tool is fixed.
     """
     source = Path(file).absolute()
     robot = parse_urdf(source)

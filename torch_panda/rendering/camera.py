@@ -33,7 +33,7 @@ class Camera:
             twice for them, so a picture without shadows takes half the time.
 
     Raises:
-        ValueError: a size, a distance or an angle is out of range.
+        ValueError: A size, a distance or an angle is out of range.
     """
 
     target: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -128,7 +128,7 @@ def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
         size: Height and width, or one number for both [pixels]; None keeps the size.
 
     Raises:
-        ValueError: the size is neither an integer nor a pair of integers.
+        ValueError: The size is neither an integer nor a pair of integers.
     """
     if size is None:
         return camera

@@ -29,7 +29,7 @@ def check_renderer(renderer: str) -> None:
     """Make sure that a renderer works on this machine.
 
     Raises:
-        ValueError: there is no renderer of this name.
+        ValueError: There is no renderer of this name.
         RuntimeError: EGL does not work on this machine.
     """
     check_choice("renderer", renderer, get_args(RendererName))

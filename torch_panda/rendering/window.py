@@ -30,7 +30,7 @@ class Window:
             ``height`` are not used.
 
     Raises:
-        BulletError: there is no display, or no OpenGL on it.
+        BulletError: There is no display, or no OpenGL on it.
     """
 
     def __init__(self, simulation: VectorSimulation, camera: Camera) -> None:
@@ -51,7 +51,7 @@ class Window:
         """Show an environment in its current state.
 
         Raises:
-            BulletError: the window is closed.
+            BulletError: The window is closed.
         """
         self._client.pose(self._simulation.scene, self._simulation.state, env)
 
