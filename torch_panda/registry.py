@@ -218,7 +218,7 @@ def make(
     sensors: Sequence[Sensor | str] = (),
     task_options: Options | None = None,
     robot_options: Options | None = None,
-    **options: Any,  # noqa: ANN401 (those of RobotTaskEnv)
+    **options: Any,  # noqa: ANN401 (options of RobotTaskEnv)
 ) -> RobotTaskEnv:
     """Make the environments of an id.
 

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command.
 
     Args:
-        arguments: Name and options of the command. None means those of the command
+        arguments: Name and options of the command; None takes them from the command
             line.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)

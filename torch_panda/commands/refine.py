@@ -43,7 +43,7 @@ from torch_panda.learning.policy_files import SavedPolicy
 from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
-LEARNING_RATE = 0.3  # first learning rate, as a fraction of that of training
+LEARNING_RATE = 0.3  # first learning rate, as a fraction of the rate of training
 
 
 @dataclass

@@ -105,7 +105,7 @@ def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
     """Read the transitions (n,) to learn from, or generate them into the run's folder.
 
     Raises:
-        ValueError: There are no such data, or they do not fit the task.
+        ValueError: The data do not exist or do not fit the task.
         OSError: Generated data cannot be written.
     """
     path = Path(args.data)

@@ -51,7 +51,7 @@ class FormatModule(Protocol):
         """The folder that a new data set will have.
 
         Raises:
-            ValueError: The name is invalid, or there is such a data set.
+            ValueError: The name is invalid, or the data set exists already.
         """
 
     def read(self, path: Path) -> TensorDict:

@@ -37,7 +37,7 @@ def generate(
     num_envs: int,
     num_threads: int | None = None,
     progress: Callable[[int], object] | None = None,
-    **make_options: Any,  # noqa: ANN401 (those of `torch_panda.make`)
+    **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> TensorDict:
     """Generate a data set of whole episodes.
 
@@ -95,7 +95,7 @@ def generate_parts(
     num_threads: int | None = None,
     progress: Callable[[int], object] | None = None,
     first: int = 0,
-    **make_options: Any,  # noqa: ANN401 (those of `torch_panda.make`)
+    **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> Iterator[TensorDict]:
     """Generate the data set of `generate` in parts of at most ``num_envs`` episodes.
 
@@ -152,7 +152,7 @@ def size(
     env_id: str,
     kind: Kind,
     transitions: int,
-    **make_options: Any,  # noqa: ANN401 (those of `torch_panda.make`)
+    **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> tuple[int, int]:
     """Number of episodes of a data set, and their number of steps."""
     options = {**make_options, **fixed_options(kind)}

@@ -139,10 +139,10 @@ def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:
 
 
 def check_no_arguments(arguments: dict[str, Any]) -> None:
-    """Check that there are no arguments of `torch_panda.make`, for a `RobotTaskEnv`.
+    """Refuse arguments of `torch_panda.make` that come with a `RobotTaskEnv`.
 
     Raises:
-        TypeError: There is such an argument.
+        TypeError: There is at least one argument.
     """
     if arguments:
         raise TypeError(

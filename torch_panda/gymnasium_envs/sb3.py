@@ -76,8 +76,8 @@ class SB3VecEnv(VecEnv):
             self._actions
         )
         done = terminated | truncated
-        # If an episode ended, report the success of its last step, not that of the
-        # reset.
+        # If an episode ended, report the success of its last step. `infos` holds the
+        # success at the start of the next episode.
         success = np.where(
             done,
             infos.get("final_info", {}).get("is_success", False),

@@ -88,7 +88,7 @@ def evaluate(
     seed: int | None = 1_000,
     num_envs: int = 32,
     tasks: Tasks = "random",
-    **options: Any,  # noqa: ANN401 (those of `make`)
+    **options: Any,  # noqa: ANN401 (options of `make`)
 ) -> Evaluation:
     """Evaluate a policy on an environment, without exploration noise.
 

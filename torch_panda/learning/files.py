@@ -77,7 +77,7 @@ def read(
     keys: Iterable[NestedKey],
     *,
     finite: Iterable[NestedKey] = (),
-    **options: Any,  # noqa: ANN401 (those of torch.load)
+    **options: Any,  # noqa: ANN401 (options of torch.load)
 ) -> Any:  # noqa: ANN401 (the content)
     """Read a file that `save` wrote. Code in the file is not run.
 

@@ -51,7 +51,7 @@ class Policy(TensorDictModuleBase):
         """Write an action for every observation and goal.
 
         Raises:
-            ValueError: The size of observations or goals is not that of the training.
+            ValueError: Observations or goals have another size than in the training.
         """
         state = tensordict.select(*self.in_keys)
         sizes = (self.spaces.observation_size, self.spaces.goal_size)
@@ -120,8 +120,8 @@ class SavedPolicy:
                 environments as in the training.
 
         Raises:
-            ValueError: The sizes of the environments' spaces are not those of the
-                training, or the weights do not fit the hyperparameters.
+            ValueError: The environments' spaces have other sizes than in the training,
+                or the weights do not fit the hyperparameters.
         """
         spaces = self.spaces
         if env is not None:
@@ -183,8 +183,8 @@ def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
     cls: type[AnyHyperparameters] = Hyperparameters
     if isinstance(agent, OfflineAgent):
         cls = agent.Hyperparameters
-    # `agent.hp` may be the options of a run, which have further fields. The file does
-    # not need those.
+    # `agent.hp` may be the options of a run. Leave out the fields that are not
+    # hyperparameters.
     hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}
     content = {
         "env_id": env_id,

@@ -34,10 +34,10 @@ def pretrain(
     Args:
         checkpoint: State of the run.
         demos: Demonstrations.
-        updates: Total number of gradient steps, including those before a resume.
+        updates: Total number of gradient steps, including the steps before a resume.
         batch_size: Transitions per gradient step.
-        learning_rate: Learning rate of the first step, as a fraction of that of
-            training.
+        learning_rate: Learning rate of the first step, as a fraction of the learning
+            rate of training.
         stop: Object that becomes true to end the imitation early, such as `StopSignal`.
     """
     agent, progress = checkpoint.agent, checkpoint.progress

@@ -40,7 +40,7 @@ class Agent(nn.Module, ABC):
             deterministic under ``ExplorationType.DETERMINISTIC``.
         explore: The same module with the exploration noise of the algorithm.
         optimizer: Optimizer of all trained parameters.
-        updates: Number of gradient steps so far, without those of imitation.
+        updates: Number of gradient steps so far, without imitation.
 
     Raises:
         ValueError: The hyperparameters do not fit the spaces.
