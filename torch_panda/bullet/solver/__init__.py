@@ -1,6 +1,6 @@
-"""Faster constraints and forward dynamics for Bullet, with the same bits.
+"""Faster constraints, dynamics and inverse kinematics for Bullet, with the same bits.
 
-`activate` replaces five of Bullet's functions in this process if all conditions of
+`activate` replaces six of Bullet's functions in this process if all conditions of
 ``gate.py`` hold. From then on, all clients of the process run the replacements, also
 clients that a user opened with pybullet. Each C file lists which of Bullet's functions
 it reimplements, and explains why its results are the same.

@@ -257,8 +257,125 @@ struct limit {
     double lower, upper;
 };
 
+/*
+ * btInverseDynamicsBullet3::RigidBody: the base of a body, or a link.
+ *
+ * Bullet copies the fields from btMultiBody when a client first asks for the inverse
+ * kinematics, the Jacobian or the inverse dynamics of the body.
+ */
+struct tree_link {
+    double mass;
+    char pad0[832];
+    int joint_type;
+    char pad1[4];
+    struct vector3 position; /* m_parent_pos_parent_body_ref */
+    struct matrix3 rotation; /* m_body_T_parent_ref, from the parent */
+    struct vector3 axis;     /* m_Jac_JR, zero if the joint does not rotate */
+    char pad2[32];
+    struct vector3 slide; /* m_parent_Jac_JT, zero if the joint does not slide */
+    int dof;              /* m_q_index, or -1 */
+    char pad3[380];
+};
+
+/* btInverseDynamicsBullet3::MultiBodyTree::MultiBodyImpl */
+struct tree_data {
+    int num_links, num_dofs; /* the base counts as a link */
+    char pad0[32];
+    struct array links;   /* of struct tree_link; the base comes first */
+    struct array parents; /* indices in `links` */
+};
+
+/* btInverseDynamicsBullet3::MultiBodyTree */
+struct tree {
+    char is_finalized;
+    char pad0[7];
+    struct tree_data *data;
+};
+
+/* b3PoolBodyHandle<InternalBodyData> */
+struct body_handle {
+    struct multi_body *body;
+    char pad0[320];
+    int next_free;
+    char pad1[4];
+};
+
+/* PhysicsServerCommandProcessorInternalData */
+struct server_data {
+    char pad0[56];
+    struct array body_handles; /* of struct body_handle, by body id */
+    char pad1[3192];
+    void *logger; /* m_commandLogger */
+    char pad2[144];
+    struct array trees;       /* values of the map m_inverseDynamicsBodies */
+    struct array tree_bodies; /* its keys: pointers to struct multi_body */
+};
+
+/* PhysicsServerCommandProcessor */
+struct server {
+    void **vtable;
+    struct server_data *data;
+};
+
+/* SharedMemoryCommand with CalculateInverseKinematicsArgs */
+struct command {
+    int type;
+    char pad0[16];
+    int flags; /* m_updateFlags */
+    int body;
+    char pad1[4];
+    double target_position[384];
+    int num_targets; /* m_numEndEffectorLinkIndices */
+    char pad2[4];
+    double target_orientation[512];
+    int target_links[128];
+    char pad3[4096];
+    double damping[128]; /* m_jointDamping */
+    double positions[128];
+    int num_iterations;
+    char pad4[4];
+    double threshold; /* m_residualThreshold */
+};
+
+/* SharedMemoryStatus with CalculateInverseKinematicsResultArgs */
+struct status {
+    int type;
+    char pad0[16];
+    int num_stream_bytes;
+    void *stream;
+    char pad1[8];
+    int body, num_dofs;
+    double positions[128];
+};
+
+/* enum EnumSharedMemoryClientCommand and EnumSharedMemoryServerStatus */
+enum { CALCULATE_INVERSE_KINEMATICS = 27, INVERSE_KINEMATICS_COMPLETED = 43 };
+
+/* enum EnumCalculateInverseKinematicsFlags */
+enum {
+    HAS_TARGET_POSITION = 16,
+    HAS_TARGET_ORIENTATION = 32,
+    HAS_JOINT_DAMPING = 128,
+    HAS_MAX_ITERATIONS = 512,
+    HAS_RESIDUAL_THRESHOLD = 1024,
+};
+
+/* B3_POOL_HANDLE_TERMINAL_USED: `next_free` of a body that exists */
+enum { USED = -2 };
+
 /* enum btMultibodyLink::eFeatherstoneJointType */
 enum { REVOLUTE = 0, PRISMATIC = 1, FIXED = 4 };
+
+/* enum btInverseDynamicsBullet3::JointType */
+enum { TREE_FIXED = 0, TREE_REVOLUTE = 1, TREE_PRISMATIC = 2 };
+
+/* The type of a joint in a tree, or -1 if this package does not know the type. */
+static inline int tree_joint_type(int joint_type) {
+    return joint_type == REVOLUTE    ? TREE_REVOLUTE
+           : joint_type == PRISMATIC ? TREE_PRISMATIC
+           : joint_type == FIXED     ? TREE_FIXED
+                                     : -1;
+}
 
 /* enum btCollisionObject::CollisionFlags, and of CollisionObjectTypes */
 enum { STATIC = 1, KINEMATIC = 2, LINK_COLLIDER = 64 };
@@ -411,6 +528,36 @@ AT(solver_info, mode, 176);
 AT(solver_info, residual_threshold, 208);
 AT(solver_info, restitution_threshold, 216);
 AT(solver_info, num_inner_iterations, 232);
+AT(tree_link, joint_type, 840);
+AT(tree_link, position, 848);
+AT(tree_link, rotation, 880);
+AT(tree_link, axis, 976);
+AT(tree_link, slide, 1040);
+AT(tree_link, dof, 1072);
+SIZE(tree_link, 1456);
+AT(tree_data, links, 40);
+AT(tree_data, parents, 72);
+AT(tree, data, 8);
+AT(body_handle, next_free, 328);
+SIZE(body_handle, 336);
+AT(server_data, body_handles, 56);
+AT(server_data, logger, 3280);
+AT(server_data, trees, 3432);
+AT(server_data, tree_bodies, 3464);
+AT(command, flags, 20);
+AT(command, body, 24);
+AT(command, target_position, 32);
+AT(command, num_targets, 3104);
+AT(command, target_orientation, 3112);
+AT(command, target_links, 7208);
+AT(command, damping, 11816);
+AT(command, num_iterations, 13864);
+AT(command, threshold, 13872);
+AT(status, num_stream_bytes, 20);
+AT(status, stream, 24);
+AT(status, body, 40);
+AT(status, num_dofs, 44);
+AT(status, positions, 48);
 
 #undef AT
 #undef SIZE

@@ -49,6 +49,7 @@ _SOLVER = "_ZTV27btMultiBodyConstraintSolver"
 _MOTOR = "_ZTV21btMultiBodyJointMotor"
 _LIMIT = "_ZTV31btMultiBodyJointLimitConstraint"
 _WORLD = "_ZTV28btSoftMultiBodyDynamicsWorld"
+_SERVER = "_ZTV29PhysicsServerCommandProcessor"
 _CREATE_ROWS = (
     "20createConstraintRowsER20btAlignedObjectArrayI27btMultiBodySolverConstraint"
     "ER23btMultiBodyJacobianDataRK19btContactSolverInfo"
@@ -72,6 +73,11 @@ _REPLACED = (
     (
         _WORLD,
         "_ZN24btMultiBodyDynamicsWorld19solveExternalForcesER19btContactSolverInfo",
+    ),
+    (
+        _SERVER,
+        "_ZN29PhysicsServerCommandProcessor14processCommandERK19SharedMemoryCommand"
+        "R18SharedMemoryStatusPci",
     ),
 )
 # ctypes knows the address of an exported function. Comparing it with the address in the

@@ -14,8 +14,6 @@
  * tree decides the order of pairs, and this order decides the results. A replacement
  * would therefore have to insert and remove the same leaves in the same order.
  *
- * Inverse kinematics, 12 %. Bullet calls these functions directly, not through a vtable.
- *
  * Contacts of two shapes (the narrow phase), 7 %: spread over many functions.
  */
 #if defined(__x86_64__) && defined(__linux__)
@@ -26,11 +24,11 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { VERSION = 5 }; /* native.py refuses a library of another version */
+enum { VERSION = 6 }; /* native.py refuses a library of another version */
 
 /* The functions that are replaced, in the order of gate.py. */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, EXTERNAL_FORCES,
-       NUM_FUNCTIONS };
+       COMMAND, NUM_FUNCTIONS };
 
 enum { MAX_BODIES = 16 }; /* of a world; Bullet accelerates further bodies */
 
@@ -47,6 +45,10 @@ typedef void rows_function(void *, struct array *, struct jacobian_data *,
 
 /* btMultiBodyDynamicsWorld::solveExternalForces */
 typedef void forces_function(struct world *, const struct solver_info *);
+
+/* PhysicsServerCommandProcessor::processCommand */
+typedef char command_function(struct server *, const struct command *, struct status *,
+                              char *, int);
 
 /* Whether a thread runs Bullet's functions or the replacements. */
 enum mode {
@@ -66,6 +68,8 @@ struct counts {
     int bullet_manifolds; /* whose rows Bullet created instead */
     int bodies;           /* that `accelerate` accelerated */
     int bullet_bodies;    /* for which it needed Bullet's function */
+    int answers;          /* for inverse kinematics, by this solver */
+    int bullet_answers;   /* for inverse kinematics, by Bullet */
     int joint_rows;       /* that were probed */
     int contact_rows;     /* that were probed */
     int spinning_rows;    /* that were probed */
@@ -78,6 +82,7 @@ static int enabled; /* whether threads in mode FOLLOW use this solver */
 static __thread enum mode mode;
 static __thread struct counts counts;
 static __thread struct expectation expectation;
+static __thread const struct world *probed_world; /* the latest, or NULL */
 /* The responses of a group while `convert` lets Bullet create the rows of its joints in
    this thread, and NULL at all other times. */
 static __thread struct responses **responses;
@@ -201,8 +206,10 @@ static void external_forces(struct world *world, const struct solver_info *info)
     forces_function *bullet_forces = (forces_function *)bullet[EXTERNAL_FORCES];
     struct multi_body *sleepers[MAX_BODIES];
     int states[MAX_BODIES];
-    if (mode == PROBE && counts.mismatch == NULL)
+    if (mode == PROBE && counts.mismatch == NULL) {
         counts.mismatch = probe_world(world, info, &expectation);
+        probed_world = counts.mismatch == NULL ? world : NULL;
+    }
     const int count = is_active() ? put_to_sleep(world, sleepers, states) : 0;
     bullet_forces(world, info);
     for (int i = 0; i < count; i++)
@@ -217,6 +224,28 @@ static void external_forces(struct world *world, const struct solver_info *info)
         bullet_forces(world, info);
         world->bodies = bodies;
     }
+}
+
+/*
+ * Answers a command of a client.
+ *
+ * Bullet calls its function for the inverse kinematics directly. This function, through
+ * which all commands come, has a slot in a vtable.
+ */
+static char process_command(struct server *server, const struct command *command,
+                            struct status *status, char *buffer, int buffer_size) {
+    const int is_known = command->type == CALCULATE_INVERSE_KINEMATICS;
+    if (is_known && is_active()) {
+        const int answered = solve_inverse_kinematics(server, command, status);
+        if (mode == SOLVE) *(answered ? &counts.answers : &counts.bullet_answers) += 1;
+        if (answered) return 1;
+    }
+    const char has_status = ((command_function *)bullet[COMMAND])(
+        server, command, status, buffer, buffer_size);
+    if (is_known && mode == PROBE && counts.mismatch == NULL)
+        counts.mismatch =
+            probe_command(server, command, status, probed_world, &expectation);
+    return has_status;
 }
 
 /* Stores a function in a slot of a vtable. Returns 0, or 1 if the system does not make
@@ -243,7 +272,7 @@ void solver_uninstall(void) {
 int solver_install(void **const *new_slots, void *const *functions) {
     void *const replacements[] = {(void *)iterations, (void *)convert,
                                   (void *)motor_rows, (void *)limit_rows,
-                                  (void *)external_forces};
+                                  (void *)external_forces, (void *)process_command};
     for (int i = 0; i < NUM_FUNCTIONS; i++) {
         slots[i] = new_slots[i];
         bullet[i] = functions[i];
@@ -263,6 +292,7 @@ void solver_enable(int on) { __atomic_store_n(&enabled, on, __ATOMIC_RELAXED); }
 void solver_set_mode(enum mode new_mode, const struct expectation *expected) {
     mode = new_mode;
     counts = (struct counts){0};
+    probed_world = NULL;
     if (expected != NULL) expectation = *expected;
 }
 

@@ -10,6 +10,7 @@
 
 #include <math.h>
 #include <stdint.h>
+#include <string.h>
 
 #define CHECK(name, condition)                                                         \
     if (!(condition)) return name
@@ -377,5 +378,87 @@ const char *probe_result(const struct solver *solver,
           solver->analytics.island ==
               (num_bodies > 0 ? bodies[0]->companion_id : -2));
     return NULL;
+}
+
+static const char *probe_tree(const struct tree *tree, const struct multi_body *body,
+                              const struct expectation *expected) {
+    const int num_links = expected->num_links + 1;
+    CHECK("MultiBodyTree", tree != NULL && tree->is_finalized == 1);
+    const struct tree_data *data = tree->data;
+    CHECK("MultiBodyTree.m_impl", data != NULL && (uintptr_t)data % 16 == 0);
+    CHECK("MultiBodyImpl.m_num_dofs",
+          data->num_links == num_links && data->num_dofs == expected->num_dofs);
+    CHECK("MultiBodyImpl.m_body_list",
+          is_array(&data->links) && data->links.size == num_links);
+    CHECK("MultiBodyImpl.m_parent_index",
+          is_array(&data->parents) && data->parents.size == num_links);
+    const struct tree_link *own = data->links.data;
+    const int *parents = data->parents.data;
+    CHECK("RigidBody.m_joint_type", own->joint_type == TREE_FIXED);
+    const struct link *link = body->links.data;
+    for (int i = 1, dof = 0; i < num_links; i++, link++) {
+        own++;
+        const int type = expected->joint_types[i - 1];
+        CHECK("RigidBody.m_mass", own->mass == expected->link_masses[i - 1]);
+        CHECK("RigidBody.m_joint_type", own->joint_type == tree_joint_type(type));
+        CHECK("MultiBodyImpl.m_parent_index", parents[i] == link->parent + 1);
+        CHECK("RigidBody.m_q_index", own->dof == (type == FIXED ? -1 : dof));
+        CHECK("RigidBody.m_body_T_parent_ref",
+              is_unit(&own->rotation.row[0]) && is_unit(&own->rotation.row[2]));
+        CHECK("RigidBody.m_parent_pos_parent_body_ref",
+              fabs(own->position.x) + fabs(own->position.y) < 1.0);
+        const struct vector3 none = {0.0, 0.0, 0.0, 0.0};
+        if (type == REVOLUTE)
+            CHECK("RigidBody.m_Jac_JR", is_same(&own->axis, &link->axes[0].top));
+        if (type == PRISMATIC) {
+            CHECK("RigidBody.m_Jac_JR", is_same(&own->axis, &none));
+            CHECK("RigidBody.m_parent_Jac_JT", is_unit(&own->slide));
+        }
+        dof += type != FIXED;
+    }
+    return NULL;
+}
+
+const char *probe_command(const struct server *server, const struct command *command,
+                          const struct status *status, const struct world *world,
+                          const struct expectation *expected) {
+    const double *target = expected->target;
+    CHECK("SharedMemoryCommand.m_updateFlags",
+          command->flags == (HAS_TARGET_POSITION | HAS_TARGET_ORIENTATION |
+                             HAS_JOINT_DAMPING | HAS_MAX_ITERATIONS));
+    CHECK("m_targetPositions", !memcmp(command->target_position, target, 24));
+    CHECK("m_targetOrientation", !memcmp(command->target_orientation, target + 3, 32));
+    CHECK("m_numEndEffectorLinkIndices", command->num_targets == 1);
+    CHECK("m_endEffectorLinkIndices", command->target_links[0] >= 0 &&
+                                          command->target_links[0] < expected->num_links);
+    for (int i = 0; i < expected->num_dofs; i++)
+        CHECK("m_jointDamping", command->damping[i] == expected->ik_damping);
+    CHECK("m_maxNumIterations", command->num_iterations == expected->ik_iterations);
+    CHECK("SharedMemoryStatus.m_type", status->type == INVERSE_KINEMATICS_COMPLETED);
+    CHECK("SharedMemoryStatus.m_dataStream",
+          status->num_stream_bytes == 0 && status->stream == NULL);
+    CHECK("m_inverseKinematicsResultArgs", status->body == command->body &&
+                                               status->num_dofs == expected->num_dofs);
+
+    const struct server_data *data = server->data;
+    CHECK("PhysicsServerCommandProcessor.m_data",
+          data != NULL && (uintptr_t)data % 8 == 0);
+    CHECK("m_commandLogger", data->logger == NULL);
+    CHECK("m_bodyHandles", is_array(&data->body_handles) && command->body >= 0 &&
+                               command->body < data->body_handles.size);
+    const struct body_handle *handle =
+        (const struct body_handle *)data->body_handles.data + command->body;
+    CHECK("b3PoolBodyHandle.m_nextFreeHandle", handle->next_free == USED);
+    const struct multi_body *body = NULL;
+    for (int i = 0; world != NULL && i < world->bodies.size; i++)
+        if (((struct multi_body *const *)world->bodies.data)[i] == handle->body)
+            body = handle->body;
+    CHECK("InternalBodyData.m_multiBody",
+          body != NULL && body->num_dofs == expected->num_dofs);
+    CHECK("m_inverseDynamicsBodies",
+          is_array(&data->trees) && data->trees.size == 1 &&
+              is_array(&data->tree_bodies) && data->tree_bodies.size == 1 &&
+              *(const struct multi_body *const *)data->tree_bodies.data == body);
+    return probe_tree(*(const struct tree *const *)data->trees.data, body, expected);
 }
 #endif

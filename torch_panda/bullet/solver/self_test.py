@@ -1,9 +1,10 @@
 """The self-test, which compares Bullet's solver with the replacement in one scene.
 
-An arm of four joints swings into its joint limits and into a stack of two boxes. Bullet
-steps the scene first, while ``probe.c`` checks the layout of Bullet's objects. Then the
-replacement steps the same scene in a new client. After every step, both states must be
-equal bit for bit.
+An arm of four joints swings into its joint limits and into a stack of two boxes. After
+every step, a client asks for the inverse kinematics of one link. Bullet steps the scene
+first, while ``probe.c`` checks the layout of Bullet's objects. Then the replacement
+steps the same scene in a new client. After every step, both states and both answers
+must be equal bit for bit.
 """
 
 from ctypes import c_double, c_float, c_int
@@ -46,6 +47,9 @@ _JOINT_TYPES = (REVOLUTE, REVOLUTE, FIXED, PRISMATIC, PRISMATIC)  # of the arm's
 _LINK_MASSES = (0.7, 0.4, 0.1, 0.05, 0.05)
 _NUM_JOINTS = 4
 _JOINT_TARGET = 0.8  # lies beyond the limits of all joints
+_TARGET = (0.3, 0.1, 0.2, 0.5, 0.5, 0.1, 0.7)  # pose for the inverse kinematics
+_IK_DAMPING = 0.02
+_IK_ITERATIONS = 6
 
 
 def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) -> None:
@@ -80,6 +84,9 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         _JOINT_DAMPING,
         _DAMPING,
         _MAX_VELOCITY,
+        (c_double * 7)(*_TARGET),
+        _IK_DAMPING,
+        _IK_ITERATIONS,
     )
     try:
         solver.set_mode(PROBE, expectation)
@@ -105,6 +112,11 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         raise GateError("the packed solver did not create the rows of the self-test")
     if counts.bodies != _NUM_STEPS:
         raise GateError("the packed solver did not accelerate the arm of the self-test")
+    # The first of Bullet's answers creates numbers that the replacement reads.
+    if (counts.answers, counts.bullet_answers) != (_NUM_STEPS - 1, 1):
+        raise GateError(
+            "the packed solver did not compute the inverse kinematics of the self-test"
+        )
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
             raise GateError(f"the self-test differs from Bullet in step {step}")
@@ -125,7 +137,8 @@ def _simulate() -> list[bytes]:
                     "step",
                 )
                 bodies = (_state(connection, body) for body in (arm, *boxes))
-                states.append(b"".join(bodies))
+                link = step % len(_JOINT_TYPES)
+                states.append(b"".join((*bodies, _reach(connection, arm, link))))
             return states
         finally:
             connection.close()
@@ -195,6 +208,22 @@ def _drive(connection: Connection, arm: int, step: int) -> None:
     connection.submit(
         command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
     )
+
+
+def _reach(connection: Connection, arm: int, link: int) -> bytes:
+    """Bytes of the joint positions that bring a link to the target."""
+    command = capi.ik_init(connection.handle, arm)
+    capi.ik_set_target(command, link, doubles(_TARGET[:3]), doubles(_TARGET[3:]))
+    capi.ik_set_iterations(command, _IK_ITERATIONS)
+    capi.ik_set_damping(command, _NUM_JOINTS, doubles((_IK_DAMPING,) * _NUM_JOINTS))
+    status = connection.submit(
+        command,
+        capi.CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED,
+        "solve the inverse kinematics",
+    )
+    joints = (c_double * _NUM_JOINTS)()
+    capi.ik_result(status, c_int(), c_int(), joints)
+    return bytes(joints)
 
 
 def _state(connection: Connection, body: int) -> bytes:

@@ -79,6 +79,15 @@ int can_accelerate(const struct multi_body *body);
  */
 int accelerate(struct multi_body *body, double time_step);
 
+/*
+ * Answer a command of a client that asks for the inverse kinematics of a body.
+ *
+ * Returns 1 if the status has the answer. Returns 0, with nothing changed, if Bullet's
+ * own function has to answer.
+ */
+int solve_inverse_kinematics(const struct server *server, const struct command *command,
+                             struct status *status);
+
 /* Numbers of the self-test's scene, for the layout probe. */
 struct expectation {
     void **motor_table, **limit_table; /* of virtual functions */
@@ -99,6 +108,9 @@ struct expectation {
     double joint_damping;      /* of all joints */
     double damping;            /* linear and angular, of all bodies */
     double max_velocity;       /* of all coordinates */
+    double target[7];          /* pose, of the inverse kinematics */
+    double ik_damping;         /* of all joints */
+    int ik_iterations;
 };
 
 /*
@@ -106,7 +118,8 @@ struct expectation {
  *
  * probe_world does this before Bullet accelerates the bodies. probe_manifolds does it
  * before Bullet creates the rows of a group, probe_rows before it solves the group, and
- * probe_result after it. Each function returns NULL, or the name of the first field that
+ * probe_result after it. probe_command does it after Bullet has answered a command for the
+ * inverse kinematics. Each function returns NULL, or the name of the first field that
  * does not have the expected number.
  */
 const char *probe_world(const struct world *world, const struct solver_info *info,
@@ -120,5 +133,8 @@ const char *probe_rows(const struct solver *solver, const struct solver_info *in
 const char *probe_result(const struct solver *solver,
                          struct collision_object *const *bodies, int num_bodies,
                          int num_manifolds, const struct solver_info *info);
+const char *probe_command(const struct server *server, const struct command *command,
+                          const struct status *status, const struct world *world,
+                          const struct expectation *expected);
 
 #endif
