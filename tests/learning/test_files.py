@@ -94,7 +94,7 @@ WRITERS = {
     "numbers.pt": lambda path: files.save(path, torch.zeros(100_000)),
     "text.txt": lambda path: files.save_text(path, "x" * 100_000),
     "curve.png": lambda path: plot_curve(
-        [{"step": 0, "success": 0}], "Reach", path, steps="steps"
+        [{"step": 0, "success": 0}], "Reach", path, xlabel="steps"
     ),
     "args.json": lambda path: write_options(path.parent, Args(), Args()),
 }

@@ -49,7 +49,7 @@ class Curve:
     ) -> None:
         self.env_id, self.agent, self.out = env_id, agent, out
         self.logger = logger
-        self.steps = "gradient steps" if offline else "environment steps"
+        self.xlabel = "gradient steps" if offline else "environment steps"
         self.tasks = evaluation_tasks(env_id) if offline else {}
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
@@ -105,7 +105,7 @@ class Curve:
         writer.writerows(progress.curve)
         files.save_text(self.out / "curve.csv", text.getvalue())
         path = self.out / "curve.png"
-        plot_curve(progress.curve, self.env_id, path, steps=self.steps)
+        plot_curve(progress.curve, self.env_id, path, xlabel=self.xlabel)
         save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
 
     def close(self) -> None:

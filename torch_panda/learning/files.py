@@ -73,7 +73,7 @@ def save_text(path: Path, text: str) -> None:
 
 def read(
     path: Path,
-    what: str,
+    content_name: str,
     keys: Iterable[NestedKey],
     *,
     finite: Iterable[NestedKey] = (),
@@ -83,7 +83,7 @@ def read(
 
     Args:
         path: The file.
-        what: Description of the expected content for the error, such as "a policy".
+        content_name: Name of the expected content for the error, such as "a policy".
         keys: Keys that the content must have.
         finite: Keys under which all numbers must be finite.
         **options: Options of `torch.load`.
@@ -103,7 +103,7 @@ def read(
     except Exception as error:  # damaged bytes can raise almost any exception
         reason = str(error) if isinstance(error, ValueError) else type(error).__name__
         raise ValueError(
-            f"{path} does not hold {what}, or is damaged ({reason})"
+            f"{path} does not hold {content_name}, or is damaged ({reason})"
         ) from None
     return content
 

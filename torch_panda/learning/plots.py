@@ -46,12 +46,12 @@ Panel = dict[Line, list[Curve]]
 """The curves of all seeds, by line."""
 
 
-def plot_curve(curve: Curve, title: str, path: Path, *, steps: str) -> None:
-    """Draw one run's success over steps; ``steps`` names their kind."""
+def plot_curve(curve: Curve, title: str, path: Path, *, xlabel: str) -> None:
+    """Draw one run's success over steps; ``xlabel`` names the kind of steps."""
     figure = Figure(figsize=(5, 3.5), layout="constrained")
     axes = figure.subplots()
     axes.plot([row["step"] for row in curve], [row["success"] for row in curve], "o-")
-    _label(axes, title, "success", steps)
+    _label(axes, title, "success", xlabel)
     save(figure, path)
 
 
@@ -228,9 +228,9 @@ def line_label(preset: str, changed: dict[str, object]) -> str:
     return ", ".join(parts)
 
 
-def _label(axes: Axes, title: str, metric: Metric, steps: str) -> None:
+def _label(axes: Axes, title: str, metric: Metric, xlabel: str) -> None:
     names = {"success": "success rate", "ever_success": "success rate at any step"}
-    axes.set(xlabel=steps, ylabel=names.get(metric, metric), title=title)
+    axes.set(xlabel=xlabel, ylabel=names.get(metric, metric), title=title)
     if metric in names:
         axes.set_ylim(-0.05, 1.05)
     axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 0))
