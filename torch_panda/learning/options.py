@@ -30,8 +30,8 @@ class Args(Hyperparameters):
     preset: Preset = "paper"
     """defaults of the other options: those of the panda-gym paper ("paper"), the task's
     recipe for the least wall-clock time ("tuned"), or its recipe for the fewest
-    environment steps ("sample-efficient"). The last two also keep episodes in which no
-    object moved out of the replay buffer, except for a random tenth"""
+    environment steps ("sample-efficient"). With the last two, the replay buffer gets
+    only a random tenth of the episodes in which no object moves"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
