@@ -24,11 +24,11 @@ import torch_panda
 from torch_panda.datasets.formats import Writer, load_format
 from torch_panda.datasets.generation import (
     Kind,
+    batch_shape,
     episode_seed,
     fixed_options,
     generate_parts,
     sha256,
-    size,
 )
 from torch_panda.datasets.parts import Parts
 from torch_panda.datasets.recording import TensorWriter, add_noise, play
@@ -236,7 +236,7 @@ def record_data(args: Args, kind: Kind) -> None:
     parts = Parts(
         folder.with_name(folder.name + ".unfinished"), recipe, resume=args.resume
     )
-    num_episodes, steps = size(args.env_id, kind, transitions, **options)
+    num_episodes, steps = batch_shape(args.env_id, kind, transitions, **options)
     try:
         with tqdm(
             total=num_episodes * steps,

@@ -115,7 +115,7 @@ def generate_parts(
     seed = check_seed(seed)
     expert = None if kind == "random" else make_expert(env_id)
     make_options = {**make_options, **fixed_options(kind)}
-    num_episodes, steps = size(env_id, kind, transitions, **make_options)
+    num_episodes, steps = batch_shape(env_id, kind, transitions, **make_options)
     num_envs = min(num_envs, num_episodes - first)
     if num_envs < 1:
         return
@@ -148,13 +148,13 @@ def fixed_options(kind: str) -> dict[str, Any]:
     return options
 
 
-def size(
+def batch_shape(
     env_id: str,
     kind: Kind,
     transitions: int,
     **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> tuple[int, int]:
-    """Number of episodes of a data set, and their number of steps."""
+    """Batch shape [episodes, steps] of the data set that `generate` returns."""
     options = {**make_options, **fixed_options(kind)}
     steps = options.get("max_episode_steps") or max_episode_steps(env_id)
     return -(-transitions // steps), steps
