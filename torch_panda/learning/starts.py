@@ -20,8 +20,9 @@ from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Flip, Push, Slide, Stack
 
 SCRIPT_STEPS = 45  # steps in which the scripted hand reaches its position
-# A hand with a blocked gripper stops beside an object. Range of the distance between
-# their centres [m]. The fingers, at most 2.3 cm long and wide, do not touch it then.
+# Range of the distance between the centres of hand and object, if a hand with a blocked
+# gripper stops beside the object [m]. The fingers are at most 2.3 cm long and wide, so
+# they do not touch the object.
 GAP = (0.055, 0.08)
 # Height of an object that is held up above the others [m].
 LIFTED = (0.12, 0.2)

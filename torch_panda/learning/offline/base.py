@@ -3,7 +3,7 @@
 `fit` computes the mean and deviation of the data, `update` takes one gradient step on a
 batch of `OfflineData`, and `policy` acts. Agents differ in their ``goals``, which are
 strategies of `torch_panda.transforms.GoalSampler`, and in their `losses`. The docstring
-of each loss cites the equation of its paper.
+of each loss cites the equation or section of the paper.
 
 In the papers a goal is a state g. Here a goal is the part of a state that the task
 cares about, such as the position of a cube, because the policy gets ``desired_goal``.
@@ -57,8 +57,9 @@ class OfflineHyperparameters:
     batch_size: Positive = 256
     """transitions per gradient step"""
     actor_goal: Literal["future", "geometric"] = "future"
-    """goals of policies: achieved later in the episode, with equal probabilities as in
-    OGBench ("future"), or sooner ones more often, by the discount ("geometric")"""
+    """goals of policies, which are achieved later in the episode: all with the same
+    probability as in OGBench ("future"), or k steps later with a probability in
+    proportion to discount**k ("geometric")"""
     relative_inputs: RelativeInputs = "fine"
     """further inputs of the networks: "coarse" adds the offsets of objects from the
     hand, and of goals from objects. "fine" also adds these offsets clipped at 3 cm, so
