@@ -70,7 +70,8 @@ class Args:
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
-    """continue the run in the folder; all other options must be the same"""
+    """continue the run in the folder. Only --out and --import may differ from the
+    options with which it was started"""
 
 
 class Refinement:
