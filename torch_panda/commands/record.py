@@ -51,36 +51,36 @@ class Args:
     episodes: Positive | None = None
     """number of demonstrations (kind "expert"); None means 200"""
     seed: Seed = 0
-    """seed of the environments, or of the data set"""
+    """seed of the environments (kind "expert"), or of the data set"""
     num_envs: Positive = 32
     """number of environments stepped in parallel"""
     num_threads: Positive | None = None
     """number of threads that step the environments; None means one per core"""
     noise_eps: Weight = 0.0
-    """standard deviation of Gaussian noise on the executed actions; the file holds the
+    """standard deviation of Gaussian noise on the executed actions. The file holds the
     actions without noise, so that imitating them teaches how to correct errors (DART,
     arXiv 1703.09327)"""
     task_options: dict[str, Finite] = field(default_factory=dict)
     """arguments of the task to change, such as `clearance 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
-    """"tensors" writes one file with a nested dict of tensors; "minari" and "lerobot"
+    """"tensors" writes one file with a nested dict of tensors. "minari" and "lerobot"
     write a data set in the format of that library"""
     out: Path | None = None
-    """file to write; for minari the id of the data set, for lerobot its folder; None
-    measures the expert's success only"""
+    """file to write (tensors), id of the data set (minari) or its folder (lerobot).
+    None only measures the expert's success"""
     image_size: Positive = 128
     """height and width of the pictures of a LeRobot data set [pixels]"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     kind: Literal["expert", Kind] = "expert"
-    """demonstrations ("expert"); or the data of `torch_panda.datasets.generate`: the
+    """demonstrations ("expert"), or a data set of `torch_panda.datasets.generate`: the
     expert with noise on its actions ("noisy"), the expert pursuing goal after goal
     without reset ("play"), or random actions ("random")"""
     transitions: Positive | None = None
-    """number of transitions of the other kinds, rounded up to whole episodes; None
-    means 100,000"""
+    """number of transitions of a data set, rounded up to whole episodes; None means
+    100,000"""
     resume: bool = False
-    """continue a data set of the other kinds that was interrupted"""
+    """continue a data set whose recording was interrupted"""
 
 
 def print_success(env_id: str, success: list[Tensor]) -> None:
