@@ -41,11 +41,12 @@ class Hyperparameters:
     environments. The fractions of the other environments are evenly spaced between
     them. SAC and TQC use this option only with exploration "points" """
     exploration: Exploration = "actions"
-    """how to explore: with random actions ("actions"; DDPG, TD3), or by moving the hand
-    towards random points ("points"; under joint control, random joint positions)"""
+    """how to explore: with random actions ("actions", only DDPG and TD3), or by moving
+    the hand towards random points ("points"). Under joint control, "points" moves the
+    joints towards random positions"""
     relative_inputs: RelativeInputs = "none"
-    """additional inputs of the networks: "coarse" adds the offsets from the hand to
-    objects and from objects to goals; "fine" also adds these offsets clipped at 3 cm,
+    """additional inputs of the networks. "coarse" adds the offsets from the hand to
+    objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
     so that differences of millimetres count"""
     fine_fingers: bool = False
     """let networks and noise work with the cube root of the fingers' action, which

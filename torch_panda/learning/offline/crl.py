@@ -44,9 +44,9 @@ class CRLHyperparameters(OfflineHyperparameters):
     algo: Literal["crl"] = "crl"
     """algorithm"""
     contrastive_loss: ContrastiveLoss = "binary"
-    """the paper's "binary" decides for each pair of (s, a) and goal whether they belong
-    together; "infonce" chooses the goal of each (s, a) among the goals of the batch,
-    and the (s, a) of each goal"""
+    """"binary", as in the paper, decides for each pair of (s, a) and goal whether the
+    two belong together. "infonce" chooses the goal of each (s, a) among the goals of
+    the batch, and the (s, a) of each goal"""
     alpha: Weight = 0.1
     """weight of the imitation in the policy's loss"""
     latent_size: Positive = 128
