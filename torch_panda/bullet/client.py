@@ -399,9 +399,9 @@ class PhysicsClient:
         """Set the friction [N m] or [N] of a joint that nothing else controls.
 
         Bullet imitates friction by a motor. The motor's target velocity is 0, and its
-        maximum force is ``force``. Without this call, the motor may apply an impulse of
-        1 N m s or 1 N s in every substep. At the default time step of 2 ms, this is a
-        maximum of 500 N m or 500 N.
+        maximum force is ``force``. Without this call, its maximum impulse is 1 N m s or
+        1 N s per substep. With the default substep of 2 ms, this equals 500 N m or
+        500 N.
 
         Raises:
             ValueError: The force is negative or not finite.
@@ -426,9 +426,8 @@ class PhysicsClient:
         not 0. (One of them suffices in pybullet; Bullet's own default needs both.)
         Resets restore the filter that was set while the scene was built.
 
-        Bullet removes the link from the broad phase and inserts it again, after all
-        links that are in it already. The link thereby loses its present overlaps and
-        contacts.
+        Bullet removes the link from the broad phase and inserts it again, so the link
+        loses its present overlaps and contacts.
         """
         command = capi.filter_init(self.connection.handle)
         capi.filter_set_group_mask(command, body, link, group, mask)
@@ -536,9 +535,8 @@ class PhysicsClient:
         """Set the targets of the motors of all movable joints of a body.
 
         The first ``len(velocities)`` joints get velocity targets. The remaining joints
-        get position targets. The motors behave as after pybullet's
-        ``setJointMotorControlArray``, but their position gain is
-        `PhysicsParams.position_gain`.
+        get position targets. This works like pybullet's ``setJointMotorControlArray``,
+        but with the position gain `PhysicsParams.position_gain`.
 
         Args:
             body: Body id.
@@ -565,7 +563,7 @@ class PhysicsClient:
     def apply_torques(self, body: int, torques: Doubles) -> None:
         """Apply torques [N m] to the first ``len(torques)`` movable joints of a body.
 
-        The torques act in the next time step only.
+        The torques act in the next substep only.
         """
         command = capi.motor_init(
             self.connection.handle, body, capi.CONTROL_MODE_TORQUE
@@ -577,10 +575,10 @@ class PhysicsClient:
         )
 
     def step(self, count: int = 1) -> None:
-        """Advance the world by ``count`` time steps."""
+        """Advance the world by ``count`` substeps."""
         handle = self.connection.handle
-        # One command serves all time steps: it lies in the client's command buffer, and
-        # a time step does not overwrite this buffer.
+        # One command serves all substeps: it lies in the client's command buffer, and a
+        # substep does not overwrite this buffer.
         command = capi.step_init(handle)
         expected = capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED
         for _ in range(count):
@@ -606,7 +604,7 @@ class PhysicsClient:
 
     @property
     def num_detections(self) -> int:
-        """Number of collision detections so far; every time step has one."""
+        """Number of collision detections so far; every substep has one."""
         return self.native.num_detections
 
     def state(self, body: int, *, link_velocities: bool = False) -> BodyState:
@@ -623,7 +621,7 @@ class PhysicsClient:
     def contact_points(
         self, body_a: int | None = None, body_b: int | None = None
     ) -> list[ContactPoint]:
-        """Contacts of the last time step.
+        """Contacts of the last substep.
 
         Args:
             body_a: Return only contacts in which this body takes part. They are
