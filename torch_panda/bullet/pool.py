@@ -67,11 +67,11 @@ class _Worker:
 
 
 class WorkerError(RuntimeError):
-    """The work on one environment failed. The other environments' work was done.
+    """The work on at least one environment failed. The work on the others was done.
 
     Args:
-        index: Index of the environment.
-        error: The error that the work raised.
+        index: Lowest index of an environment whose work failed.
+        error: The error that this work raised.
     """
 
     def __init__(self, index: int, error: Exception) -> None:
@@ -96,8 +96,8 @@ class WorkerPool:
         """Call ``work(index)`` for every index, and return when all calls are done.
 
         A first Ctrl-C raises when all work is done, so that no client remains in the
-        middle of a step. A second Ctrl-C raises at once, and `wait` waits for the rest
-        of the work.
+        middle of a step. A second Ctrl-C raises at once. The next `run`, `wait` or
+        `close` then waits for the rest of the work.
 
         Raises:
             WorkerError: ``work`` raised for at least one index. All other calls were
