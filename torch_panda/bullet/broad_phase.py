@@ -27,27 +27,25 @@ from torch_panda.bullet.client import PhysicsClient
 from torch_panda.rotations import rotate_vector
 
 # Position to which `restore` moves all bodies before it inserts their links into the
-# tree of AABBs again, one by one [m]. Bullet inserts an AABB beside the closest AABBs
-# of the tree. This position is so far from the scene that a new AABB is always beside
-# AABBs that were already inserted again, and never beside AABBs that are still at this
-# position.
+# tree of AABBs again, one by one [m]. The position is so far from the scene that links
+# that are still there do not affect where in the tree Bullet inserts the others.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
 # `restore` restores the number of detections modulo this cycle, that is, its lowest 8
-# bits. A detection reads one bit per level of the tree, and the trees of the shipped
-# tasks have up to 11 levels. But restoring k bits takes up to 2**k - 1 detections per
-# reset. Only the lowest 6 bits had an effect in 120 episodes, so 8 leave a margin.
+# bits. A detection reads one bit per level of the tree. The trees of the shipped tasks
+# have up to 11 levels, but only the lowest 6 bits had an effect in 120 episodes. Each
+# further bit would double the number of detections that a reset needs.
 _DETECTION_CYCLE = 256
 
 _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
 
 
 class _Link(NamedTuple):
-    """The collision filter and pose with which a link entered the broad phase."""
+    """A link, and how `restore` inserts it into the broad phase."""
 
     body: int
     link: int
     group_mask: tuple[int, int]  # collision group and mask
-    snapshot: int  # id of a snapshot with the link at the pose at which it entered
+    snapshot: int  # id of the snapshot to load before the link is inserted
 
 
 class BroadPhase:
@@ -90,17 +88,15 @@ class BroadPhase:
 
         All bodies are first moved far away. Then one link after another is inserted at
         the pose at which it was built, in the order in which the links were built. Its
-        old overlaps and contacts are lost. The links that are still far away do not
-        affect where in the tree a link is inserted, so the tree is the same after every
-        reset.
+        old overlaps and contacts are lost.
         """
         client = self._client
         client.load(self._away)
-        # All links overlap far away, so filter out all their pairs.
+        # All bodies are at the same position now, so filter out all pairs of links.
         for body, link, _, _ in self._links:
             client.set_collision_filter(body, link, *_NO_CONTACTS)
-        # Bring the cursor over the list of pairs to its start. A detection moves the
-        # cursor on, modulo the number of pairs. With exactly one pair the result is 0.
+        # Move the cursor back to the start of the list of pairs. A detection advances
+        # the cursor modulo the number of pairs, so with exactly one pair it becomes 0.
         for body in self._overlapping:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
@@ -136,13 +132,13 @@ class BroadPhase:
         if the link's centre of mass were at the origin of the link's frame. At the end,
         it moves the links to their poses without updating their AABBs. A link's AABB is
         therefore displaced by the vector from its centre of mass to the origin of its
-        frame. In the link's snapshot, the whole body is displaced by this vector.
+        frame. To insert the same AABB again, `restore` loads a snapshot in which the
+        whole body is displaced by this vector.
 
-        The importer also inserts a link with a different orientation if the link's
-        inertial frame is rotated. This method does not imitate that, because no shipped
-        robot has such a link. For a robot that has one, all resets still lead to the
-        same broad phase. It differs from the broad phase that Bullet has after
-        importing the robot, so episodes may differ from episodes in plain pybullet.
+        If a link's inertial frame is rotated, the importer also inserts the link with a
+        different orientation. This method does not imitate that, because no shipped
+        robot has such a link. With such a robot, episodes are still reproducible, but
+        may differ from episodes in plain pybullet.
         """
         client, base = self._client, poses[0]
         for link, pose in enumerate(poses, start=-1):
