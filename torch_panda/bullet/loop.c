@@ -90,7 +90,8 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
     pthread_attr_t attributes;
     pthread_attr_init(&attributes);
     pthread_attr_setstacksize(&attributes, STACK_SIZE);
-    sigset_t all, before; /* Python's threads handle signals */
+    /* Block all signals in the new threads, so that Python's threads handle them. */
+    sigset_t all, before;
     sigfillset(&all);
     pthread_sigmask(SIG_SETMASK, &all, &before);
     for (; loop->num_workers < num_threads - 1; loop->num_workers++) {
@@ -102,8 +103,9 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
     return loop;
 }
 
-/* Do the work of the clients in envs, num_envs indices. Return the number of failures.
-   The steps of all but the first num_whole clients are cut into pieces. */
+/* Do the work of the num_envs clients whose indices are in envs. Cut the steps of all
+   but the first num_whole clients into pieces. Return the number of failures. The call
+   uses envs as the queue and overwrites it. */
 static int share_out(struct loop *loop, work *work, int *envs, int num_envs,
                      int num_whole) {
     fenv_t before; /* the caller's settings, which may flush denormals to zero */
@@ -122,8 +124,8 @@ static int share_out(struct loop *loop, work *work, int *envs, int num_envs,
     return loop->num_failed;
 }
 
-/* Step the clients in envs, num_envs unique indices, whose order the call changes.
-   Return the number of failures. */
+/* Step the num_envs clients whose indices are in envs, without duplicates. Return the
+   number of failures. The call overwrites envs. */
 int loop_step(struct loop *loop, const struct control *control, doubles setpoint,
               int *envs, int num_envs) {
     struct batch *batch = loop->batch;
@@ -140,7 +142,8 @@ static int reset(struct batch *batch, int env, int piece) {
     return 0;
 }
 
-/* Reset the clients in envs, num_envs indices. Return the number of failures. */
+/* Reset the num_envs clients whose indices are in envs. Return the number of failures.
+   The call overwrites envs. */
 int loop_reset(struct loop *loop, int *envs, int num_envs) {
     return share_out(loop, reset, envs, num_envs, num_envs);
 }
