@@ -1,4 +1,4 @@
-"""Control of a robot's motors: a Python function, or a `MotorControl` of numbers."""
+"""Control of a robot's motors by a Python function or by a `MotorControl`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ ArmMode = Literal["position", "velocity", "torque"]
 class MotorControl:
     """Drives all movable joints of a robot to setpoints.
 
-    It is a `Control` that consists of numbers only, so the native loop can carry it out
-    in C. The arm's joints are the first joints of the robot.
+    It is a `Control` that the native loop can also carry out in C. The arm's joints are
+    the first joints of the robot.
 
     A setpoint is a row of numbers. Its first part is for the arm. Without ``ik_link``,
     it has one number per joint of the arm: positions [rad], velocities [rad/s] or
@@ -34,9 +34,9 @@ class MotorControl:
     Attributes:
         forces: Maximum force of every joint's motor [N m] or [N]. The torques of
             ``arm_mode="torque"`` are not limited.
-        ik_link: Link that the inverse kinematics bring to its target; None means that
-            setpoints contain the arm's joints. It needs ``arm_mode`` "position" and
-            ``num_arm_joints``.
+        ik_link: Link that the inverse kinematics bring to its target, which requires
+            ``arm_mode`` "position" and ``num_arm_joints``; None means that setpoints
+            contain the arm's joints.
         ik_orientation: Orientation that this link keeps, quaternion xyzw in the world
             frame; None means that setpoints contain it.
         num_arm_joints: Number of the arm's joints.
@@ -101,18 +101,19 @@ class MotorControl:
         if self.arm_mode == "velocity":
             velocities = setpoint[:first]
         forces = self.forces
-        if self.arm_mode == "torque":  # these joints have no motor force that brakes
+        if self.arm_mode == "torque":
+            # The motor must not brake a joint that a torque drives.
             forces = (0.0,) * first + forces[first:]
         client.control_joints(body, joints[first:], forces, velocities)
 
     def advance(
         self, client: PhysicsClient, body: int, setpoint: Doubles, count: int
     ) -> None:
-        """Take ``count`` time steps, with the setpoint's torques if it has any."""
+        """Take ``count`` substeps, with the setpoint's torques if it has any."""
         if self.arm_mode != "torque":
             client.step(count)
             return
         torques = setpoint[: self.num_arm_joints]
-        for _ in range(count):  # Bullet applies a torque for one time step only
+        for _ in range(count):  # Bullet applies a torque in one substep only
             client.apply_torques(body, torques)
             client.step()
