@@ -87,6 +87,17 @@ def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
                 theirs = theirs.exclude("_reset")
 
 
+def test_a_step_returns_only_stepped_clients():
+    with make("raise") as env:
+        env.reset()
+        simulation, control = env.episodes.simulation, env.robot.controller
+        setpoint = env.robot.setpoint(torch.zeros(3, 3), simulation).numpy()
+        blow_up(env, 0, "object")
+        blow_up(env, 1, "object")
+        assert simulation.step(control, setpoint, [1]) == [1]
+        assert simulation.step(control, setpoint, [0, 2]) == [0]
+
+
 def test_unknown_option():
     with pytest.raises(ValueError, match="on_divergence must be one of"):
         torch_panda.make("PandaReach-v1", on_divergence="ignore")

@@ -144,7 +144,7 @@ class VectorSimulation:
             envs: Indices of the clients to step; None means all.
 
         Returns:
-            Indices of the clients whose state is not finite.
+            Indices of the stepped clients whose state is not finite.
 
         Raises:
             WorkerError: Bullet failed in one or more clients. The error names the first
@@ -155,9 +155,8 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # Wait for the Python threads. After a first Ctrl-C, `WorkerPool.run`
-                # waits until they are done before it raises. After a second one it
-                # raises at once, and the threads may still use clients now.
+                # If a second Ctrl-C interrupted an earlier call, its Python threads may
+                # still be using clients.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -174,8 +173,9 @@ class VectorSimulation:
                 client.step(self.n_substeps)
             self.state.read(env, client)
 
-        self._pool.run(step_one, range(self.num_envs) if envs is None else envs)
-        return self.diverged()
+        stepped = range(self.num_envs) if envs is None else envs
+        self._pool.run(step_one, stepped)
+        return sorted(set(self.diverged()).intersection(stepped))
 
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for some environments in the simulation's threads.
@@ -193,10 +193,8 @@ class VectorSimulation:
         the bodies there. It then overwrites these tensors, except ``marker_pose``, with
         the state that Bullet reports.
 
-        The reset also restores Bullet's broad phase, a tree of the bodies' bounding
-        boxes and a list of the boxes that overlap. The broad phase depends on earlier
-        steps, and Bullet solves contacts in its order. Because it is restored, an
-        episode depends on its start and its actions only. See `BroadPhase`.
+        The reset also restores Bullet's broad phase, so that an episode depends on its
+        start and its actions only. See `BroadPhase`.
 
         Args:
             envs: Indices of the clients to reset.
