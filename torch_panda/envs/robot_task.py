@@ -181,7 +181,7 @@ class RobotTaskEnv(EnvBase):
 
     @property
     def goal_indices(self) -> tuple[int, ...] | None:
-        """Entries of ``observation`` that are the task's achieved goal, in its order.
+        """Index in ``observation`` of each entry of the task's achieved goal.
 
         None if the observation does not contain the achieved goal, or if the task does
         not declare `Task.goal_entries`.
@@ -250,9 +250,9 @@ class RobotTaskEnv(EnvBase):
             tensordict: May hold ``_reset``, a mask of the environments to reset, and a
                 state to start from: the result of `get_state`, or some of its entries.
                 The call does not change it.
-            set_state: Whether to start from this state. Joints that the state leaves
-                out are neutral, velocities are zero, and objects and goals are sampled.
-                None starts from the state if the tensordict holds one.
+            set_state: Whether to start from this state. Entries that the state lacks
+                start as in any new episode. None starts from the state if the
+                tensordict holds one.
             **kwargs: Other options of torchrl.
 
         Returns:
