@@ -52,9 +52,9 @@ _BYTES_PER_ENV = 44e6
 class Episodes:
     """n environments of one robot and one task; see `RobotTaskEnv` for the arguments.
 
-    All tensors are on the CPU. They have n rows, except the actions and states that a
-    caller passes. Those have the batch shape of a `RobotTaskEnv`: (n,), or () if
-    ``num_envs`` is None. Then n is 1.
+    All tensors are on the CPU and have n rows. Only actions and states that a caller
+    passes have the batch shape of a `RobotTaskEnv`: (n,), or () if ``num_envs`` is None
+    (then n is 1).
 
     A call raises `BulletError` while a call of another thread is running.
 
@@ -63,8 +63,8 @@ class Episodes:
         renderer: Draws the environments.
         seeds: Seeds of the episodes.
         entries: Observed entries beside ``observation`` and the goals, by key.
-        goal_indices: Entries of ``observation`` that are the task's achieved goal, or
-            None.
+        goal_indices: Index in ``observation`` of each entry of the task's achieved
+            goal, or None; see `RobotTaskEnv.goal_indices`.
         goal_dim: Number of entries of ``achieved_goal`` and ``desired_goal``.
     """
 
@@ -401,7 +401,8 @@ class Episodes:
             step_mask[acting] = True
             self._history.record(action, step_mask)
             self._advance(action, acting)
-            # Sensors report the present only, so read them after the last action.
+            # Sensors report the present only, so the last step of each environment is
+            # enough for them.
             self._observer.after_step(last)
         self._starts.step_count[envs] = start_state.values["step_count"]
         start_state.check_arrival(envs, self._starts.state())
