@@ -68,8 +68,8 @@ class EpisodeObserver:
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._attached_sensors, extra]
         # Keys that sensors and tasks may not observe, because a reset would take
-        # observations with these keys for a state. The sensor "joint_state" may use
-        # two of them; see `is_state`.
+        # observations with these keys for entries of a state. The sensor "joint_state"
+        # may use two of them; see `is_state`.
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
@@ -112,8 +112,8 @@ class EpisodeObserver:
             observed, has_outcome = self._observe_goals(goal), False
         else:
             observed, has_outcome = self._compiled.observe(goal, step_count)
-        # `has_outcome`: C code has computed success, ends and reward, and they are
-        # valid; see `CompiledObserver.observe`. C code does not call the task's hooks.
+        # `has_outcome` says whether C code computed success, end flags and reward; see
+        # `CompiledObserver.observe`. C code does not call the task's hooks.
         if not has_outcome or self._has_reward or self._has_failure:
             self._add_outcome(observed, step_count, action)
         if action is None:
@@ -267,9 +267,9 @@ class EpisodeObserver:
             if len(self._goal_indices) != task.goal_dim or not is_inside:
                 raise ValueError(
                     f"{task_name}.goal_entries must name {task.goal_dim} entries of an "
-                    f"observation; the robot's part has {robot.observation_dim} "
-                    f"entries and the task's has {task.observation_dim}, got "
-                    f"{task.goal_entries}"
+                    f"observation, got {task.goal_entries}; the robot's part has "
+                    f"{robot.observation_dim} entries, and the task's part has "
+                    f"{task.observation_dim}"
                 )
 
 
