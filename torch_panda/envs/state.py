@@ -75,7 +75,7 @@ class StartState(NamedTuple):
             yield action, rows[is_acting].tolist(), last.tolist()
 
     def check_arrival(self, envs: list[int], state: dict[str, Tensor]) -> None:
-        """Check that repeating the actions led to this state.
+        """Check that repeating the actions led to the state in `values`.
 
         Args:
             envs: The environments of the k rows.
@@ -226,6 +226,6 @@ def _read_entry(
         check_rows(key, is_small, envs, f"finite and at most {_LIMIT:g}")
     else:
         check_rows(key, value >= 0, envs, "at least 0")
-    if key.endswith("object_pose"):  # also that of the start of an exact state
+    if key.endswith("object_pose"):  # also "start_object_pose"
         check_rotations(key, value, envs)
     return value
