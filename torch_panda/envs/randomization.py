@@ -156,8 +156,8 @@ class PhysicsFactors:
                 self._gravity = (index, physics.gravity)
                 continue
             argument, links, nominal_value = targets[name]
-            # If the nominal value is 0, the factor multiplies this number instead: 1,
-            # so that the value becomes the factor, or 0, so that the link keeps its 0.
+            # Replaces a nominal value of 0. With 1, the drawn number becomes the value.
+            # With 0, the link is left out and keeps its 0.
             zero_substitute = 1.0 if name in _ABSOLUTE_AT_ZERO else 0.0
             for link in links:
                 if value := nominal_value(*link) or zero_substitute:
