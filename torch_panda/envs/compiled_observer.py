@@ -1,4 +1,4 @@
-"""Computes observations, goals, success, reward and the ends of episodes in C."""
+"""Computes observations, goals, success, reward and end flags in C."""
 
 import torch
 from torch import Tensor
@@ -114,15 +114,15 @@ class CompiledObserver:
             step_count: Number of steps of the present episodes, (n, 1) int64.
 
         Returns:
-            The observed entries with the reward; and whether reward, success and ends
-            are valid. They are not valid if the task defines its own success or reward,
-            if the reward is dense, or if a goal is so close to the threshold that the
-            rounding of torch decides.
+            The observed entries and the reward; and whether reward, success and end
+            flags are valid. They are not valid if the task overrides one of
+            `_DISTANCE_METHODS`, if the reward is dense, or if a distance is so close to
+            the threshold that torch may round it to the other side.
         """
         observed = {key: torch.empty_like(t) for key, t in self._templates.items()}
         description, task = self._description, self._task
         description.distance_threshold = task.distance_threshold
-        is_complete = self._library.environment_observe(
+        has_outcome = self._library.environment_observe(
             description,
             self._state_address,
             len(goal),
@@ -130,7 +130,7 @@ class CompiledObserver:
             step_count.data_ptr(),
             *[value.data_ptr() for value in observed.values()],
         )
-        return observed, is_complete and task.reward_type == "sparse"
+        return observed, has_outcome and task.reward_type == "sparse"
 
 
 def _robot_columns(
@@ -143,8 +143,9 @@ def _robot_columns(
         or robot_class.fingers_width is not Robot.fingers_width
     ):
         return selected_columns(robot.observation, simulation)
-    # `Robot.observation` has the position and the velocity of the hand, then the width.
-    # WIDTH is no column: it tells the C code to compute the distance of the fingers.
+    # `Robot.observation` has the position and velocity of the end-effector and, with a
+    # free gripper, the distance between the fingers. WIDTH is not a column: it tells C
+    # code to compute this distance.
     first = simulation.state.ee_column
     columns = tuple(range(first, first + 6))
     if not robot.has_free_gripper:
