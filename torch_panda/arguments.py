@@ -19,7 +19,8 @@ class Configured:
 
     def __new__(cls, *args: object, **arguments: object) -> Self:
         """Refuse unknown arguments."""
-        check_call(cls.__name__, cls, arguments)
+        if arguments:
+            check_call(cls.__name__, cls, arguments)
         return super().__new__(cls)
 
     def __repr__(self) -> str:

@@ -156,7 +156,7 @@ def test_an_arm_alone(monkeypatch):
 
     def build(client):
         arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
-        joints = [joint.index for joint in client.joints(arm) if joint.is_movable]
+        joints = [joint.number for joint in client.joints(arm) if joint.is_movable]
         return Scene(arm, tuple(joints), ee_link=11)
 
     results = []

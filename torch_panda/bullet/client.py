@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 from ctypes import byref, c_int
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from typing_extensions import Self
 
@@ -29,7 +29,6 @@ from torch_panda.bullet.connection import (
     doubles,
     shared_doubles,
 )
-from torch_panda.bullet.contacts import ContactPoint, read_contact
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
 from torch_panda.bullet.urdf import (
@@ -41,25 +40,25 @@ from torch_panda.bullet.urdf import (
 from torch_panda.checks import check_not_negative, check_quaternion
 from torch_panda.rotations import NO_ROTATION
 
+if TYPE_CHECKING:  # imported at its first use
+    from torch_panda.bullet.contacts import ContactPoint
+
 # pybullet's default velocityGain in setJointMotorControlArray.
 VELOCITY_GAIN = 1.0
 
 
-@dataclass(frozen=True)
-class Joint:
+class Joint(NamedTuple):
     """A joint of a body, as its URDF describes it.
 
     Attributes:
-        index: Index of the joint, and of the link that it moves.
+        number: Index of the joint, and of the link that it moves.
         name: Name of the joint.
-        link_name: Name of the link that it moves.
         is_movable: Whether the joint has one degree of freedom.
         damping: Damping [N m s/rad] or [N s/m].
     """
 
-    index: int
+    number: int
     name: str
-    link_name: str
     is_movable: bool
     damping: float
 
@@ -298,9 +297,8 @@ class PhysicsClient:
         joints = []
         for index in range(capi.joint_count(handle, body)):
             capi.joint_info(handle, body, index, byref(info))
-            name, link = info.joint_name.decode(), info.link_name.decode()
-            is_movable = info.u_size == 1
-            joints.append(Joint(index, name, link, is_movable, info.damping))
+            name, is_movable = info.joint_name.decode(), info.u_size == 1
+            joints.append(Joint(index, name, is_movable, info.damping))
         return joints
 
     def mass(self, body: int, link: int = -1) -> float:
@@ -620,7 +618,7 @@ class PhysicsClient:
 
     def contact_points(
         self, body_a: int | None = None, body_b: int | None = None
-    ) -> list[ContactPoint]:
+    ) -> list["ContactPoint"]:
         """Contacts of the last substep.
 
         Args:
@@ -630,6 +628,8 @@ class PhysicsClient:
             body_b: Of these contacts, return only those whose body b is this body; None
                 returns all.
         """
+        from torch_panda.bullet.contacts import read_contact
+
         # Filter in Python: Bullet's own filter exchanges bodies a and b where needed,
         # but does not reverse the friction forces.
         handle = self.connection.handle

@@ -42,4 +42,4 @@ def build_scene(
 
 
 def _movable_joints(client: PhysicsClient, body: int) -> tuple[int, ...]:
-    return tuple(joint.index for joint in client.joints(body) if joint.is_movable)
+    return tuple(joint.number for joint in client.joints(body) if joint.is_movable)

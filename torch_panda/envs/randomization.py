@@ -135,7 +135,7 @@ class PhysicsFactors:
         ]
         fingers = [(scene.robot, link) for link in finger_links]
         joints = [(scene.robot, joint) for joint in scene.joints]
-        damping = {joint.index: joint.damping for joint in client.joints(scene.robot)}
+        damping = {joint.number: joint.damping for joint in client.joints(scene.robot)}
         # By name of the factor: the argument of `set_dynamics`, the links as (body,
         # link) pairs, and the function that reads a link's nominal value.
         targets: dict[

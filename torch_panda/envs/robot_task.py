@@ -26,15 +26,16 @@ from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
 from torch_panda.envs.state import EXACT_KEYS, is_state, unpack_state
 from torch_panda.envs.state_support import StateSupport
-from torch_panda.rendering import Camera, RendererName, Window, segmentation_ids
+from torch_panda.rendering import Camera, RendererName
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
 from torch_panda.sensors import Sensor
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
 
-if TYPE_CHECKING:  # needs an extra
+if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.web_viewer import WebViewer
+    from torch_panda.rendering.window import Window
 
 _CPU = torch.device("cpu")
 
@@ -427,6 +428,8 @@ class RobotTaskEnv(EnvBase):
         ``object`` (``object1`` and ``object2`` in Stack). A task can give a body
         another name with `Visual.name`.
         """
+        from torch_panda.rendering.env_renderer import segmentation_ids
+
         return segmentation_ids(self.episodes.simulation)
 
     def render(
@@ -464,7 +467,7 @@ class RobotTaskEnv(EnvBase):
             pixels = episodes.renderer.picture(chosen, camera).to(self.device)
         return pixels[0] if is_single else pixels
 
-    def open_window(self, camera: Camera | None = None) -> Window:
+    def open_window(self, camera: Camera | None = None) -> "Window":
         """Open pybullet's GUI. ``show(i)`` of the result shows environment i.
 
         It needs a display. Close it, or use it as a context manager.
@@ -476,6 +479,8 @@ class RobotTaskEnv(EnvBase):
         Raises:
             BulletError: There is no display, or the environment is closed.
         """
+        from torch_panda.rendering.window import Window
+
         episodes = self.episodes
         with episodes.exclusive():
             return Window(episodes.simulation, camera or Camera())

@@ -3,14 +3,17 @@
 import math
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation, WorkerPool
 from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.egl import RendererName
-from torch_panda.rendering.env_renderer import EnvRenderer
 from torch_panda.rendering.frames import Frames
+
+if TYPE_CHECKING:  # imported with the first picture
+    from torch_panda.rendering.env_renderer import EnvRenderer
 
 # Smallest cells in which merging the vertices of a mesh saves time [m].
 _FINEST_CELL = 0.004
@@ -84,12 +87,14 @@ class VectorRenderer:
             self._gl_thread.run(lambda k: renderers[k].close(), range(len(renderers)))
             self._gl_thread.close()
 
-    def _provide(self, cell: float, count: int) -> list[EnvRenderer]:
+    def _provide(self, cell: float, count: int) -> list["EnvRenderer"]:
         """The idle renderers for a mesh cell, at least ``count`` of them.
 
         Missing renderers are made one by one, because Bullet's importer is not
         thread-safe.
         """
+        from torch_panda.rendering.env_renderer import EnvRenderer
+
         renderers = self._idle.setdefault(cell, [])
 
         def make(_: int) -> None:
