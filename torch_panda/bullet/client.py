@@ -68,9 +68,9 @@ class PhysicsClient:
 
     One thread at a time may use a client.
 
-    The client has no visual shapes. Instead, it records the commands that build its
-    scene in a blueprint. A renderer builds its own copy of the scene from the blueprint
-    and draws that copy.
+    The client has no visual shapes. Instead, its `blueprint` holds the commands that
+    built the scene. A renderer builds its own copy of the scene from the blueprint and
+    draws that copy.
 
     Args:
         physics: Parameters of the integration.
@@ -85,8 +85,7 @@ class PhysicsClient:
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
-        # Imported here, because `import torch_panda` does not need this package. Only
-        # clients do.
+        # Imported here, because only clients need this package.
         from torch_panda.bullet import solver
 
         solver.activate()
@@ -396,8 +395,8 @@ class PhysicsClient:
     def set_joint_friction(self, body: int, joint: int, force: float) -> None:
         """Set the friction [N m] or [N] of a joint that nothing else controls.
 
-        Bullet imitates friction by a motor. The motor's target velocity is 0, and its
-        maximum force is ``force``. Without this call, its maximum impulse is 1 N m s or
+        Bullet imitates friction by a motor with target velocity 0 and maximum force
+        ``force``. Without this call, Bullet's default motor applies up to 1 N m s or
         1 N s per substep. With the default substep of 2 ms, this equals 500 N m or
         500 N.
 
@@ -622,9 +621,9 @@ class PhysicsClient:
         """Contacts of the last substep.
 
         Args:
-            body_a: Return only contacts in which this body takes part. They are
-                reversed where necessary, so that it is body a of each contact. None
-                returns the contacts of all bodies as Bullet stores them.
+            body_a: Return only contacts of this body, reversed where necessary, so that
+                this body is body a. None returns the contacts of all bodies as Bullet
+                stores them.
             body_b: Of these contacts, return only those whose body b is this body; None
                 returns all.
         """
