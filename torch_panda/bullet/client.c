@@ -104,7 +104,7 @@ static int advance(struct batch *batch, int env, int num_substeps) {
     handle command = batch->bullet->step_init(client->handle);
     for (; client->num_substeps < num_substeps; client->num_substeps++) {
         client->num_detections++;
-        if (has_torques) { /* Bullet applies a torque for one time step only */
+        if (has_torques) { /* Bullet applies a torque in one substep only */
             if (!apply_torques(batch, env)) return 0;
             command = batch->bullet->step_init(client->handle);
         }
