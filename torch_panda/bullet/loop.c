@@ -104,8 +104,8 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
 }
 
 /* Do the work of the num_envs clients whose indices are in envs. Cut the steps of all
-   but the first num_whole clients into pieces. Return the number of failures. The call
-   uses envs as the queue and overwrites it. */
+   but the first num_whole clients into pieces. Return the number of failures. envs
+   becomes the queue: a client of which one piece was done is written back into it. */
 static int share_out(struct loop *loop, work *work, int *envs, int num_envs,
                      int num_whole) {
     fenv_t before; /* the caller's settings, which may flush denormals to zero */
@@ -142,8 +142,8 @@ static int reset(struct batch *batch, int env, int piece) {
     return 0;
 }
 
-/* Reset the num_envs clients whose indices are in envs. Return the number of failures.
-   The call overwrites envs. */
+/* Reset the num_envs clients whose indices are in envs. Return the number of
+   failures. */
 int loop_reset(struct loop *loop, int *envs, int num_envs) {
     return share_out(loop, reset, envs, num_envs, num_envs);
 }
