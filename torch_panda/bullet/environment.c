@@ -1,5 +1,5 @@
-/* Computes setpoints from actions. Computes observations, goals, success, reward and the
-   ends of episodes from states.
+/* Computes setpoints from actions. Computes observations, goals, success, reward and end
+   flags from states.
 
    Robot.setpoint and EpisodeObserver compute the same numbers with torch. They need
    about 40 operations of torch per step, each of which takes 2 to 5 microseconds. The
@@ -78,9 +78,9 @@ static int compare(const struct observation *observed, const float *achieved_goa
     return distance > threshold + margin && distance < 1e15 ? MISSED : UNKNOWN;
 }
 
-/* Observe all environments. Return 1 if success, ends and the sparse reward are valid
-   too. Return 0 if only the observations and goals are valid, in which case the caller
-   has to compute the others. The reward may be NULL. */
+/* Observe all environments. Return 1 if success, end flags and the sparse reward are
+   valid too. Return 0 if only the observations and goals are valid, in which case the
+   caller has to compute the others. The reward may be NULL. */
 int environment_observe(const struct observation *observed, doubles state, int num_envs,
                         doubles goal, const int64_t *step_count, float *observation,
                         float *achieved_goal, float *desired_goal, float *reward,
