@@ -67,6 +67,7 @@ class CompiledObserver:
             torch.empty(n, len(goal_columns), dtype=torch.float32, device="cpu"),
             torch.empty(n, 1, dtype=torch.bool, device="cpu"),
         )
+        # In the order of the arguments of `environment_observe`.
         self._templates = {
             "observation": observation,
             "achieved_goal": goal,
