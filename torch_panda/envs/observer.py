@@ -73,7 +73,7 @@ class EpisodeObserver:
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
-        # The randomizer comes afterwards, because it may observe a reserved key.
+        # Added after this check, because the randomizer may observe a reserved key.
         self.entries = join_entries(observers, reserved) | randomizer.entries
         observers.append(randomizer)
         self._observers = [observer for observer in observers if observer.entries]
@@ -100,8 +100,9 @@ class EpisodeObserver:
                 after a reset.
 
         Returns:
-            ``observation``, the goals, ``success``, ``terminated``, ``truncated`` and
-            ``done``; after a step also ``reward``, (n, 1) float32.
+            ``observation``, the goals, ``success``, ``terminated``, ``truncated``,
+            ``done``, and the entries in `entries`; after a step also ``reward``, (n, 1)
+            float32.
 
         Raises:
             ValueError: One of the first observations or rewards is NaN or infinite, or
