@@ -81,8 +81,8 @@ class RobotTaskEnv(EnvBase):
             physics is computed on the CPU.
         max_episode_steps: Number of steps after which an episode is ``truncated``;
             None means the task's number.
-        terminate_on_success: Whether success ends an episode, as in panda-gym 3. In the
-            paper, episodes continue after success.
+        terminate_on_success: Whether success ends an episode, as in panda-gym 3. In
+            panda-gym's paper, episodes continue after success.
         physics: How Bullet integrates: "exact" as in panda-gym, "fast", or parameters.
         sensors: Sensors to observe beside ``observation``, each under its own keys. A
             sensor without arguments may be given by its name.
@@ -370,8 +370,8 @@ class RobotTaskEnv(EnvBase):
             exact: Add the starts of the episodes and the actions since, under
                 ``start_...``, ``actions`` and ``num_actions``. A reset to an exact
                 state repeats these actions, and the episode then continues bit for
-                bit. Bullet remembers more than poses and velocities, so that a plain
-                state continues only approximately.
+                bit. Bullet remembers more than poses and velocities, so after a reset
+                to a plain state, the episode continues only approximately.
 
         Returns:
             ``joint_position`` and ``joint_velocity`` (*batch, n_joints),
