@@ -11,19 +11,24 @@ from torch_panda.learning.exploration import (
     DURATION,
     HIGHEST_POINT,
     LOWEST_POINT,
+    NEAR_OBJECTS,
+    OBJECT_DISTANCE,
+    OBJECT_HEIGHTS,
+    WARM_UP,
     RandomPointModule,
 )
 
 NUM_ENVS = 64
 
 
-def make_module(eps, *, moves_joints=False, action_size=4):
+def make_module(eps, *, moves_joints=False, action_size=4, objects=()):
     return RandomPointModule(
         torch.as_tensor(eps).expand(NUM_ENVS).clone(),
         action_size=action_size,
         action_scale=0.05,
         moves_joints=moves_joints,
         num_arm_actions=7 if moves_joints else 3,
+        objects=objects,
     )
 
 
@@ -40,9 +45,13 @@ def explore(module, steps, action_size=4, hand=(0.0, 0.0, 0.1)):
 
 
 @pytest.mark.parametrize("eps", [0.0, 0.3, 0.5, 1.0])
-def test_the_ratio_of_exploring_steps_is_eps(eps):
+def test_after_the_warm_up_the_ratio_of_exploring_steps_is_eps(eps):
     torch.manual_seed(0)
-    replaced = explore(make_module(eps), steps=2000)[..., 0] != 9.0
+    module = make_module(eps)
+    warm_up = explore(module, steps=WARM_UP)[..., 0]
+    assert (warm_up != 9.0).all()
+    explore(module, steps=DURATION[1])  # the last moves of the warm-up end
+    replaced = explore(module, steps=2000)[..., 0] != 9.0
     assert replaced.float().mean() == pytest.approx(eps, abs=0.01)
 
 
@@ -84,6 +93,44 @@ def test_the_hand_reaches_points_of_the_region():
     assert torch.cat(distances[10:]).median() < 0.05
     low, high = torch.tensor(LOWEST_POINT), torch.tensor(HIGHEST_POINT)
     assert ((module.point >= low) & (module.point <= high)).all()
+
+
+def test_half_of_the_points_are_near_one_of_the_objects():
+    torch.manual_seed(0)
+    module = make_module(1.0, objects=(3, 6))
+    centres = torch.tensor([[2.0, 1.0, 0.02], [-3.0, 1.0, 0.3]])
+    observation = torch.cat((torch.zeros(3), centres.flatten()))
+    points = torch.cat(
+        [module._draw_points(observation.expand(NUM_ENVS, -1)) for _ in range(100)]
+    )
+    distance = (points[:, None, :2] - centres[:, :2]).abs().amax(-1)
+    is_near = distance <= OBJECT_DISTANCE + 1e-6
+    assert is_near.float().mean(0).tolist() == pytest.approx(
+        [NEAR_OBJECTS / 2] * 2, abs=0.02
+    )
+    lowest, highest = OBJECT_HEIGHTS
+    for near, (_, _, z) in zip(is_near.T, centres, strict=True):
+        heights = points[near, 2]
+        assert heights.min() >= max(0.0, z + lowest)
+        assert heights.max() <= z + highest
+    anywhere = points[~is_near.any(1)]
+    low, high = torch.tensor(LOWEST_POINT), torch.tensor(HIGHEST_POINT)
+    assert ((anywhere >= low) & (anywhere <= high)).all()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "objects"),
+    [("PandaReach-v1", ()), ("PandaPush-v1", (6,)), ("PandaStack-v1", (7, 19))],
+)
+def test_agents_know_where_observations_have_objects(env_id, objects):
+    with torch_panda.make(env_id, num_envs=2) as env:
+        agent = make_agent(env, Hyperparameters(exploration="points"))
+        assert agent.random_points().objects == objects
+        td = env.reset()
+    for start in objects:
+        position = td["observation"][:, start : start + 3]
+        goals = td["achieved_goal"].unflatten(1, (-1, 3))
+        assert (goals == position[:, None]).all(-1).any(1).all()
 
 
 def test_joint_control_spends_a_displacement():

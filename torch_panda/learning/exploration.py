@@ -23,6 +23,9 @@ LOWEST_POINT, HIGHEST_POINT = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
 NEAR_OBJECTS = 0.5
 OBJECT_DISTANCE = 0.1
 OBJECT_HEIGHTS = (-0.02, 0.06)
+# In its first WARM_UP steps, each environment always moves to points. Then the replay
+# buffer has many contacts before learning begins.
+WARM_UP = 250
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point
 NOISE = 0.2  # standard deviation of the Gaussian noise on actions towards a point
@@ -32,16 +35,17 @@ class RandomPointModule(TensorDictModuleBase):
     """Replaces some actions by actions that move the arm to a random point.
 
     In each step, an environment without a point draws one with a certain probability,
-    and keeps it for several steps. The gripper's action is drawn uniformly together
-    with the point. Under joint control, a point is a displacement of all joints.
+    and keeps it for several steps. In the first `WARM_UP` steps, all environments always
+    move to points. The gripper's action is drawn uniformly together with the point.
+    Under joint control, a point is a displacement of all joints.
 
     Like torchrl's exploration modules, this module acts only under
     ``ExplorationType.RANDOM``, and draws from torch's global random generator. Its
     state is part of ``state_dict``.
 
     Args:
-        eps: Fraction of the steps of each environment in which it moves to a point,
-            (num_envs,), from 0 to 1.
+        eps: Fraction of the later steps of each environment in which it moves to a
+            point, (num_envs,), from 0 to 1.
         action_size: Size of an action.
         action_scale: Displacement that an action of 1 causes in one step, [m] for the
             end-effector and [rad] for joints.
@@ -58,6 +62,7 @@ class RandomPointModule(TensorDictModuleBase):
     point: Tensor
     gripper: Tensor
     start_probability: Tensor
+    warm_up_left: Tensor
 
     def __init__(
         self,
@@ -83,6 +88,7 @@ class RandomPointModule(TensorDictModuleBase):
         self.action_scale = action_scale
         self.moves_joints = moves_joints
         self.objects = tuple(objects)
+        self.register_buffer("warm_up_left", torch.tensor(WARM_UP))
         self.register_buffer("steps_left", torch.zeros(num_envs, dtype=torch.int64))
         self.register_buffer("point", torch.zeros(num_envs, num_arm_actions))
         gripper_size = action_size - num_arm_actions
@@ -105,7 +111,10 @@ class RandomPointModule(TensorDictModuleBase):
     def _start_moves(self, observation: Tensor) -> None:
         """Draw which environments without a point get one, and draw the points."""
         draws = torch.rand_like(self.start_probability)
-        starts = (self.steps_left == 0) & (draws < self.start_probability)
+        is_warm_up = self.warm_up_left > 0
+        self.warm_up_left.sub_(1).clamp_(min=0)
+        draws_point = is_warm_up | (draws < self.start_probability)
+        starts = (self.steps_left == 0) & draws_point
         shortest, longest = DURATION
         durations = torch.randint_like(self.steps_left, shortest, longest + 1)
         self.steps_left.copy_(torch.where(starts, durations, self.steps_left))
