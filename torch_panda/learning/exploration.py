@@ -35,9 +35,9 @@ class RandomPointModule(TensorDictModuleBase):
     """Replaces some actions by actions that move the arm to a random point.
 
     In each step, an environment without a point draws one with a certain probability,
-    and keeps it for several steps. In the first `WARM_UP` steps, all environments always
-    move to points. The gripper's action is drawn uniformly together with the point.
-    Under joint control, a point is a displacement of all joints.
+    and keeps it for several steps. In the first `WARM_UP` steps, every environment
+    always moves to points. The gripper's action is drawn uniformly together with the
+    point. Under joint control, a point is a displacement of all joints.
 
     Like torchrl's exploration modules, this module acts only under
     ``ExplorationType.RANDOM``, and draws from torch's global random generator. Its
