@@ -113,6 +113,22 @@ def test_from_fetch(theirs, ours):
     check_row(theirs, ours, env, make, is_fetch=True)
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_fetch_has_the_same_clock():
+    """Episodes have 50 steps of 40 ms."""
+    robotics = pytest.importorskip(
+        "gymnasium_robotics", reason="needs gymnasium-robotics, which brings MuJoCo"
+    )
+    gymnasium.register_envs(robotics)
+    ours = gymnasium.make("torch_panda/PandaPush-v1")
+    theirs = gymnasium.make("FetchPush-v4")
+    step = ours.unwrapped.torch_env.physics.ctrl_dt
+    assert step == pytest.approx(theirs.unwrapped.dt) == pytest.approx(0.04)
+    assert ours.spec.max_episode_steps == theirs.spec.max_episode_steps == 50
+    ours.close()
+    theirs.close()
+
+
 def test_an_exact_state_goes_on():
     """The episode continues, as `restore_state` is meant to do."""
     env = gymnasium.make("torch_panda/PandaPush-v3")
