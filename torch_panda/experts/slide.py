@@ -18,9 +18,10 @@ STRIKE_HEIGHT = 0.02  # height of the end-effector in the strike [m]
 # distance. DEVIATION is the angle between the strike and the puck's path [rad]. Their
 # variables are s, the root of the distance; x and y, the puck's position; and n, the
 # sine of the direction. The keys are terms: "sxn" stands for s * x * n, and "" for 1.
-# fit_strike.py fits the coefficients to random strikes, and it tests them on others: 90
-# % of the pucks stop within 5 cm of the predicted distance, and 99 % within 5 cm
-# sideways. Cubic terms that do not improve the fit are left out.
+# The coefficients were fitted to random strikes in PandaSlide-v1 (by fit_strike.py of
+# commit 0ac2f60) and tested on others: 90 % of the pucks stop within 5 cm of the
+# predicted distance, and 99 % within 5 cm sideways. Cubic terms that do not improve the
+# fit are left out.
 STRENGTH = {
     "": 0.3047, "s": 0.5741, "x": 0.8988, "ss": 0.2025, "sn": -0.1505, "xn": -2.9521,
     "yn": 0.6878, "sxx": 7.388, "sxn": 3.4006, "xxx": 22.7439,
