@@ -58,12 +58,6 @@ def test_desired_goals_of_others(stack):
     torch.testing.assert_close(batch["next", "reward"], reward)
 
 
-def test_stored_copies(stack):
-    buffer = make_buffer(stack, 400, her="augment")
-    buffer.extend(select_sequences(play_randomly(stack), 1.0).reshape(-1))
-    assert len(buffer) == 5 * 400
-
-
 def test_parts_need_several_objects():
     with (
         torch_panda.make("PandaPush-v1", num_envs=1) as env,

@@ -8,13 +8,13 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.transforms import HindsightAugment, HindsightRelabel
+from torch_panda.transforms import HindsightRelabel
 
-Hindsight = Literal["relabel", "parts", "augment", "none"]
+Hindsight = Literal["relabel", "parts", "none"]
 
 # Both numbers are from the panda-gym paper (arXiv 2106.13687).
 K = 4  # hindsight goals per original goal; the HER paper's k
-BUFFER_SIZE = 1_000_000  # capacity, not counting relabelled copies
+BUFFER_SIZE = 1_000_000  # capacity
 # Steps at the start of an episode in which Slide's puck falls onto the table. They do
 # not count as motion.
 SETTLING_STEPS = 4
@@ -48,12 +48,10 @@ def make_buffer(
 
     Args:
         env: Environment whose transitions will be stored.
-        capacity: Number of transitions without their relabelled copies, at most
-            `BUFFER_SIZE`.
+        capacity: Number of transitions, at most `BUFFER_SIZE`.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
-            the goal is relabelled. "augment" stores K relabelled copies of each
-            transition. "none" keeps the original goals.
+            the goal is relabelled. "none" keeps the original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of other
             transitions. The rest are goals achieved later in the same episode.
         seed: Seed of the choice of goals.
@@ -61,17 +59,11 @@ def make_buffer(
     Raises:
         ValueError: ``her`` does not fit the task.
     """
-    capacity = min(capacity, BUFFER_SIZE)
     weights = {"future": 1 - desired_ratio, "desired": desired_ratio}
     strategy = {name: weight for name, weight in weights.items() if weight}
     # `success_fn` is None below, because success is not stored (see `STORED_KEYS`).
-    transform: HindsightRelabel | HindsightAugment | None = None
-    if her == "augment":
-        capacity *= K + 1
-        transform = HindsightAugment.from_env(
-            env, success_fn=None, k=K, strategy=strategy, seed=seed
-        )
-    elif her != "none":
+    transform = None
+    if her != "none":
         num_objects, rest = divmod(env.task.goal_dim, POSITION_SIZE)
         if her == "parts" and (rest or num_objects < 2):
             raise ValueError(
@@ -86,7 +78,7 @@ def make_buffer(
             goal_parts=(POSITION_SIZE,) * num_objects if her == "parts" else None,
             seed=seed,
         )
-    storage = LazyTensorStorage(capacity, device=env.device)
+    storage = LazyTensorStorage(min(capacity, BUFFER_SIZE), device=env.device)
     return TensorDictReplayBuffer(storage=storage, transform=transform)
 
 

@@ -36,8 +36,8 @@ class Args(Hyperparameters):
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
     """hindsight goals, four for each original goal: relabel transitions when they are
-    sampled ("relabel"), the same with a separate draw for each object's part of the
-    goal ("parts"), or store relabelled copies ("augment"). "none" uses no hindsight"""
+    sampled ("relabel"), or the same with a separate draw for each object's part of the
+    goal ("parts"). "none" uses no hindsight"""
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of other transitions. The
     rest are goals achieved later in the same episode"""
