@@ -103,9 +103,3 @@ def test_outputs_that_cannot_be_written(tmp_path, monkeypatch, script, name, mes
     (tmp_path / "folder.gif").mkdir()
     with pytest.raises(SystemExit, match=message):
         script.main(script.Args(out=tmp_path / name))
-
-
-def test_training_below_a_file(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(SystemExit, match="Not a directory"):
-        train.main(train.Args(out=tmp_path / "file" / "run"))
