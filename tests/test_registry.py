@@ -3,9 +3,14 @@
 import pytest
 
 import torch_panda
-from tests.test_custom import PushBall
 from torch_panda import Panda, Push
 from torch_panda.registry import Family
+
+
+class PushBall(Push):
+    """A task of a user."""
+
+    max_episode_steps = 30
 
 
 @pytest.fixture

@@ -35,6 +35,58 @@ def test_objects_that_are_not_sensors_are_refused():
         make(Reach(), sensors=(3,))
 
 
+def make_kuka(**arguments):
+    return torch_panda.Robot(
+        **{
+            "urdf": "kuka_iiwa/model.urdf",
+            "neutral_joint_position": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
+            "joint_forces": (200.0,) * 7,
+            "ee_link": 6,
+            "ee_orientation": (0.0, 1.0, 0.0, 0.0),
+            **arguments,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"ee_link": 7},
+        {"wrist_joint": 7},
+        {"wrist_joint": -1},
+        {"finger_links": (3, 99)},
+    ],
+)
+def test_links_and_joints_that_the_urdf_lacks_are_refused(options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"{name} must be a .* 0 to 6, got"):
+        make(Reach(), make_kuka(**options))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_arm_joints": 0},
+        {"num_arm_joints": -1},
+        {"num_arm_joints": 8},
+        {"base_position": (0.0, 0.0)},
+        {"base_position": (0.0, 0.0, float("nan"))},
+        {"neutral_joint_position": (float("nan"),) * 7},
+    ],
+)
+def test_numbers_out_of_range_are_refused(options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        make_kuka(**options)
+
+
+def test_a_wrong_number_of_joint_forces_is_refused():
+    robot = make_kuka()
+    robot.joint_forces = robot.joint_forces[:-1]
+    with pytest.raises(ValueError, match="7 movable joints"):
+        make(Reach(), robot)
+
+
 # ---- scenes ------------------------------------------------------------------
 
 
@@ -175,18 +227,30 @@ def test_observation_keys_that_are_not_strings_are_refused():
         make(task)
 
 
+@pytest.mark.parametrize(
+    ("function", "values"),
+    [
+        ("sample_goal", (0.1,)),
+        ("sample_goal", (0.1, 0.1, float("nan"))),
+        ("sample_objects", ((0.1, 0.1, 0.02),)),
+    ],
+)
+def test_draws_of_a_wrong_shape_or_not_finite_are_refused(function, values):
+    task = Push()
+    setattr(task, function, lambda rng: values)
+    with (
+        make(task) as env,
+        pytest.raises(ValueError, match=f"{function} must return finite numbers"),
+    ):
+        env.reset()
+
+
 # ---- rotations ---------------------------------------------------------------
 
 
 def test_quaternions_of_length_zero_are_refused():
-    kuka = {
-        "urdf": "kuka_iiwa/model.urdf",
-        "neutral_joint_position": (0.0,) * 7,
-        "joint_forces": (200.0,) * 7,
-        "ee_link": 6,
-    }
     with pytest.raises(ValueError, match="ee_orientation must be a quaternion"):
-        torch_panda.Robot(**kuka, ee_orientation=(0, 0, 0, 0))
+        make_kuka(ee_orientation=(0, 0, 0, 0))
     task = Push()
     task.sample_objects = lambda rng: ((0, 0, 0.02, 0, 0, 0, 0),)
     with (

@@ -5,7 +5,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from tests.test_custom import make_kuka
+from tests.envs.test_checks import make_kuka
 from torch_panda import Reach, RobotTaskEnv
 
 SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
