@@ -28,12 +28,15 @@ def test_recipes_are_options(task, preset):
 
 
 def test_the_sample_efficient_recipe_changes_the_tuned_recipe():
-    tuned = default_args("tuned", "PandaPickAndPlace-v3")
-    args = default_args("sample-efficient", "PandaPickAndPlace-v3")
+    tuned = default_args("tuned", "PandaPickAndPlace-v1")
+    args = default_args("sample-efficient", "PandaPickAndPlace-v1")
     assert (args.exploration, args.network) == ("points", "layer-norm")
     assert args.updates_per_step == 4 * tuned.updates_per_step
     assert tuned.start_at_object > args.start_at_object == 0
     assert args.relative_inputs == tuned.relative_inputs == "fine"
+    # Without special starts, random grasps on -v3 rarely hold the cube.
+    args = default_args("sample-efficient", "PandaPickAndPlace-v3")
+    assert args.start_at_object == tuned.start_at_object
 
 
 def test_every_task_has_a_recipe():
