@@ -133,6 +133,7 @@ def test_function_that_is_not_in_the_table(closed, monkeypatch):
         ("joint_damping", 0.1, "btMultibodyLink.m_jointTorque"),
         ("damping", 0.05, "btMultiBody.m_linearDamping"),
         ("max_velocity", 50.0, "btMultiBody.m_maxCoordinateVelocity"),
+        ("table_size", 0.4, "btBroadphaseProxy.m_aabbMax"),
         ("target", (ctypes.c_double * 7)(0.1), "m_targetPositions"),
         ("ik_damping", 0.1, "m_jointDamping"),
         ("ik_iterations", 7, "m_maxNumIterations"),
@@ -183,6 +184,7 @@ def test_groups_that_are_left_to_bullet(closed, monkeypatch):
     [
         ("manifolds", "did not create the rows of the self-test"),
         ("bodies", "did not accelerate the arm of the self-test"),
+        ("aabbs", "did not move the AABBs of the self-test"),
         ("answers", "did not compute the inverse kinematics of the self-test"),
     ],
 )

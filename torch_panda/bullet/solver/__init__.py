@@ -1,6 +1,6 @@
-"""Faster constraints, dynamics and inverse kinematics for Bullet, with the same bits.
+"""Faster dynamics, kinematics and broad phase for Bullet, with the same bits.
 
-`activate` replaces six of Bullet's functions in this process if all conditions of
+`activate` replaces eight of Bullet's functions in this process if all conditions of
 ``gate.py`` hold. From then on, all clients of the process run the replacements, also
 clients that a user opened with pybullet. Each C file lists which of Bullet's functions
 it reimplements, and explains why its results are the same.

@@ -69,11 +69,13 @@ struct link {
 struct collision_object {
     char pad0[360];
     int has_anisotropic_friction;
-    char pad1[44];
+    char pad1[12];
+    struct proxy *proxy; /* m_broadphaseHandle */
+    char pad2[24];
     int flags;
-    char pad2[4];
-    int companion_id;
     char pad3[4];
+    int companion_id;
+    int world_index; /* m_worldArrayIndex */
     int activation_state;
     char pad4[60];
     int internal_type;
@@ -82,7 +84,7 @@ struct collision_object {
 /* btMultiBodyLinkCollider, a btCollisionObject */
 struct link_collider {
     struct collision_object base;
-    char pad0[132];
+    char pad0[128];
     struct multi_body *body;
     int link;
 };
@@ -148,8 +150,76 @@ struct multi_body {
 
 /* btSoftMultiBodyDynamicsWorld */
 struct world {
-    char pad0[672];
+    char pad0[8];
+    struct array objects; /* of pointers to struct collision_object */
+    char pad1[88];
+    struct broad_phase *broad_phase; /* m_broadphasePairCache */
+    char pad2[536];
     struct array bodies; /* of pointers to struct multi_body */
+};
+
+/* btDbvtAabbMm */
+struct aabb {
+    struct vector3 min, max;
+};
+
+/* btDbvtNode */
+struct node {
+    struct aabb aabb;
+    struct node *parent;
+    union {
+        struct node *children[2]; /* of a leaf, the second is NULL */
+        struct proxy *proxy;
+    };
+};
+
+/* btDbvt */
+struct aabb_tree {
+    struct node *root, *free;
+    int lookahead; /* m_lkhd */
+    int num_leaves;
+    unsigned path; /* m_opath */
+    char pad0[4];
+    struct array stack;
+};
+
+/* btDbvtProxy: a link in the broad phase */
+struct proxy {
+    struct collision_object *object; /* m_clientObject */
+    char pad0[16];
+    struct aabb aabb;
+    struct node *leaf;
+    struct proxy *previous, *next; /* of the list of its stage */
+    int stage;
+};
+
+/* btBroadphasePair */
+struct overlapping_pair {
+    struct proxy *a, *b;
+    char pad0[16];
+};
+
+/* btHashedOverlappingPairCache */
+struct pair_cache {
+    char pad0[8];
+    struct array pairs; /* of struct overlapping_pair */
+};
+
+/* btDbvtBroadphase */
+struct broad_phase {
+    char pad0[8];
+    struct aabb_tree trees[2]; /* of links that move, and of links that stand still */
+    struct proxy *stages[3];
+    struct pair_cache *pair_cache;
+    double prediction;
+    int stage; /* m_stageCurrent */
+    char pad1[12];
+    int num_new_pairs;
+    char pad2[4];
+    int num_calls, num_updates; /* m_updates_call, m_updates_done */
+    char pad3[21];
+    char defers_collisions; /* m_deferedcollide */
+    char needs_cleanup;
 };
 
 /* btMultiBodySolverConstraint: one row */
@@ -383,6 +453,9 @@ enum { STATIC = 1, KINEMATIC = 2, LINK_COLLIDER = 64 };
 /* Activation states: ACTIVE_TAG and ISLAND_SLEEPING */
 enum { ACTIVE = 1, ASLEEP = 2 };
 
+/* The stage of a link that stands still: btDbvtBroadphase::STAGECOUNT */
+enum { FIXED_STAGE = 2 };
+
 /* enum btSolverMode */
 enum {
     TWO_FRICTION_DIRECTIONS = 16,
@@ -426,8 +499,10 @@ AT(link, world_basis, 1112);
 AT(link, world_origin, 1208);
 SIZE(link, 1312);
 AT(collision_object, has_anisotropic_friction, 360);
+AT(collision_object, proxy, 376);
 AT(collision_object, flags, 408);
 AT(collision_object, companion_id, 416);
+AT(collision_object, world_index, 420);
 AT(collision_object, activation_state, 424);
 AT(collision_object, internal_type, 488);
 AT(link_collider, body, 624);
@@ -467,7 +542,30 @@ AT(multi_body, pos_updated, 993);
 AT(multi_body, num_dofs, 996);
 AT(multi_body, use_rk4, 1004);
 AT(multi_body, needs_joint_feedback, 1006);
+AT(world, objects, 8);
+AT(world, broad_phase, 128);
 AT(world, bodies, 672);
+AT(node, parent, 64);
+AT(node, children, 72);
+SIZE(node, 88);
+AT(aabb_tree, lookahead, 16);
+SIZE(aabb_tree, 64);
+AT(proxy, aabb, 24);
+AT(proxy, leaf, 88);
+AT(proxy, previous, 96);
+AT(proxy, stage, 112);
+SIZE(overlapping_pair, 32);
+AT(pair_cache, pairs, 8);
+AT(broad_phase, trees, 8);
+AT(broad_phase, stages, 136);
+AT(broad_phase, pair_cache, 160);
+AT(broad_phase, prediction, 168);
+AT(broad_phase, stage, 176);
+AT(broad_phase, num_new_pairs, 192);
+AT(broad_phase, num_calls, 200);
+AT(broad_phase, num_updates, 204);
+AT(broad_phase, defers_collisions, 229);
+AT(broad_phase, needs_cleanup, 230);
 AT(constraint_row, relpos1_cross_normal, 16);
 AT(constraint_row, applied_impulse, 216);
 AT(constraint_row, friction, 224);

@@ -50,6 +50,7 @@ _MOTOR = "_ZTV21btMultiBodyJointMotor"
 _LIMIT = "_ZTV31btMultiBodyJointLimitConstraint"
 _WORLD = "_ZTV28btSoftMultiBodyDynamicsWorld"
 _SERVER = "_ZTV29PhysicsServerCommandProcessor"
+_BROAD_PHASE = "_ZTV16btDbvtBroadphase"
 _CREATE_ROWS = (
     "20createConstraintRowsER20btAlignedObjectArrayI27btMultiBodySolverConstraint"
     "ER23btMultiBodyJacobianDataRK19btContactSolverInfo"
@@ -78,6 +79,12 @@ _REPLACED = (
         _SERVER,
         "_ZN29PhysicsServerCommandProcessor14processCommandERK19SharedMemoryCommand"
         "R18SharedMemoryStatusPci",
+    ),
+    (_WORLD, "_ZN16btCollisionWorld11updateAabbsEv"),
+    (
+        _BROAD_PHASE,
+        "_ZN16btDbvtBroadphase7setAabbEP17btBroadphaseProxyRK9btVector3S4_"
+        "P12btDispatcher",
     ),
 )
 # ctypes knows the address of an exported function. Comparing it with the address in the

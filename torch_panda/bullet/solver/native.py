@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 # Version of the C sources, as in hook.c: the library must have been compiled from
 # sources of this version.
-VERSION = 6
+VERSION = 7
 
 # ``enum mode`` in hook.c
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
@@ -58,6 +58,7 @@ class Expectation(Structure):
         ("joint_damping", c_double),
         ("damping", c_double),
         ("max_velocity", c_double),
+        ("table_size", c_double),
         ("target", c_double * 7),
         ("ik_damping", c_double),
         ("ik_iterations", c_int),
@@ -78,6 +79,8 @@ class Counts(Structure):
         ("bullet_bodies", c_int),
         ("answers", c_int),
         ("bullet_answers", c_int),
+        ("aabbs", c_int),
+        ("bullet_aabbs", c_int),
         ("joint_rows", c_int),
         ("contact_rows", c_int),
         ("spinning_rows", c_int),

@@ -144,6 +144,95 @@ static const char *probe_forces(const struct multi_body *body,
     return NULL;
 }
 
+static int is_inside(const struct vector3 *a, const struct vector3 *min,
+                     const struct vector3 *max) {
+    return min->x <= a->x && a->x <= max->x && min->y <= a->y && a->y <= max->y &&
+           min->z <= a->z && a->z <= max->z;
+}
+
+/* A leaf of the tree of AABBs, and its ancestors. */
+static const char *probe_leaf(const struct proxy *proxy, const struct aabb_tree *tree) {
+    const struct node *node = proxy->leaf;
+    CHECK("btDbvtProxy.leaf", node != NULL && (uintptr_t)node % 16 == 0);
+    CHECK("btDbvtNode.data", node->proxy == proxy && node->children[1] == NULL);
+    const struct vector3 *min = &node->aabb.min, *max = &node->aabb.max;
+    CHECK("btDbvtNode.volume", is_inside(&proxy->aabb.min, min, max) &&
+                                   is_inside(&proxy->aabb.max, min, max));
+    for (int depth = 0; node->parent != NULL; depth++) {
+        const struct node *parent = node->parent;
+        CHECK("btDbvtNode.parent", depth < MAX_OBJECTS && (uintptr_t)parent % 16 == 0);
+        CHECK("btDbvtNode.childs",
+              parent->children[0] == node || parent->children[1] == node);
+        min = &parent->aabb.min, max = &parent->aabb.max;
+        CHECK("btDbvtNode.volume", is_inside(&node->aabb.min, min, max) &&
+                                       is_inside(&node->aabb.max, min, max));
+        node = parent;
+    }
+    CHECK("btDbvt.m_root", tree->root == node);
+    return NULL;
+}
+
+static const char *probe_broad_phase(const struct world *world,
+                                     const struct expectation *expected) {
+    CHECK("btCollisionWorld.m_collisionObjects",
+          world->objects.size >= expected->num_bodies &&
+              world->objects.size <= MAX_OBJECTS &&
+              world->objects.capacity == 128 * 1024 && world->objects.data != NULL);
+    const struct broad_phase *broad_phase = world->broad_phase;
+    CHECK("btCollisionWorld.m_broadphasePairCache",
+          broad_phase != NULL && (uintptr_t)broad_phase % 16 == 0);
+    const struct aabb_tree *trees = broad_phase->trees;
+    CHECK("btDbvt.m_leaves", trees[0].num_leaves > 0 && trees[1].num_leaves >= 0 &&
+                                 trees[0].num_leaves + trees[1].num_leaves ==
+                                     world->objects.size);
+    CHECK("btDbvt.m_lkhd", trees[0].lookahead == -1);
+    CHECK("btDbvtBroadphase.m_prediction", broad_phase->prediction == 0.0);
+    CHECK("btDbvtBroadphase.m_stageCurrent",
+          broad_phase->stage >= 0 && broad_phase->stage < FIXED_STAGE);
+    CHECK("btDbvtBroadphase.m_newpairs", broad_phase->num_new_pairs == 1);
+    CHECK("btDbvtBroadphase.m_updates_call",
+          broad_phase->num_updates > 0 &&
+              broad_phase->num_updates <= broad_phase->num_calls);
+    CHECK("btDbvtBroadphase.m_deferedcollide", broad_phase->defers_collisions == 0);
+    CHECK("btDbvtBroadphase.m_needcleanup", broad_phase->needs_cleanup == 0);
+    struct collision_object *const *objects = world->objects.data;
+    for (int i = 0; i < world->objects.size; i++) {
+        const struct collision_object *object = objects[i];
+        CHECK("btCollisionWorld.m_collisionObjects",
+              object != NULL && (uintptr_t)object % 16 == 0);
+        CHECK("btCollisionObject.m_worldArrayIndex", object->world_index == i);
+        const struct proxy *proxy = object->proxy;
+        CHECK("btCollisionObject.m_broadphaseHandle", proxy != NULL);
+        CHECK("btBroadphaseProxy.m_clientObject", proxy->object == object);
+        CHECK("btDbvtProxy.stage", proxy->stage >= 0 && proxy->stage <= FIXED_STAGE);
+        CHECK("btDbvtProxy.links",
+              proxy->previous == NULL ? broad_phase->stages[proxy->stage] == proxy
+                                      : proxy->previous->next == proxy);
+        const char *mismatch =
+            probe_leaf(proxy, &trees[proxy->stage == FIXED_STAGE ? 1 : 0]);
+        if (mismatch != NULL) return mismatch;
+    }
+    const struct multi_body *table = ((struct multi_body *const *)world->bodies.data)[1];
+    const struct aabb *aabb = &table->base_collider->proxy->aabb;
+    CHECK("btBroadphaseProxy.m_aabbMax",
+          fabs(aabb->max.x - aabb->min.x - 2.0 * (expected->table_size + 0.02)) < 1e-9);
+    const struct pair_cache *cache = broad_phase->pair_cache;
+    CHECK("btDbvtBroadphase.m_paircache", cache != NULL && (uintptr_t)cache % 16 == 0);
+    CHECK("btHashedOverlappingPairCache.m_overlappingPairArray",
+          is_array(&cache->pairs) && cache->pairs.size > 0);
+    const struct overlapping_pair *pair = cache->pairs.data;
+    for (int i = 0; i < cache->pairs.size; i++, pair++) {
+        const struct proxy *const proxies[] = {pair->a, pair->b};
+        for (int k = 0; k < 2; k++) {
+            int index = 0;
+            while (index < world->objects.size && objects[index]->proxy != proxies[k])
+                index++;
+            CHECK("btBroadphasePair.m_pProxy0", index < world->objects.size);
+        }
+    }
+    return NULL;
+}
+
 const char *probe_world(const struct world *world, const struct solver_info *info,
                         const struct expectation *expected) {
     CHECK("m_timeStep", info->time_step == expected->time_step);
@@ -172,7 +261,7 @@ const char *probe_world(const struct world *world, const struct solver_info *inf
         const char *mismatch = body->num_dofs ? probe_forces(body, expected) : NULL;
         if (mismatch != NULL) return mismatch;
     }
-    return NULL;
+    return probe_broad_phase(world, expected);
 }
 
 const char *probe_manifolds(const struct solver *solver,

@@ -43,6 +43,7 @@ _GRAVITY = -9.81
 _JOINT_DAMPING = 0.2
 _DAMPING = c_float(0.04).value  # Bullet's default, linear and angular
 _MAX_VELOCITY = 100.0  # Bullet's default
+_TABLE_SIZE = 0.5  # half its length
 _JOINT_TYPES = (REVOLUTE, REVOLUTE, FIXED, PRISMATIC, PRISMATIC)  # of the arm's links
 _LINK_MASSES = (0.7, 0.4, 0.1, 0.05, 0.05)
 _NUM_JOINTS = 4
@@ -84,6 +85,7 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         _JOINT_DAMPING,
         _DAMPING,
         _MAX_VELOCITY,
+        _TABLE_SIZE,
         (c_double * 7)(*_TARGET),
         _IK_DAMPING,
         _IK_ITERATIONS,
@@ -117,6 +119,8 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         raise GateError(
             "the packed solver did not compute the inverse kinematics of the self-test"
         )
+    if not counts.aabbs:
+        raise GateError("the packed solver did not move the AABBs of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
             raise GateError(f"the self-test differs from Bullet in step {step}")
@@ -162,7 +166,7 @@ def _build(connection: Connection) -> list[int]:
         fixed_base=True,
         flags=capi.URDF_IGNORE_VISUAL_SHAPES,
     )
-    table = _box(connection, 0.0, (0.5, 0.5, 0.05), (0.0, 0.0, -0.05))
+    table = _box(connection, 0.0, (_TABLE_SIZE, _TABLE_SIZE, 0.05), (0.0, 0.0, -0.05))
     boxes = [
         _box(connection, _MASSES[0], (0.03, 0.03, 0.03), (0.44, 0.05, 0.03)),
         _box(connection, _MASSES[1], (0.02, 0.03, 0.02), (0.44, 0.05, 0.08)),

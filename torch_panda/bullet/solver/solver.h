@@ -12,6 +12,8 @@
 
 #include "bullet_types.h"
 
+#include <stdint.h>
+
 /*
  * The iterations of btSequentialImpulseConstraintSolver over the rows of one group.
  *
@@ -88,6 +90,29 @@ int accelerate(struct multi_body *body, double time_step);
 int solve_inverse_kinematics(const struct server *server, const struct command *command,
                              struct status *status);
 
+enum { MAX_OBJECTS = 64 }; /* of a world whose AABBs are moved here */
+
+/* The AABBs of a world's objects, while Bullet updates them all. */
+struct aabbs {
+    const struct world *world;
+    int num_objects; /* 0 until the AABBs have been read */
+    int num_pairs;
+    int num_moved, num_left; /* AABBs that this solver has moved, and Bullet */
+    _Alignas(16) double limits[6][MAX_OBJECTS]; /* minimum and maximum of x, y, z */
+    uint64_t pairs[MAX_OBJECTS]; /* bit i: whether the pair with object i is known */
+};
+
+/*
+ * Move the AABB of a link in the broad phase.
+ *
+ * Returns 1 if the AABB was moved. Returns 0, with nothing changed, if Bullet's own
+ * function has to move it. After Bullet has moved it, call follow_bullet.
+ */
+int move_aabb(struct aabbs *aabbs, struct broad_phase *broad_phase, struct proxy *proxy,
+              const struct vector3 *min, const struct vector3 *max);
+void follow_bullet(struct aabbs *aabbs, const struct broad_phase *broad_phase,
+                   const struct proxy *proxy);
+
 /* Numbers of the self-test's scene, for the layout probe. */
 struct expectation {
     void **motor_table, **limit_table; /* of virtual functions */
@@ -108,6 +133,7 @@ struct expectation {
     double joint_damping;      /* of all joints */
     double damping;            /* linear and angular, of all bodies */
     double max_velocity;       /* of all coordinates */
+    double table_size;         /* of the second body: half its length along x */
     double target[7];          /* pose, of the inverse kinematics */
     double ik_damping;         /* of all joints */
     int ik_iterations;
