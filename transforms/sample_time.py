@@ -25,8 +25,8 @@ class SampleTimeTransform(BufferTransform):
     Args:
         reward_fn: See `BufferTransform`.
         unit: Rows that share a goal. "row" draws a goal for each row. "slice" draws one
-            goal for all rows of a sampled slice, as for its last row, so that a
-            "future" goal lies in the future of all of them.
+            goal for all rows of a sampled slice. It is drawn for the last of these
+            rows, so that a "future" goal lies in the future of all of them.
         capacity: Number of transitions to remember, for a transform that is called
             without a buffer. With a buffer, the transform remembers the transitions
             that the buffer holds.
@@ -122,8 +122,9 @@ class SampleTimeTransform(BufferTransform):
         """Returns the serial number of the oldest transition that the buffer holds."""
         stored, (before, written) = self._count_stored(buffer), self._last_write
         size = 0 if buffer is None else getattr(buffer.storage, "max_size", 0)
-        # If another thread is in the middle of `extend`, its transitions may be
-        # remembered, but not stored yet.
+        # Another thread may be in the middle of `extend`. The memory then counts its
+        # transitions already, but the length of the storage has not grown yet, so add
+        # them. (The length of a full storage never grows.)
         if stored == before < size:
             stored += written
         return self._memory.count - stored
@@ -218,8 +219,8 @@ def _check_layout(
         is_padded: Whether some rows are padding.
 
     Raises:
-        RuntimeError: The buffer would write them in another order, or has padding that
-            cannot be removed.
+        RuntimeError: The buffer would write them in another order, or the data have
+            padding that cannot be removed.
     """
     ndim, writer = buffer.storage.ndim, type(buffer.writer)
     if is_padded and not ndim == data.ndim == 1:
@@ -228,12 +229,24 @@ def _check_layout(
             "(split_trajs=True): extend a storage of ndim=1 with data.reshape(-1), or "
             "do not split trajectories"
         )
-    fits = data.ndim in (ndim - 1, ndim) and buffer.dim_extend == ndim - 1
-    adds_many = method == "add" and data.shape[ndim - 1 :].numel() > 1
-    if adds_many or not fits or not issubclass(writer, RoundRobinWriter):
+    if not issubclass(writer, RoundRobinWriter):
         raise RuntimeError(
-            f"rows must be written round-robin (here: {writer.__name__}) in order of "
-            f"time; got {list(data.shape)} for ndim={ndim}: extend with "
-            "data.reshape(-1), or use several dimensions, ndim=2 for [num_envs, time] "
-            "(of collectors with replay_buffer=)"
+            "the writer must be round-robin, so that rows are in order of time, got "
+            f"{writer.__name__}: make the buffer without writer="
+        )
+    if buffer.dim_extend != ndim - 1:
+        raise RuntimeError(
+            "the last dimension of a storage must be time, got dim_extend="
+            f"{buffer.dim_extend} for ndim={ndim}: make the buffer without dim_extend="
+        )
+    if data.ndim not in (ndim - 1, ndim):
+        raise RuntimeError(
+            f"data {list(data.shape)} for ndim={ndim} must have as many dimensions as "
+            "the storage: call extend(data.reshape(-1)) with ndim=1, or use ndim=2 for "
+            "data [num_envs, time], which collectors with replay_buffer= write"
+        )
+    if method == "add" and data.shape[ndim - 1 :].numel() > 1:
+        raise RuntimeError(
+            f"add() writes a single step, got data {list(data.shape)} for ndim={ndim}: "
+            "call extend(), or use ndim=2 for collectors with replay_buffer="
         )

@@ -177,12 +177,19 @@ def test_slices_with_goals_per_row_warn_once(unit):
         (HindsightAugment, {"sampler": slices()}, r'unit="slice"'),
         (HindsightAugment, {"ndim": 2}, "ndim=1"),
         (HindsightRelabel, {}, r"\[2, 8\] for ndim=1.*reshape.*ndim=2"),
+        (HindsightRelabel, {"ndim": 2, "dim_extend": 0}, "dim_extend=0 for ndim=2"),
     ],
 )
 def test_layouts_that_are_refused_at_once(hindsight, options, message):
     rb, data = buffer(hindsight(reward_fn), **options), Envs(2, [4]).chunk(8)
     with pytest.raises(RuntimeError, match=message):
         rb.extend(data.reshape(-1) if "sampler" in options else data)
+
+
+def test_adding_several_steps_as_one_is_refused():
+    rb = buffer(HindsightRelabel(reward_fn))
+    with pytest.raises(RuntimeError, match=r"add\(\).*\[16\].*call extend\(\)"):
+        rb.add(Envs(2, [4]).chunk(8).reshape(-1))
 
 
 @pytest.mark.parametrize("cls", [TensorDictReplayBuffer, ReplayBuffer])
