@@ -234,6 +234,10 @@ def test_no_run_and_no_place(runs, tmp_path):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "file" / "curves.png"))
 
 
+def test_runs_with_another_logger_have_the_same_label():
+    assert find_changes(Args(logger="tensorboard"), Args()) == {}
+
+
 def test_when_the_learning_rate_has_fallen_is_another_line():
     args, default = Args(total_steps=200_000), Args()
     assert find_changes(args, default) == {}

@@ -32,12 +32,11 @@ OBJECT: dict[str, Any] = {
     "augmentation": "mirror-shift",
     "eval_interval": 5_000,
 }
-# Options that `find_changes` leaves out. The legend of a plot names the algorithm
-# beside the result of `find_changes`. Runs of one task and algorithm that differ only
-# in the other options listed here belong to the same line.
+# Options that `find_changes` leaves out: the algorithm, which the labels of plots name
+# anyway, and options that may differ between the runs of one line.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
-    *("out", "resume", "device", "video", "imports"),
+    *("out", "resume", "device", "video", "logger", "imports"),
 }
 # Options that need the control type "ee". `find_recipe` drops them for other robots.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
