@@ -72,8 +72,8 @@ class DataCheck:
     Args:
         rewriter: Functions and keys of the transform.
         ignored: Keys of entries that are not computed from goals, such as ids.
-        warned: Subjects of the warnings given so far. Two checks of one transform share
-            this set, so that each warning is given once.
+        warned: Subjects of the warnings given so far. The two `DataCheck` objects of a
+            transform share this set, so that each warning is given once.
 
     Attributes:
         shapes: Observation entries of the base environment, without its transforms, and
@@ -184,13 +184,14 @@ class DataCheck:
     def _check_affine(self, rows: TensorDictBase) -> bool:
         """Refuses entries that are affine functions of achieved and desired goal.
 
-        An affine function has 2 * goal_dim + 1 coefficients per column. The desired
-        goal is constant in each episode. If no object has moved yet, the achieved goal
-        is constant too, so an episode gives only one equation. With at most 2 *
-        goal_dim + 1 distinct desired goals, some affine function fits any column that
-        is constant in each episode, and the fit proves nothing. So the check waits for
-        more goals. From then on, it refuses a column if an affine function fits it,
-        with three exceptions:
+        An affine function has 2 * goal_dim + 1 coefficients per column. The check waits
+        until there are more distinct desired goals than coefficients. Until an object
+        moves, all rows of an episode have the same two goals and give only one
+        equation. With too few equations, an affine function also fits columns that do
+        not depend on the goals.
+
+        Then the check refuses a column if an affine function fits it, with three
+        exceptions:
 
         - The base environment itself has the entry, in the same shape.
         - An affine function of the achieved goal alone fits the column.

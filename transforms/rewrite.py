@@ -111,10 +111,10 @@ class Rewriter:
             )
         if self.terminated_fn is not None:
             done, terminated = batch.get(DONE), batch.get(TERMINATED)
-            # In data of torchrl's trainers, "truncated" is true in every row, and
-            # "done" only where an episode ends. So a row counts as truncated only if
-            # both are true. In data without "truncated", it counts if it is done but
-            # not terminated.
+            # torchrl's ReplayBufferTrainer sets "truncated" in every row, probably by
+            # mistake. "done" is true only where an episode ends, so a row counts as
+            # truncated only if both are true. In data without "truncated", it counts if
+            # it is done but not terminated.
             truncated = batch.get(TRUNCATED, ~terminated) & done
 
             def reaches(desired: Tensor) -> Tensor:

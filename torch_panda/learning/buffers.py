@@ -106,7 +106,8 @@ def select_sequences(data: TensorDictBase, keep_unmoved: float) -> TensorDictBas
 
     Args:
         data: Successive steps of each environment, [num_envs, steps], from its reset
-            on. They are several episodes if success ends episodes.
+            on. If success ends episodes, the steps of an environment may belong to
+            several episodes.
         keep_unmoved: Probability with which a sequence is kept in which the achieved
             goal does not change (see `has_moved`).
 

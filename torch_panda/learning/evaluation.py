@@ -33,9 +33,9 @@ class Evaluation:
         at_start: Whether each episode starts with its goal reached, (n,) bool.
         returns: Sum of the rewards of each episode, (n,).
         lengths: Number of steps of each episode, (n,).
-        tasks: Results of each of the `evaluation_tasks` by its name; empty for random
-            starts. The other attributes hold the episodes of all five, which have the
-            same number of episodes.
+        tasks: Results of each of the five `evaluation_tasks` by its name, from the same
+            number of episodes each; empty for random starts. The other attributes hold
+            the results of all episodes together.
     """
 
     success: Tensor
@@ -168,8 +168,8 @@ def evaluate_fixed_starts(
     starts = TensorDict.stack(list(states.values())).to(env.device)
     parts: list[Evaluation] = []
     for first in range(0, episodes, num_envs):
-        # If episodes are missing for a full batch at the end, the first ones are
-        # repeated. `_join` drops the repeats.
+        # If fewer episodes than environments are left for the last batch, the first
+        # episodes fill it up. `_join` drops these repeats.
         numbers = torch.arange(first, first + num_envs) % episodes
         start = env.reset(starts[numbers % len(states)], set_state=True)
         randomized = _RandomStart(policy, actions[numbers])
@@ -182,7 +182,12 @@ def evaluate_fixed_starts(
 
 
 class _RandomStart(TensorDictModuleBase):
-    """A policy with other first actions, ``actions`` (num_envs, steps, n)."""
+    """A policy whose first actions are replaced.
+
+    Args:
+        policy: Policy that writes ``action``.
+        actions: Actions of the first steps, (num_envs, steps, action size).
+    """
 
     def __init__(self, policy: TensorDictModuleBase, actions: Tensor) -> None:
         super().__init__()

@@ -23,8 +23,8 @@ LOWEST_POINT, HIGHEST_POINT = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
 NEAR_OBJECTS = 0.5
 OBJECT_DISTANCE = 0.1
 OBJECT_HEIGHTS = (-0.02, 0.06)
-# In its first WARM_UP steps, each environment always moves to points. Then the replay
-# buffer has many contacts before learning begins.
+# In its first WARM_UP steps, each environment always moves to points, so that the
+# replay buffer soon has many contacts.
 WARM_UP = 250
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point
@@ -44,8 +44,8 @@ class RandomPointModule(TensorDictModuleBase):
     state is part of ``state_dict``.
 
     Args:
-        eps: Fraction of the later steps of each environment in which it moves to a
-            point, (num_envs,), from 0 to 1.
+        eps: Fraction of the steps after the warm-up in which each environment moves to
+            a point, (num_envs,), from 0 to 1.
         action_size: Size of an action.
         action_scale: Displacement that an action of 1 causes in one step, [m] for the
             end-effector and [rad] for joints.

@@ -41,16 +41,17 @@ class Hyperparameters:
     environments. The fractions of the other environments are evenly spaced between
     them. SAC and TQC use this option only with exploration "points" """
     exploration: Exploration = "actions"
-    """how to explore: with random actions ("actions", only DDPG and TD3), or by moving
-    the hand towards random points ("points"). Under joint control, "points" moves the
-    joints towards random positions"""
+    """how to explore. "actions" takes random actions with DDPG and TD3. With SAC and
+    TQC it has no effect, because their policies are random. "points" moves the hand
+    towards random points, or under joint control the joints towards random
+    positions"""
     relative_inputs: RelativeInputs = "none"
     """additional inputs of the networks. "coarse" adds the offsets from the hand to
     objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
     so that differences of millimetres count"""
     fine_fingers: bool = False
-    """let networks and noise work with the cube root of the fingers' action, which
-    makes differences of 0.1 mm visible"""
+    """let networks and noise work with the cube root of the fingers' action, so that a
+    difference of 0.1 mm is larger than the error of a network"""
     augmentation: AugmentationKind = "none"
     """mirror half of each batch in the robot's plane of symmetry ("mirror"), and also
     shift half of each batch over the table ("mirror-shift")"""

@@ -59,8 +59,9 @@ class Args(Hyperparameters):
     at an object or holds it, or the first cube of Stack is at its goal. If it is above
     0, all training episodes last at most 50 steps"""
     randomize: Factor = 1.0
-    """draw the masses and frictions of objects and table for every training episode,
-    between 1 / factor and factor times the task's values"""
+    """largest factor f of domain randomization. For every training episode, the mass
+    and friction of the objects and the friction of the table are drawn between 1 / f
+    and f times the task's values; 1 changes nothing"""
     demos: Path | None = None
     """demonstrations to learn from, in addition to the transitions of the run: a file
     of `record`, or the folder of a data set"""

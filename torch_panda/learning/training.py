@@ -1,8 +1,9 @@
 """The training loop: steps of parallel environments, then gradient steps.
 
-Each iteration resets all environments, steps each of them for the length of an episode,
-and then takes ``updates_per_step`` gradient steps per environment step. If success ends
-episodes, an environment plays several of them in one iteration.
+Each iteration resets all environments, steps each of them for the length of an episode
+(with ``--start-at-object`` at most `MAX_STEPS_FROM_MIDDLE` steps), and then takes
+``updates_per_step`` gradient steps per environment step. If success ends episodes, an
+environment plays several of them in one iteration.
 
 A run is saved between two iterations only. The next iteration begins with a reset, so
 the state of the environments need not be saved, and ``--resume`` continues the run bit
@@ -40,9 +41,9 @@ from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
-# Upper bound on the steps of an iteration if some episodes start in the middle of the
-# task. Such episodes need fewer steps than whole ones. The bound also cuts the whole
-# ones, because all environments take the same number of steps.
+# Largest number of steps that each environment takes in an iteration, if some episodes
+# start in the middle of the task. Such episodes need fewer steps. All environments take
+# the same number of steps, so this also cuts the episodes that start at the beginning.
 MAX_STEPS_FROM_MIDDLE = 50
 # Fraction of the sequences without motion (see `has_moved`) that the replay buffer
 # stores. The preset "paper" stores all of them.
@@ -68,7 +69,9 @@ class Run:
     ) -> None:
         self.args, self.out = args, out
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-        # On CPUs with AVX-512 this selects oneDNN, which is up to twice as fast.
+        # On CPUs with AVX-512, "medium" makes oneDNN multiply float32 matrices, up to
+        # twice as fast as with "highest". PyTorch may then round to bfloat16 inside a
+        # product.
         torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
         randomize = None

@@ -57,9 +57,9 @@ class OfflineHyperparameters:
     batch_size: Positive = 256
     """transitions per gradient step"""
     actor_goal: Literal["future", "geometric"] = "future"
-    """goals of policies, which are achieved later in the episode: all with the same
-    probability as in OGBench ("future"), or k steps later with a probability in
-    proportion to discount**k ("geometric")"""
+    """goals of policies, achieved later in the episode: all equally likely, as in
+    OGBench ("future"), or k steps later with a probability in proportion to discount**k
+    ("geometric")"""
     relative_inputs: RelativeInputs = "fine"
     """further inputs of the networks: "coarse" adds the offsets of objects from the
     hand, and of goals from objects. "fine" also adds these offsets clipped at 3 cm, so
@@ -140,7 +140,7 @@ class OfflineAgent(nn.Module, ABC):
 
     @property
     def goals(self) -> dict[str, StrategyOption]:
-        """Strategies by which `GoalSampler` draws goals, by the key of the goals."""
+        """The strategy with which `GoalSampler` draws the goals of each key."""
         return {"value_goal": self.value_goal, "actor_goal": self.hp.actor_goal}
 
     def assemble(self, actor: nn.Module) -> None:

@@ -3,8 +3,10 @@
 OGBench's name for the action-free values of HIQL (arXiv 2307.11949, section 3).
 
 IQL (arXiv 2110.06169) without Q: an expectile of r + discount * V(s', g) over the
-actions of the data approximates the maximum over them, as transitions are nearly
-deterministic. The policy imitates actions in proportion to exp(alpha * advantage).
+actions of the data approximates the maximum over these actions. This needs nearly
+deterministic transitions: with random ones, the expectile would also favour lucky
+outcomes of an action. The policy imitates actions in proportion to
+exp(alpha * advantage).
 """
 
 import copy
@@ -65,8 +67,9 @@ class GCIVL(OfflineAgent):
         x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * self.target_value(x_next)  # (2, n)
-            # The paper has one value. As in OGBench, each of two values regresses to
-            # its own target, and both share the sign of this advantage.
+            # The paper has one value function. Here there are two, as in OGBench. Each
+            # regresses to its own target. The sign of this advantage sets the weight of
+            # both squared errors.
             advantage = q.amin(0) - self.target_value(x).mean(0)
         diff = q - self.value(x)
         return expectile_loss(diff, advantage, self.hp.expectile).sum(0).mean()

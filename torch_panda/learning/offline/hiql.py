@@ -94,22 +94,23 @@ class HIQL(OfflineAgent):
         """Draw a goal for the high level, and one waypoint for each of three losses.
 
         The three losses are those of the high-level policy, the low-level policy and
-        the values of waypoints. Row t of the data leads to the state s_t+1, so the
-        state k steps after s_t is s' of row t + k - 1. The waypoint of the high level
-        does not lie beyond its goal, and the waypoint of the low level does not lie
-        beyond the end of the episode.
+        the values of waypoints. Row t of the data holds a state s and the next state
+        s', so the state k steps after s is s' of row t + k - 1. The waypoint of the
+        high level does not lie beyond its goal, and the waypoint of the low level does
+        not lie beyond the end of the episode.
         """
         t = batch["index"]
         last = data.last[t]
-        # The goal of the high level is achieved in this row, later in the episode.
+        # The goal of the high level is the goal achieved in `goal_row`, which is drawn
+        # from row t to the last row of the episode.
         if self.hp.actor_goal == "future":
             goal_row = t + (torch.rand(t.shape) * (last - t + 1)).long()
         else:
             goal_row = draw_geometric_rows(t, last, self.hp.discount)
         waypoint_row = t + self.hp.subgoal_steps - 1
-        # The waypoint of the values is s' of this row, s' of a later row (k steps later
-        # with probability proportional to discount**k), or s' of a random row. The
-        # probabilities of the three are those of VALUE_GOALS.
+        # The waypoint for the loss of V(s, phi(s, w)) is s' of row t, of a row drawn by
+        # `draw_geometric_rows`, or of a random row. VALUE_GOALS holds the probabilities
+        # of the three.
         geometric = draw_geometric_rows(t, last, self.hp.discount)
         random = torch.randint(len(data), t.shape)
         weights = torch.tensor([*VALUE_GOALS.values()])
@@ -165,7 +166,7 @@ class HIQL(OfflineAgent):
         return expectile_loss(q - v, advantage, self.hp.expectile).sum(0).mean()
 
     def high_actor_loss(self, b: Batch, s: Tensor, w: Tensor) -> Tensor:
-        """Weighted imitation of waypoints, A = V(s_t+k, g) - V(s_t, g) (eq. 6)."""
+        """Weighted imitation of waypoints, A = V(w, g) - V(s, g) (eq. 6)."""
         with torch.no_grad():
             v = self.goal_value(self.normalizer(b.s, b.g_actor)).mean(0)
             v_later = self.goal_value(self.normalizer(w, b.g_actor)).mean(0)
@@ -174,7 +175,7 @@ class HIQL(OfflineAgent):
         return weighted_regression(log_probs, v_later - v, self.hp.high_alpha)
 
     def low_actor_loss(self, a: Tensor, s: Tensor, s_next: Tensor, w: Tensor) -> Tensor:
-        """Weighted imitation of actions, A = V(s_t+1, w) - V(s_t, w) (eq. 7)."""
+        """Weighted imitation of actions, A = V(s', w) - V(s, w) (eq. 7)."""
         with torch.no_grad():
             z = self.represent(self.phi, s, w)
             v = self.waypoint_value(s, z).mean(0)
