@@ -43,7 +43,7 @@ from torch_panda.registry import make
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 # Largest number of steps that each environment takes in an iteration, if some episodes
 # start in the middle of the task. Such episodes need fewer steps. All environments take
-# the same number of steps, so this also cuts the episodes that start at the beginning.
+# the same number of steps, so the limit also cuts episodes that start at the beginning.
 MAX_STEPS_FROM_MIDDLE = 50
 # Fraction of the sequences without motion (see `has_moved`) that the replay buffer
 # stores. The preset "paper" stores all of them.
