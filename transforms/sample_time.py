@@ -72,7 +72,8 @@ class SampleTimeTransform(BufferTransform):
 
     def _count_stored(self, buffer: ReplayBuffer | None) -> int:
         """Returns how many of the remembered transitions the buffer holds."""
-        # An ensemble samples from several buffers, and does not say from which one.
+        # An ensemble does not say from which of its buffers it samples. For it, as
+        # without a buffer, the newest `capacity` transitions count.
         if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):
             return len(buffer.storage)
         count = self._memory.count
@@ -225,9 +226,9 @@ def _check_layout(
     ndim, writer = buffer.storage.ndim, type(buffer.writer)
     if is_padded and not ndim == data.ndim == 1:
         raise RuntimeError(
-            f"data {list(data.shape)} for ndim={ndim} have padded rows "
-            "(split_trajs=True): extend a storage of ndim=1 with data.reshape(-1), or "
-            "do not split trajectories"
+            "padded rows (split_trajs=True) can only be removed from data [time] for a "
+            f"storage of ndim=1, got data {list(data.shape)} and ndim={ndim}: extend a "
+            "storage of ndim=1 with data.reshape(-1), or do not split trajectories"
         )
     if not issubclass(writer, RoundRobinWriter):
         raise RuntimeError(
@@ -243,7 +244,7 @@ def _check_layout(
         raise RuntimeError(
             f"data {list(data.shape)} for ndim={ndim} must have as many dimensions as "
             "the storage: call extend(data.reshape(-1)) with ndim=1, or use ndim=2 for "
-            "data [num_envs, time], which collectors with replay_buffer= write"
+            "data [num_envs, time], such as those of a collector with replay_buffer="
         )
     if method == "add" and data.shape[ndim - 1 :].numel() > 1:
         raise RuntimeError(

@@ -396,9 +396,9 @@ class PhysicsClient:
         """Set the friction [N m] or [N] of a joint that nothing else controls.
 
         Bullet imitates friction by a motor with target velocity 0 and maximum force
-        ``force``. Without this call, Bullet's default motor applies up to 1 N m s or
-        1 N s per substep. With the default substep of 2 ms, this equals 500 N m or
-        500 N.
+        ``force``. Without this call, Bullet's default motor applies an impulse of
+        up to 1 N m s or 1 N s per substep. With the default substep of 2 ms, this
+        equals 500 N m or 500 N.
 
         Raises:
             ValueError: The force is negative or not finite.

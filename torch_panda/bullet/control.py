@@ -34,9 +34,9 @@ class MotorControl:
     Attributes:
         forces: Maximum force of every joint's motor [N m] or [N]. The torques of
             ``arm_mode="torque"`` are not limited.
-        ik_link: Link that the inverse kinematics bring to its target, which requires
-            ``arm_mode`` "position" and ``num_arm_joints``; None means that setpoints
-            contain the arm's joints.
+        ik_link: Link that the inverse kinematics bring to its target. It requires
+            ``arm_mode="position"``, and a ``num_arm_joints`` above 0. None means that
+            setpoints contain the arm's joints.
         ik_orientation: Orientation that this link keeps, quaternion xyzw in the world
             frame; None means that setpoints contain it.
         num_arm_joints: Number of the arm's joints.

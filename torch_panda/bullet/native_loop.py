@@ -63,10 +63,12 @@ class NativeLoop:
         self._clients = (POINTER(native.Client) * n)()
         self._state = state
         # Outcome of each client's last step or reset. The field `expected` is 0 if
-        # nothing failed, DIVERGED if the state is not finite, CLIENT_CLOSED, or the
-        # status code that a failed command should have returned.
+        # nothing failed, DIVERGED if the state is not finite, and CLIENT_CLOSED if the
+        # client is closed. If a command failed, it is the status code that the command
+        # should have returned.
         self._failures = (native.Failure * n)()
-        # A ctypes struct keeps alive the objects that it points to, except tensors.
+        # A ctypes struct keeps alive the objects that it points to. It has only the
+        # addresses of tensors, so `self._state` keeps the tensors alive.
         self._batch = native.Batch(
             pointer(native.bullet_functions()),
             pointer(native_scene),

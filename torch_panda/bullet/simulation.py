@@ -155,8 +155,8 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # If a second Ctrl-C interrupted an earlier call, its Python threads may
-                # still be using clients.
+                # `WorkerPool.run` waits for its threads after a first Ctrl-C, but not
+                # after a second one. So they may still be using clients.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 

@@ -73,7 +73,8 @@ class EpisodeObserver:
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
-        # Added after this check, because the randomizer may observe a reserved key.
+        # `join_entries` refuses reserved keys. The randomizer comes after it, because
+        # it may observe one.
         self.entries = join_entries(observers, reserved) | randomizer.entries
         observers.append(randomizer)
         self._observers = [observer for observer in observers if observer.entries]

@@ -258,7 +258,8 @@ class RobotTaskEnv(EnvBase):
 
         Returns:
             The observed entries of all environments. After a start from a state, also
-            the entries of this state, except those that only an exact state has.
+            the entries of this state, except those that `get_state` adds for
+            ``exact=True``.
 
         Raises:
             ValueError: The state is missing or wrong; or ``set_state`` is None and the
@@ -344,8 +345,9 @@ class RobotTaskEnv(EnvBase):
             The steps, (*batch, time).
         """
         if policy is None and kwargs.get("actions") is None:
-            # `rand_action` makes tensordict look for pandas at every call. Where pandas
-            # is not installed, this takes about 0.1 ms per step.
+            # `RandomPolicy` draws the same actions as `rand_action`. But `rand_action`
+            # makes tensordict look for the package "pandas" at every call. Where it is
+            # not installed, this takes about 0.1 ms per step.
             policy, kwargs["trust_policy"] = RandomPolicy(self.action_spec), True
         return super().rollout(max_steps, policy, callback, **kwargs)
 

@@ -122,7 +122,8 @@ class EpisodeStarts:
         if type(self._task).marker_pose is not Task.marker_pose:
             self._simulation.marker_pose[envs] = self.marker_pose(self.goal[envs], envs)
             return
-        # The same poses from arrays, in a fifth of the time.
+        # The poses of the default `Task.marker_pose`, from arrays in a fifth of the
+        # time.
         poses, goals = self._marker_poses, self._arrays["desired_goal"]
         for env in envs:
             poses[env, :, :3] = goals[env].reshape(-1, 3)

@@ -90,8 +90,9 @@ class StartState(NamedTuple):
                 raise ValueError(
                     f"the actions in the exact state of environment "
                     f"{envs[int(differs[0])]} do not lead to its {key}: the state was "
-                    f"changed or belongs to another environment; leave out its start "
-                    f"and its actions to start from the other entries"
+                    f"changed or belongs to another environment; to start "
+                    f"from its other entries, leave out num_actions, actions and the "
+                    f"entries that begin with start_"
                 )
 
 
@@ -215,7 +216,8 @@ def _read_entry(
 ) -> Tensor:
     """Check an entry of a state, (*batch_shape, ...); return (len(envs), ...).
 
-    The result has the dtype of ``like``, which has the entry's shape, (n, ...).
+    ``like`` is a tensor (n, ...) with the same last dimensions, and with the dtype of
+    the result.
     """
     shape = (*batch_shape, *like.shape[1:])
     if tuple(value.shape) != shape:

@@ -161,8 +161,8 @@ def write_options(
 ) -> None:
     """Make the folder of a run, and write its options into args.json.
 
-    The file also lists the options that differ from ``default`` under ``changed``, for
-    the legends of plots, and has the entries ``more``.
+    Its entry ``changed`` has the options that differ from ``default``, for the legends
+    of plots. The entries ``more`` are written too.
 
     Raises:
         OSError: The file cannot be written.

@@ -33,7 +33,8 @@ OBJECT: dict[str, Any] = {
     "eval_interval": 5_000,
 }
 # Options that `find_changes` leaves out: the algorithm, which the labels of plots name
-# anyway, and options that may differ between the runs of one line.
+# anyway, and options that may differ between the runs that one line
+# of a plot summarizes.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
     *("out", "resume", "device", "video", "logger", "imports"),
@@ -89,7 +90,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     },
     # For training with demonstrations: without them no training has solved the task. A
     # tenth of a millimetre separates a firm grasp from one in which the cube swings, so
-    # the recipe has fine fingers.
+    # the recipe sets ``fine_fingers``.
     Flip: {
         **OBJECT,
         "relative_inputs": "fine",

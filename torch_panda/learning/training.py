@@ -45,8 +45,9 @@ DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 # start in the middle of the task. Such episodes need fewer steps. All environments take
 # the same number of steps, so the limit also cuts episodes that start at the beginning.
 MAX_STEPS_FROM_MIDDLE = 50
-# Fraction of the sequences without motion (see `has_moved`) that the replay buffer
-# stores. The preset "paper" stores all of them.
+# Fraction that the replay buffer stores of the sequences without motion (see
+# `buffers.has_moved`). A sequence is the steps of one environment in one iteration. The
+# preset "paper" stores all of them.
 KEEP_UNMOVED = 0.1
 
 
@@ -69,9 +70,9 @@ class Run:
     ) -> None:
         self.args, self.out = args, out
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-        # On CPUs with AVX-512, "medium" makes oneDNN multiply float32 matrices, up to
-        # twice as fast as with "highest". PyTorch may then round to bfloat16 inside a
-        # product.
+        # With "medium", PyTorch leaves products of float32 matrices to oneDNN. On CPUs
+        # with AVX-512, they are up to twice as fast as with "highest", but may be
+        # rounded to bfloat16 inside a product.
         torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
         randomize = None
