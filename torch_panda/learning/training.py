@@ -84,6 +84,9 @@ class Run:
         self.env = make(
             args.env_id,
             num_envs=args.num_envs,
+            # The collector calls the exploration once when it is made, and a point
+            # near an object depends on the first observation.
+            seed=args.seed,
             device=args.device,
             randomize=randomize,
         )
