@@ -119,7 +119,9 @@ static inline void replace_child(struct aabb_tree *tree, struct node *parent,
 /* Removes a leaf from the tree, changes its AABB, and inserts it again. The leaf is not
    the only one. */
 static void move_leaf(struct aabb_tree *tree, struct node *leaf, struct limits aabb) {
-    /* The parent of the leaf leaves the tree, too, and becomes its new parent. */
+    /* The parent of the leaf leaves the tree, too, and becomes its new parent. It must be
+       this node again, because Bullet compares the addresses of nodes when it optimises
+       the tree. */
     struct node *parent = leaf->parent, *above = parent->parent;
     struct node *sibling = parent->children[parent->children[0] == leaf];
     replace_child(tree, above, parent, sibling);
@@ -179,6 +181,7 @@ static int read_aabbs(struct aabbs *aabbs, const struct broad_phase *broad_phase
     for (int i = 0; i < objects->size; i++) {
         const struct collision_object *object =
             ((struct collision_object *const *)objects->data)[i];
+        if (object->world_index != i) return 0;
         const struct limits limits = load(&object->proxy->leaf->aabb);
         if (!overlap(limits, limits)) return 0;
         set_limits(aabbs, i, &object->proxy->leaf->aabb);
@@ -213,13 +216,15 @@ int move_aabb(struct aabbs *aabbs, struct broad_phase *broad_phase, struct proxy
     if (!contains(old, new)) {
         if (aabbs->num_objects == 0 && !read_aabbs(aabbs, broad_phase)) return 0;
         const int index = proxy->object->world_index;
+        if (index < 0 || index >= aabbs->num_objects) return 0;
         uint64_t overlaps = find_overlaps(aabbs, &moved);
         if (overlaps & ~aabbs->pairs[index]) return 0;
         move_leaf(tree, leaf, new);
         set_limits(aabbs, index, &moved);
         broad_phase->needs_cleanup = 1;
         broad_phase->num_updates++;
-        /* Bullet counts known pairs as new, but not the pair of the object with itself. */
+        /* Bullet counts known pairs as new, but not the pair of the object with itself,
+           whose bit is always set. So one bit is skipped. */
         while (overlaps &= overlaps - 1) broad_phase->num_new_pairs++;
     }
     broad_phase->num_calls++;
@@ -246,11 +251,12 @@ void follow_bullet(struct aabbs *aabbs, const struct broad_phase *broad_phase,
                    const struct proxy *proxy) {
     const struct aabb *aabb = &proxy->leaf->aabb;
     const struct limits limits = load(aabb);
+    const int index = proxy->object->world_index;
     if (broad_phase->pair_cache->pairs.size != aabbs->num_pairs ||
-        !overlap(limits, limits))
+        !overlap(limits, limits) || index < 0 || index >= aabbs->num_objects)
         aabbs->num_objects = 0; /* read again */
     else
-        set_limits(aabbs, proxy->object->world_index, aabb);
+        set_limits(aabbs, index, aabb);
     aabbs->num_left++;
 }
 #endif

@@ -323,6 +323,7 @@ int solve_inverse_kinematics(const struct server *server, const struct command *
         !collect(&chain, joint_positions, body, tree, command->target_links[0]))
         return 0;
     const int num_dofs = chain.num_dofs;
+    if (num_dofs == 0) return 0;
     for (int i = 0; i < num_dofs; i++)
         damping[i] = command->flags & HAS_JOINT_DAMPING ? command->damping[i] : 0.5;
     const int num_iterations =
