@@ -72,8 +72,8 @@ class SampleTimeTransform(BufferTransform):
 
     def _count_stored(self, buffer: ReplayBuffer | None) -> int:
         """Returns how many of the remembered transitions the buffer holds."""
-        # An ensemble does not say from which of its buffers it samples. For it, as
-        # without a buffer, the newest `capacity` transitions count.
+        # An ensemble does not say from which of its buffers it samples. So, as
+        # without a buffer, take the newest `capacity` transitions as stored.
         if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):
             return len(buffer.storage)
         count = self._memory.count
@@ -140,7 +140,8 @@ class SampleTimeTransform(BufferTransform):
         if self.unit == "row":
             return serials, None
         numbers, steps = self._memory.find(serials.clip(self._memory.oldest))
-        # A slice continues with the next step, or with the same one in padded rows.
+        # A slice continues with the next step, or with the same one where a sampler
+        # repeats it to pad a short slice.
         continues = (np.diff(numbers) == 0) & np.isin(np.diff(steps), (0, 1))
         is_last = np.append(~continues, True)
         return serials[is_last], is_last.cumsum() - is_last
@@ -249,5 +250,5 @@ def _check_layout(
     if method == "add" and data.shape[ndim - 1 :].numel() > 1:
         raise RuntimeError(
             f"add() writes a single step, got data {list(data.shape)} for ndim={ndim}: "
-            "call extend(), or use ndim=2 for collectors with replay_buffer="
+            "call extend(); if a collector with replay_buffer= called add(), use ndim=2"
         )

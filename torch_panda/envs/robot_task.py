@@ -90,9 +90,9 @@ class RobotTaskEnv(EnvBase):
             to learn from pictures only. The goals are always observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: What happens when a step leaves an environment in a state that
-            is not finite. The environment always starts its next episode. "raise" then
-            raises `BulletError`. With "reset", the step returns the first
-            observation of that episode, and the reward computed from this observation;
+            is not finite. With both values, the environment starts its next episode.
+            With "raise", the step raises `BulletError`. With "reset", it returns the
+            first observation of that episode, and the reward computed from this observation;
             ``success`` is False and ``truncated`` is True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.

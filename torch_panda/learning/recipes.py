@@ -90,7 +90,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     },
     # For training with demonstrations: without them no training has solved the task. A
     # tenth of a millimetre separates a firm grasp from one in which the cube swings, so
-    # the recipe sets ``fine_fingers``.
+    # the recipe sets ``fine_fingers``, which enlarges small actions of the fingers.
     Flip: {
         **OBJECT,
         "relative_inputs": "fine",

@@ -45,9 +45,9 @@ DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 # start in the middle of the task. Such episodes need fewer steps. All environments take
 # the same number of steps, so the limit also cuts episodes that start at the beginning.
 MAX_STEPS_FROM_MIDDLE = 50
-# Fraction that the replay buffer stores of the sequences without motion (see
-# `buffers.has_moved`). A sequence is the steps of one environment in one iteration. The
-# preset "paper" stores all of them.
+# Of the sequences in which the achieved goal does not change (see `buffers.has_moved`),
+# the replay buffer stores this fraction. A sequence is the steps of one environment in
+# one iteration. The preset "paper" stores all of them.
 KEEP_UNMOVED = 0.1
 
 
@@ -84,8 +84,9 @@ class Run:
         self.env = make(
             args.env_id,
             num_envs=args.num_envs,
-            # The collector calls the exploration once when it is made, and a point
-            # near an object depends on the first observation.
+            # Making the collector calls the exploration once, before the first
+            # `reseed`. With exploration "points", this call may draw a point near an
+            # object, which depends on the first observation and so on this seed.
             seed=args.seed,
             device=args.device,
             randomize=randomize,
