@@ -92,8 +92,8 @@ class RobotTaskEnv(EnvBase):
         on_divergence: What happens when a step leaves an environment in a state that
             is not finite. With both values, the environment starts its next episode.
             With "raise", the step raises `BulletError`. With "reset", it returns the
-            first observation of that episode, and the reward computed from this observation;
-            ``success`` is False and ``truncated`` is True.
+            first observation of that episode, and the reward computed from this
+            observation; ``success`` is False and ``truncated`` is True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
