@@ -9,7 +9,6 @@
  * compute_kinematics        MultiBodyTree::calculateInverseDynamics and
  *                           calculateJacobians, for the links that lead to the target
  * turn_about_axis           bodyTParentFromAxisAngle
- * get_rotation              btMatrix3x3::getRotation
  * orientation_error         IKTrajectoryHelper::computeIK, its angular part
  * solve                     MatrixRmn::Solve and ConvertToRefNoFree
  * damped_step               Jacobian::CalcDeltaThetasDLS2
@@ -112,32 +111,6 @@ static struct matrix3 turn_about_axis(struct vector3 axis, double angle) {
         {{x * x * rest + c, x * y * rest - z * s, x * z * rest + y * s, 0.0},
          {x * y * rest + z * s, y * y * rest + c, y * z * rest - x * s, 0.0},
          {x * z * rest - y * s, y * z * rest + x * s, z * z * rest + c, 0.0}}};
-}
-
-/* The quaternion of a matrix. */
-static struct vector3 get_rotation(const struct matrix3 *matrix) {
-    double m[3][3], q[4];
-    for (int i = 0; i < 3; i++) memcpy(m[i], &matrix->row[i], sizeof m[i]);
-    const double trace = m[0][0] + m[1][1] + m[2][2];
-    if (trace > 0.0) {
-        double s = sqrt(trace + 1.0);
-        q[3] = s * 0.5;
-        s = 0.5 / s;
-        q[0] = (m[2][1] - m[1][2]) * s;
-        q[1] = (m[0][2] - m[2][0]) * s;
-        q[2] = (m[1][0] - m[0][1]) * s;
-    } else {
-        const int i = m[0][0] < m[1][1] ? (m[1][1] < m[2][2] ? 2 : 1)
-                                        : (m[0][0] < m[2][2] ? 2 : 0);
-        const int j = (i + 1) % 3, k = (i + 2) % 3;
-        double s = sqrt(m[i][i] - m[j][j] - m[k][k] + 1.0);
-        q[i] = s * 0.5;
-        s = 0.5 / s;
-        q[3] = (m[k][j] - m[j][k]) * s;
-        q[j] = (m[j][i] + m[i][j]) * s;
-        q[k] = (m[k][i] + m[i][k]) * s;
-    }
-    return (struct vector3){q[0], q[1], q[2], q[3]};
 }
 
 static void compute_kinematics(struct kinematics *result, const struct chain *chain,

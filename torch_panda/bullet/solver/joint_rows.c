@@ -30,8 +30,7 @@
 #if defined(__x86_64__) && defined(__linux__)
 #include "rows.h"
 #include "solver.h"
-
-#include <math.h>
+#include "vectors.h"
 
 /* Whether a constraint belongs to a joint with one degree of freedom, and has the sizes
    that this file assumes. */
@@ -100,35 +99,14 @@ static double fill_row(struct constraint_row *row, struct jacobian_data *data,
 }
 
 static struct vector3 world_axis(const struct link *link, const struct vector3 *axis) {
-    /* btMatrix3x3::getRotation */
-    const double(*m)[4] = (const double(*)[4])link->world_basis.row;
-    double q[4];
-    const double trace = m[0][0] + m[1][1] + m[2][2];
-    if (trace > 0.0) {
-        double s = sqrt(trace + 1.0);
-        q[3] = s * 0.5;
-        s = 0.5 / s;
-        q[0] = (m[2][1] - m[1][2]) * s;
-        q[1] = (m[0][2] - m[2][0]) * s;
-        q[2] = (m[1][0] - m[0][1]) * s;
-    } else {
-        const int i = m[0][0] < m[1][1] ? (m[1][1] < m[2][2] ? 2 : 1)
-                                        : (m[0][0] < m[2][2] ? 2 : 0);
-        const int j = (i + 1) % 3, k = (i + 2) % 3;
-        double s = sqrt(m[i][i] - m[j][j] - m[k][k] + 1.0);
-        q[i] = s * 0.5;
-        s = 0.5 / s;
-        q[3] = (m[k][j] - m[j][k]) * s;
-        q[j] = (m[j][i] + m[i][j]) * s;
-        q[k] = (m[k][i] + m[i][k]) * s;
-    }
+    const struct vector3 q = get_rotation(&link->world_basis);
     /* operator*(btQuaternion, btVector3) */
-    const double x = q[3] * axis->x + q[1] * axis->z - q[2] * axis->y;
-    const double y = q[3] * axis->y + q[2] * axis->x - q[0] * axis->z;
-    const double z = q[3] * axis->z + q[0] * axis->y - q[1] * axis->x;
-    const double w = -q[0] * axis->x - q[1] * axis->y - q[2] * axis->z;
+    const double x = q.w * axis->x + q.y * axis->z - q.z * axis->y;
+    const double y = q.w * axis->y + q.z * axis->x - q.x * axis->z;
+    const double z = q.w * axis->z + q.x * axis->y - q.y * axis->x;
+    const double w = -q.x * axis->x - q.y * axis->y - q.z * axis->z;
     /* btQuaternion::operator*=, with the inverse */
-    const double ix = -q[0], iy = -q[1], iz = -q[2], iw = q[3];
+    const double ix = -q.x, iy = -q.y, iz = -q.z, iw = q.w;
     return (struct vector3){w * ix + x * iw + y * iz - z * iy,
                             w * iy + y * iw + z * ix - x * iz,
                             w * iz + z * iw + x * iy - y * ix, 0.0};
