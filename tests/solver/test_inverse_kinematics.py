@@ -61,7 +61,7 @@ class Arm:
 
 
 def answers(ask, name, **options):
-    """What `ask` returns for a new arm, and the library's counts."""
+    """Call `ask` with a new arm; return its result and the counts of the library."""
     with solver(name) as library:
         arm = Arm(**options)
         try:

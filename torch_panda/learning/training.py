@@ -41,9 +41,9 @@ from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
-# Largest number of steps that each environment takes in an iteration, if some episodes
-# start in the middle of the task. Such episodes need fewer steps. All environments take
-# the same number of steps, so the limit also cuts episodes that start at the beginning.
+# Limit on the steps that each environment takes in an iteration, in a run in which some
+# episodes start in the middle of the task. Those episodes need fewer steps. The limit
+# also cuts the other episodes, because all environments take the same number of steps.
 MAX_STEPS_FROM_MIDDLE = 50
 # Of the sequences in which the achieved goal does not change (see `buffers.has_moved`),
 # the replay buffer stores this fraction. A sequence is the steps of one environment in

@@ -269,8 +269,8 @@ class Task(Configured, ABC):
         """The task's part of the observation, (num_envs, observation_dim) float64.
 
         The robot's part precedes it in ``observation``. If a task decorates this method
-        and `achieved_goal` with `bullet.selects_state`, C code does the work of both,
-        which saves about 50 microseconds per step.
+        and `achieved_goal` with `bullet.selects_state`, C code does the work of both
+        methods. The C code saves about 50 microseconds per step.
         """
         return simulation.ee_position[:, :0]
 

@@ -238,8 +238,8 @@ static void external_forces(struct world *world, const struct solver_info *info)
 /*
  * Answers a command of a client.
  *
- * Bullet calls its function for the inverse kinematics directly. This function, through
- * which all commands come, has a slot in a vtable.
+ * Bullet calls its function for the inverse kinematics directly, so no vtable has a slot
+ * for it. All commands pass through this function, which has one.
  */
 static char process_command(struct server *server, const struct command *command,
                             struct status *status, char *buffer, int buffer_size) {
