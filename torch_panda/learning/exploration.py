@@ -63,6 +63,7 @@ class RandomPointModule(TensorDictModuleBase):
     gripper: Tensor
     start_probability: Tensor
     warm_up_left: Tensor
+    columns: Tensor
 
     def __init__(
         self,
@@ -88,6 +89,9 @@ class RandomPointModule(TensorDictModuleBase):
         self.action_scale = action_scale
         self.moves_joints = moves_joints
         self.objects = tuple(objects)
+        # Indices of the three coordinates of each object, (number of objects, 3).
+        starts = torch.tensor(self.objects, dtype=torch.int64).unsqueeze(-1)
+        self.register_buffer("columns", starts + torch.arange(3), persistent=False)
         self.register_buffer("warm_up_left", torch.tensor(WARM_UP))
         self.register_buffer("steps_left", torch.zeros(num_envs, dtype=torch.int64))
         self.register_buffer("point", torch.zeros(num_envs, num_arm_actions))
@@ -132,10 +136,8 @@ class RandomPointModule(TensorDictModuleBase):
         point = low + (high - low) * torch.rand_like(self.point)
         if not self.objects:
             return point
-        starts = torch.tensor(self.objects, device=point.device)
-        choice = torch.randint(len(starts), (len(point), 1), device=point.device)
-        axes = torch.arange(3, device=point.device)
-        centre = observation.gather(-1, starts[choice] + axes)
+        choice = torch.randint(len(self.objects), (len(point),), device=point.device)
+        centre = observation.gather(-1, self.columns[choice])
         lowest, highest = OBJECT_HEIGHTS
         low = point.new_tensor((-OBJECT_DISTANCE, -OBJECT_DISTANCE, lowest))
         high = point.new_tensor((OBJECT_DISTANCE, OBJECT_DISTANCE, highest))
