@@ -80,7 +80,7 @@ static int compare(const struct observation *observed, const float *achieved_goa
 
 /* Observe all environments. Return 1 if success, end flags and the sparse reward are
    valid too. Return 0 if only the observations and goals are valid, in which case the
-   caller has to compute the others. The reward may be NULL. */
+   caller has to compute the others. */
 int environment_observe(const struct observation *observed, doubles state, int num_envs,
                         doubles goal, const int64_t *step_count, float *observation,
                         float *achieved_goal, float *desired_goal, float *reward,
@@ -102,7 +102,7 @@ int environment_observe(const struct observation *observed, doubles state, int n
             int has_begun = step_count[env] > 0; /* no episode ends before its first step */
             is_complete = answer != UNKNOWN;
             success[env] = answer == REACHED;
-            if (reward) reward[env] = answer == REACHED ? -0.0f : -1;
+            reward[env] = answer == REACHED ? -0.0f : -1;
             terminated[env] =
                 observed->terminate_on_success && success[env] && has_begun;
             truncated[env] = step_count[env] >= observed->max_episode_steps;
