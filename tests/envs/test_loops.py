@@ -258,6 +258,12 @@ def test_forces_of_another_robot(env):
         env.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
 
 
+def test_inverse_kinematics_without_an_arm(env):
+    control = MotorControl((1.0,) * 9, ik_link=11, ik_orientation=(1.0, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="ik_link needs num_arm_joints"):
+        env.episodes.simulation.step(control, np.zeros((N, 12)))
+
+
 # ---- interrupts, processes, threads --------------------------------------------------
 
 

@@ -70,11 +70,16 @@ class MotorControl:
 
         Raises:
             ValueError: The number of forces or the shape of the setpoints is wrong, or
-                ``ik_link`` is used with velocities or torques.
+                ``ik_link`` is used with velocities, with torques or without an arm.
         """
         if self.ik_link is not None and self.arm_mode != "position":
             raise ValueError(
                 f'ik_link needs arm_mode "position", got "{self.arm_mode}"'
+            )
+        if self.ik_link is not None and self.num_arm_joints == 0:
+            raise ValueError(
+                "ik_link needs num_arm_joints, the number of joints that the inverse "
+                "kinematics may move"
             )
         if len(self.forces) != num_joints:
             raise ValueError(
