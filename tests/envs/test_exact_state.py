@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 import torch_panda
 from tests.envs.test_parity import choose_actions
@@ -128,6 +129,20 @@ def test_episodes_without_end_are_forgotten(monkeypatch):
         env.reset()
         env.step(td.clone())
         assert env.get_state(exact=True)["actions"].shape == (2, 1, 3)
+
+
+def test_an_endless_episode_does_not_cost_the_others_their_exact_states(monkeypatch):
+    monkeypatch.setattr(history, "_MAX_STEPS", 10)
+    with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
+        td = env.reset().set("action", torch.zeros(2, 3))
+        for step in range(12):
+            if step == 8:
+                env.reset(TensorDict({"_reset": torch.tensor([[False], [True]])}, [2]))
+            env.step(td.clone())
+        with pytest.raises(torch_panda.BulletError, match=r"environments \[0\] are"):
+            env.get_state(exact=True)
+        env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+        assert env.get_state(exact=True)["num_actions"].tolist() == [[0], [4]]
 
 
 def test_long_histories_are_forgotten_with_their_episodes():

@@ -54,9 +54,8 @@ class History:
                 start[env] = present[env]
         for env in envs:
             self._first_steps[env] = len(self._steps)
-        if (unused := min(self._first_steps)) > _MAX_UNUSED_STEPS:
-            del self._steps[:unused]
-            self._first_steps = [first - unused for first in self._first_steps]
+        if self._count_unused_steps() > _MAX_UNUSED_STEPS:
+            self._delete_unused_steps()
 
     def record(self, action: Tensor, step_mask: Tensor | None) -> None:
         """Record a step.
@@ -67,9 +66,25 @@ class History:
                 means all.
         """
         if len(self._steps) == _MAX_STEPS:
-            self._steps = []
-            self._first_steps = [_DROPPED] * len(self._first_steps)
+            self._delete_unused_steps()
+        if len(self._steps) == _MAX_STEPS:
+            # Forget the episodes that need the oldest step.
+            self._first_steps = [first or _DROPPED for first in self._first_steps]
+            self._delete_unused_steps()
         self._steps.append((action, None if step_mask is None else step_mask.clone()))
+
+    def _count_unused_steps(self) -> int:
+        """Count the steps at the beginning of the list that no episode needs."""
+        needed = (first for first in self._first_steps if first != _DROPPED)
+        return min(needed, default=len(self._steps))
+
+    def _delete_unused_steps(self) -> None:
+        unused = self._count_unused_steps()
+        del self._steps[:unused]
+        self._first_steps = [
+            first if first == _DROPPED else first - unused
+            for first in self._first_steps
+        ]
 
     def export(self) -> dict[str, Tensor]:
         """The recorded starts and actions.
