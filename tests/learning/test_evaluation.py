@@ -56,6 +56,19 @@ def test_a_seed_fixes_the_episodes():
     assert not torch.equal(first.returns, other.returns)
 
 
+@pytest.mark.parametrize("tasks", ["random", "fixed"])
+def test_a_function_may_be_the_policy(tasks):
+    def stay(tensordict):
+        return tensordict.set("action", 0 * tensordict["desired_goal"])
+
+    module = TensorDictModule(lambda goal: 0 * goal, ["desired_goal"], ["action"])
+    results = [
+        torch_panda.evaluate(policy, "PandaReach-v1", episodes=5, tasks=tasks)
+        for policy in (stay, module)
+    ]
+    assert torch.equal(results[0].returns, results[1].returns)
+
+
 def test_options_of_make_are_passed_on():
     policy = torch_panda.load_policy("PandaReach-v1")
     options = {"task_options": {"distance_threshold": 10.0}, "physics": "fast"}

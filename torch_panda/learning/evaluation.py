@@ -7,13 +7,12 @@ from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.evaluation_tasks import evaluation_tasks
-from torch_panda.learning.rollouts import play_episodes
+from torch_panda.learning.rollouts import Policy, play_episodes
 from torch_panda.registry import make
 
 Tasks = Literal["random", "fixed"]
@@ -81,7 +80,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: TensorDictModuleBase,
+    policy: Policy,
     env_id: str,
     *,
     episodes: int = 200,
@@ -93,8 +92,8 @@ def evaluate(
     """Evaluate a policy on an environment, without exploration noise.
 
     Args:
-        policy: Trained policy, scripted expert, or any module that writes ``action``
-            into a TensorDict with the observations.
+        policy: Trained policy, scripted expert, or any module or function that writes
+            ``action`` into a TensorDict with the observations.
         env_id: Id of the environment.
         episodes: Number of episodes.
         seed: Seed of the episodes; None draws a random seed.
@@ -110,7 +109,7 @@ def evaluate(
 
     Raises:
         ValueError: The id is unknown, or an argument is out of range.
-        TypeError: The policy is not a module, or an argument is unknown.
+        TypeError: The policy cannot be called, or an argument is unknown.
     """
     check_positive(episodes=episodes, num_envs=num_envs)
     if not callable(policy):
@@ -128,9 +127,7 @@ def evaluate(
         return evaluate_episodes(env, policy, episodes)
 
 
-def evaluate_episodes(
-    env: RobotTaskEnv, policy: TensorDictModuleBase, episodes: int
-) -> Evaluation:
+def evaluate_episodes(env: RobotTaskEnv, policy: Policy, episodes: int) -> Evaluation:
     """Evaluate a policy over the next episodes of a batch of environments."""
     parts: list[Evaluation] = []
     while sum(len(part.success) for part in parts) < episodes:
@@ -140,7 +137,7 @@ def evaluate_episodes(
 
 def evaluate_fixed_starts(
     env: RobotTaskEnv,
-    policy: TensorDictModuleBase,
+    policy: Policy,
     episodes: int,
     states: Mapping[str, TensorDict],
     *,
@@ -172,8 +169,8 @@ def evaluate_fixed_starts(
         # episodes fill it up. `_join` drops these repeats.
         numbers = torch.arange(first, first + num_envs) % episodes
         start = env.reset(starts[numbers % len(states)], set_state=True)
-        randomized = _RandomStart(policy, actions[numbers])
-        parts.append(_summarize(*play_episodes(env, randomized, start=start)))
+        acting = _replace_first_actions(policy, actions[numbers])
+        parts.append(_summarize(*play_episodes(env, acting, start=start)))
     tasks = {
         name: _join(parts, range(index, episodes, len(states)))
         for index, name in enumerate(states)
@@ -181,25 +178,17 @@ def evaluate_fixed_starts(
     return _join(parts, range(episodes), tasks)
 
 
-class _RandomStart(TensorDictModuleBase):
-    """A policy whose first actions are replaced.
+def _replace_first_actions(policy: Policy, actions: Tensor) -> Policy:
+    """Return a policy whose first actions are (num_envs, steps, action size)."""
+    remaining = list(actions.unbind(1))
 
-    Args:
-        policy: Policy that writes ``action``.
-        actions: Actions of the first steps, (num_envs, steps, action size).
-    """
-
-    def __init__(self, policy: TensorDictModuleBase, actions: Tensor) -> None:
-        super().__init__()
-        self.in_keys = list(policy.in_keys)
-        self.out_keys = ["action"]  # type: ignore[misc]  # it has a setter
-        self._policy, self._actions = policy, list(actions.unbind(1))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = self._policy(tensordict)
-        if self._actions:
-            tensordict["action"] = self._actions.pop(0)
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = policy(tensordict)
+        if remaining:
+            tensordict["action"] = remaining.pop(0)
         return tensordict
+
+    return act
 
 
 def _summarize(rollout: TensorDictBase, lengths: Tensor) -> Evaluation:

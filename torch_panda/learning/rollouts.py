@@ -1,17 +1,20 @@
 """Rollouts of whole episodes in a batch of environments."""
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torch_panda.envs import RobotTaskEnv
 
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
 
 def play_episodes(
     env: RobotTaskEnv,
-    policy: TensorDictModuleBase,
+    policy: Policy,
     exploration: ExplorationType = ExplorationType.DETERMINISTIC,  # type: ignore[assignment]
     start: TensorDictBase | None = None,
 ) -> tuple[TensorDictBase, Tensor]:
