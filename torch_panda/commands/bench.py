@@ -167,39 +167,28 @@ def _make_ours(setting: Setting, **options: Any) -> Running:  # noqa: ANN401 (op
 def _make_bare_bullet(setting: Setting) -> Running:
     """Make environments that only run our native loop with Bullet's own solver.
 
-    The setpoints of the first episode are computed from random actions. Later episodes
-    repeat these setpoints, so that only the loop is measured.
+    The first episode computes its setpoints from random actions. Later episodes repeat
+    these setpoints, and then only the loop is measured.
     """
     if loop_name() != "native":
         raise RuntimeError("torch_panda was installed without its native loop")
     env = _make_env(setting)
     env.reset()
-    simulation, robot = env.episodes.simulation, env.robot
-    start = [
-        (tensor, tensor.clone())
-        for tensor in (
-            simulation.joint_position,
-            simulation.joint_velocity,
-            simulation.object_pose,
-            simulation.object_velocity,
-            simulation.object_joint_position,
-            simulation.object_joint_velocity,
-        )
-    ]
+    simulation, control = env.episodes.simulation, env.robot.motor_control
+    start = simulation.state.rows.clone()
     setpoints: list[np.ndarray] = []
     num_steps = 0
 
     def step() -> None:
         nonlocal num_steps
         if num_steps == env.max_episode_steps:
-            for tensor, value in start:
-                tensor.copy_(value)
+            simulation.state.rows.copy_(start)
             simulation.reset(range(setting.num_envs))
             num_steps = 0
         if num_steps == len(setpoints):
             action = env.action_spec.rand()
-            setpoints.append(robot.setpoint(action, simulation).numpy())
-        simulation.step(robot.motor_control, setpoints[num_steps])
+            setpoints.append(env.robot.setpoint(action, simulation).numpy())
+        simulation.step(control, setpoints[num_steps])
         num_steps += 1
 
     return Running(step, env.close)
