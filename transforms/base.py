@@ -129,14 +129,17 @@ class BufferTransform(envs.Transform):
             accepted += [x for x in names if x not in ("options", "unknown")]
         if "strategies" in accepted:  # GoalSampler has a strategy per key
             accepted.remove("strategy")
-        suggestion, has_ratio = None, "her_ratio" in accepted
+        suggestion = None
         is_count = isinstance(value, int) and value > 0
+        is_ratio = isinstance(value, float) and 0 < value < 1
         # Translate the arguments of Stable-Baselines3 and of the other transforms, for
         # example k=4 of HindsightAugment to her_ratio=0.8 of HindsightRelabel.
-        if name in ("k", "n_sampled_goal") and is_count and has_ratio:
+        if name in ("k", "n_sampled_goal") and is_count and "her_ratio" in accepted:
             suggestion = f"her_ratio={value / (value + 1):.3g}"
-        elif name == "her_ratio" and isinstance(value, float) and 0 < value < 1:
+        elif name == "her_ratio" and is_ratio and "k" in accepted:
             suggestion = f"k={max(1, round(value / (1 - value)))}"
+        elif name == "goal_selection_strategy" and "strategies" in accepted:
+            suggestion = "strategies"
         elif name == "goal_selection_strategy":
             suggestion = f"strategy={str(getattr(value, 'value', value)).lower()!r}"
         elif similar := difflib.get_close_matches(name, accepted, n=1):

@@ -189,10 +189,18 @@ def test_bad_values_are_refused(strategies, options, message):
         GoalSampler(strategies, reward_fn, **options)
 
 
-@pytest.mark.parametrize("name", ["strategy", "her_ratio", "k"])
-def test_arguments_of_other_transforms_are_refused(name):
-    with pytest.raises(TypeError, match=f"GoalSampler has no argument '{name}'"):
-        GoalSampler({"goal": "future"}, reward_fn, **{name: 1})
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"strategy": "future"}, "'strategy'; pass strategies, one for each key"),
+        ({"her_ratio": 0.8}, "'her_ratio'; accepted are strategies, reward_fn"),
+        ({"k": 4}, "'k'; accepted are strategies, reward_fn"),
+        ({"goal_selection_strategy": "future"}, "'goal_.*y'; use strategies; accepted"),
+    ],
+)
+def test_arguments_of_other_transforms_are_refused(option, message):
+    with pytest.raises(TypeError, match=f"GoalSampler has no argument {message}"):
+        GoalSampler({"goal": "future"}, reward_fn, **option)
 
 
 def test_the_representation_names_the_strategies():
