@@ -107,7 +107,10 @@ class Checkpoint:
         Raises:
             ValueError: The file is damaged, or its run had other options.
         """
-        keys = ("args", "agent", "optimizer", "updates", "buffer", "random", "progress")
+        keys = (
+            *("args", "agent", "optimizer", "updates", "buffer"),
+            *("random", "cuda_random", "progress"),
+        )
         finite = ("agent", "optimizer")
         state = files.read(self.path, "the state of a run", keys, finite=finite)
         check_same(self.path.parent, state["args"], fixed_options(self.args))
