@@ -73,10 +73,9 @@ def test_a_file_of_a_stranger_runs_no_code(tmp_path):
     assert not mark.exists()
 
 
-# Lacks "cuda_random".
-INCOMPLETE = dict.fromkeys(
-    ("args", "agent", "optimizer", "updates", "buffer", "random", "progress"), {}
-)
+# All keys but "cuda_random".
+KEYS = (*("args", "agent", "optimizer", "updates", "buffer", "random", "progress"),)
+INCOMPLETE = dict.fromkeys(KEYS, 0)
 
 
 @pytest.mark.parametrize("content", [b"hello", {"args": {}}, INCOMPLETE])
