@@ -110,6 +110,7 @@ def test_buffers_are_compared(capsys):
         (["--ids", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
         (["--num-envs", "4", "0"], "num_envs must be positive, got "),
         (["--plot", "/dev/null/speed.png"], "File exists"),
+        (["--plot", "speed.png", "--buffers"], "plot does not work with buffers"),
     ],
 )
 def test_wrong_options_are_refused(options, message):

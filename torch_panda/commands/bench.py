@@ -344,8 +344,8 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
 
 def _process_tree(pid: int) -> list[int]:
     """Return the ids of a process and of its descendants (Linux only)."""
-    files = Path(f"/proc/{pid}/task").glob("*/children")
-    children = [int(child) for file in files for child in file.read_text().split()]
+    paths = Path(f"/proc/{pid}/task").glob("*/children")
+    children = [int(child) for path in paths for child in path.read_text().split()]
     return [pid, *(x for child in children for x in _process_tree(child))]
 
 
@@ -547,7 +547,7 @@ def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
     return _markdown(rows)
 
 
-def run(arguments: Sequence[str] | None = None) -> None:
+def run(arguments: Sequence[str]) -> None:
     """Run the command.
 
     Raises:
@@ -561,6 +561,11 @@ def run(arguments: Sequence[str] | None = None) -> None:
         for env_id in args.ids:
             torch_panda.max_episode_steps(env_id)  # refuses an unknown id
         if args.plot is not None:
+            if args.buffers:
+                raise ValueError(
+                    "plot does not work with buffers: it draws the speeds of "
+                    "environments"
+                )
             files.prepare(args.plot)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
