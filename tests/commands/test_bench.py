@@ -42,11 +42,11 @@ def test_every_installed_contender_is_measured(name):
         pytest.skip("the native loop was not compiled")
     setting = bench.Setting("PandaReach-v3", num_envs=2, num_threads=1)
     try:
-        running = bench.CONTENDERS[name].make(setting)
+        contender = bench.CONTENDERS[name].make(setting)
     except ModuleNotFoundError as error:
         pytest.skip(str(error))
-    running.step()
-    running.close()
+    contender.step()
+    contender.close()
 
 
 def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
@@ -72,7 +72,7 @@ def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
     ours, fast = table_rows(output)
     assert ours[4] == "250 (200 to 300)"
     assert fast[4:6] == ["100 (100 to 100)", "2.00 (2.00 to 2.00)"]
-    assert 'torch_panda, physics="fast": RuntimeError: out of memory' in output
+    assert 'torch_panda, physics="fast" failed: RuntimeError: out of memory' in output
     assert "interrupted" in output
 
 
@@ -85,13 +85,15 @@ def test_bare_bullet_repeats_its_episode(monkeypatch):
     monkeypatch.setattr(
         bench, "_make_env", lambda setting: envs.append(make_env(setting)) or envs[0]
     )
-    running = bench.CONTENDERS["bare-bullet"].make(bench.Setting("PandaPush-v3", 2, 2))
+    contender = bench.CONTENDERS["bare-bullet"].make(
+        bench.Setting("PandaPush-v3", 2, 2)
+    )
     position = envs[0].episodes.simulation.joint_position
     states = []
     for _ in range(100):
-        running.step()
+        contender.step()
         states.append(position.clone())
-    running.close()
+    contender.close()
     first, second = torch.stack(states).split(50)
     assert torch.equal(first, second)
     assert first.std(dim=0).max() > 0.01  # [rad]: it moves

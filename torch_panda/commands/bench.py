@@ -86,7 +86,10 @@ class Args:
 
 @dataclass(frozen=True)
 class Setting:
-    """A workload that all contenders run. `Args` explains the attributes."""
+    """A workload that all contenders run. `Args` explains the attributes.
+
+    ``modules`` are the modules of ``imports``.
+    """
 
     env_id: str
     num_envs: int
@@ -95,7 +98,7 @@ class Setting:
     modules: tuple[UserModule, ...] = ()
 
 
-class Running(NamedTuple):
+class Environments(NamedTuple):
     """Environments of a contender. ``step`` steps all of them with random actions."""
 
     step: Callable[[], object]
@@ -107,7 +110,7 @@ class Measurement(NamedTuple):
 
     Attributes:
         speed: Steps of all environments together [1/s].
-        cpu_speed: Steps per second of processor time, summed over all processes. Other
+        cpu_speed: Steps divided by the processor time of all processes [1/s]. Other
             work on the machine hardly changes it. NaN except on Linux.
         creation: Time to create one environment, without imports [s].
         memory: Memory of one environment [MB]. NaN except on Linux.
@@ -122,7 +125,7 @@ class Measurement(NamedTuple):
 # Contenders -------------------------------------------------------------------
 
 
-def _run_torchrl(env: EnvBase) -> Running:
+def _wrap_torchrl(env: EnvBase) -> Environments:
     td: TensorDictBase = env.reset()
 
     def step() -> None:
@@ -130,14 +133,14 @@ def _run_torchrl(env: EnvBase) -> Running:
         td["action"] = torch.rand(env.action_spec.shape) * 2 - 1
         _, td = env.step_and_maybe_reset(td)
 
-    return Running(step, env.close)
+    return Environments(step, env.close)
 
 
-def _run_vector_env(
+def _wrap_vector_env(
     env: Any,  # noqa: ANN401 (of Gymnasium, Stable-Baselines3 or EnvPool)
     num_envs: int,
     action_space: gymnasium.Space[Any],
-) -> Running:
+) -> Environments:
     rng = np.random.default_rng(0)
     shape = (num_envs, gymnasium.spaces.flatdim(action_space))
     env.reset()
@@ -145,7 +148,7 @@ def _run_vector_env(
     def step() -> None:
         env.step(rng.uniform(-1, 1, size=shape).astype(np.float32))
 
-    return Running(step, env.close)
+    return Environments(step, env.close)
 
 
 def _make_env(setting: Setting, **options: Any) -> torch_panda.RobotTaskEnv:  # noqa: ANN401 (options of make)
@@ -160,11 +163,11 @@ def _make_env(setting: Setting, **options: Any) -> torch_panda.RobotTaskEnv:  # 
     )
 
 
-def _make_ours(setting: Setting, **options: Any) -> Running:  # noqa: ANN401 (options of make)
-    return _run_torchrl(_make_env(setting, **options))
+def _make_ours(setting: Setting, **options: Any) -> Environments:  # noqa: ANN401 (options of make)
+    return _wrap_torchrl(_make_env(setting, **options))
 
 
-def _make_bare_bullet(setting: Setting) -> Running:
+def _make_bare_bullet(setting: Setting) -> Environments:
     """Make environments that only run our native loop with Bullet's own solver.
 
     The first episode computes its setpoints from random actions. Later episodes repeat
@@ -191,7 +194,7 @@ def _make_bare_bullet(setting: Setting) -> Running:
         simulation.step(control, setpoints[num_steps])
         num_steps += 1
 
-    return Running(step, env.close)
+    return Environments(step, env.close)
 
 
 def _panda_gym_id(setting: Setting) -> str:
@@ -214,25 +217,27 @@ def _make_panda_gym_env(setting: Setting) -> gymnasium.Env[Any, Any]:
 
 def _make_async(
     make_env: Callable[[Setting], gymnasium.Env[Any, Any]], setting: Setting
-) -> Running:
+) -> Environments:
     env = gymnasium.vector.AsyncVectorEnv(
         [partial(make_env, setting)] * setting.num_envs, context="fork"
     )
-    return _run_vector_env(env, setting.num_envs, env.single_action_space)
+    return _wrap_vector_env(env, setting.num_envs, env.single_action_space)
 
 
-def _make_sb3(setting: Setting) -> Running:
+def _make_sb3(setting: Setting) -> Environments:
     from stable_baselines3.common.vec_env import SubprocVecEnv
 
     env = SubprocVecEnv(
         [partial(_make_panda_gym_env, setting)] * setting.num_envs, start_method="fork"
     )
-    return _run_vector_env(env, setting.num_envs, env.action_space)
+    return _wrap_vector_env(env, setting.num_envs, env.action_space)
 
 
-def _make_parallel(setting: Setting) -> Running:
+def _make_parallel(setting: Setting) -> Environments:
     make_env = partial(GymEnv, _panda_gym_id(setting))
-    return _run_torchrl(ParallelEnv(setting.num_envs, make_env, mp_start_method="fork"))
+    return _wrap_torchrl(
+        ParallelEnv(setting.num_envs, make_env, mp_start_method="fork")
+    )
 
 
 def _fetch_id(setting: Setting) -> str:
@@ -248,7 +253,7 @@ def _make_fetch_env(setting: Setting) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(_fetch_id(setting))
 
 
-def _make_envpool(setting: Setting) -> Running:
+def _make_envpool(setting: Setting) -> Environments:
     import envpool
 
     env = envpool.make(
@@ -257,7 +262,7 @@ def _make_envpool(setting: Setting) -> Running:
         num_envs=setting.num_envs,
         num_threads=setting.num_threads,
     )
-    return _run_vector_env(env, setting.num_envs, env.action_space)
+    return _wrap_vector_env(env, setting.num_envs, env.action_space)
 
 
 class Contender(NamedTuple):
@@ -271,7 +276,7 @@ class Contender(NamedTuple):
     """
 
     title: str
-    make: Callable[[Setting], Running]
+    make: Callable[[Setting], Environments]
     solver: str | None = None
 
 
@@ -307,8 +312,8 @@ def measure(name: str, setting: Setting, steps: int) -> Measurement:
         Exception: The contender's own error, or ``BrokenProcessPool`` if its process
             died.
     """
-    # With "forkserver", a server process imports this module once and forks every turn.
-    # It has no threads, which would not survive a fork.
+    # With "forkserver", a server process imports this module once, and each turn forks
+    # it. The server has no threads, which would not survive a fork.
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
     with ProcessPoolExecutor(1, mp_context=context) as pool:
@@ -326,16 +331,16 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     # A first environment imports all modules, which should not count.
     first = make(replace(setting, num_envs=1, num_threads=1))
     used_before, start = _memory(), time.perf_counter()
-    running = make(setting)
+    envs = make(setting)
     creation, used = time.perf_counter() - start, _memory() - used_before
     first.close()
     for _ in range(steps):
-        running.step()
+        envs.step()
     start, cpu_start = time.perf_counter(), _cpu_time()
     for _ in range(steps):
-        running.step()
+        envs.step()
     seconds, cpu_seconds = time.perf_counter() - start, _cpu_time() - cpu_start
-    running.close()
+    envs.close()
     n = setting.num_envs
     return Measurement(
         n * steps / seconds, n * steps / cpu_seconds, creation / n, used / n
@@ -385,7 +390,7 @@ _COLUMNS = (
     "threads",
     "contender",
     "steps/s",
-    "torch_panda over it",
+    "torch_panda / this",
     "steps/CPU s",
     "created in [ms]",
     "memory [MB]",
@@ -403,27 +408,29 @@ def compare(
     cases the results until then are kept.
 
     Returns:
-        The measurements of each setting and contender in the order of the turns, and a
-        line for each contender that did not run or failed, with the reason.
+        The measurements of each setting and contender in the order of the turns, and
+        lines that explain missing measurements.
     """
     results: Results = {}
     failures: list[str] = []
-    running = [(setting, name) for setting in settings for name in names]
+    remaining = [(setting, name) for setting in settings for name in names]
     try:
-        with tqdm(total=rounds * len(running), unit="turn") as bar:
+        with tqdm(total=rounds * len(remaining), unit="turn") as bar:
             for _ in range(rounds):
-                for setting, name in list(running):
+                for setting, name in list(remaining):
                     bar.set_description(f"{setting.env_id} x {setting.num_envs} {name}")
                     try:
                         measurement = measure(name, setting, steps)
                         results.setdefault((setting, name), []).append(measurement)
                     except Exception as error:  # a library may raise any error
-                        running.remove((setting, name))
+                        remaining.remove((setting, name))
                         title = CONTENDERS[name].title
-                        failures.append(f"{title}: {type(error).__name__}: {error}")
+                        failures.append(
+                            f"{title} failed: {type(error).__name__}: {error}"
+                        )
                     bar.update()
     except KeyboardInterrupt:
-        failures.append("all: interrupted")
+        failures.append("interrupted: later turns are missing")
     return results, list(dict.fromkeys(failures))
 
 
@@ -431,7 +438,7 @@ def table(results: Results) -> str:
     """Markdown table with a row for each setting and contender.
 
     Speeds are medians and ranges over the rounds. The ratio compares torch_panda's
-    speed with the row's, round by round.
+    speed with that of the row, round by round.
     """
     rows: list[Sequence[str]] = [_COLUMNS]
     for (setting, name), turns in results.items():
@@ -525,6 +532,7 @@ def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
             storage=LazyTensorStorage(capacity), transform=relabel, batch_size=256
         ),
     }
+    # `episodes` shares this tensor, so adding to it gives the episodes new ids.
     ids = torch.arange(num_episodes)[:, None].expand(episodes.shape).clone()
     episodes["collector", "traj_ids"] = ids
     for _ in range(capacity // episodes.numel()):
@@ -540,7 +548,7 @@ def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
                 buffer.sample()
             times[name].append(1e6 * (time.thread_time() - start) / cycles)
         ids += num_episodes
-    rows = [("replay buffer", "extend(50) + sample(256) [us]", "over plain")]
+    rows = [("replay buffer", "extend(50) + sample(256) [us]", "time / plain")]
     for name, values in times.items():
         ratios = [b / a for a, b in zip(times["plain"], values, strict=True)]
         rows.append((name, _spread(values, digits=0), _spread(ratios, digits=2)))
@@ -590,7 +598,7 @@ def run(arguments: Sequence[str]) -> None:
     if results:
         print(table(results))
     for failure in failures:
-        print(f"not measured: {failure}")
+        print(failure)
     if results and args.plot is not None:
         plot(args.plot, results)
     if any((setting, OURS) not in results for setting in settings):
