@@ -11,7 +11,6 @@ and `--preset sample-efficient` use the recipes of the task in
 With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +55,7 @@ class Mode:
     algo: str = ""
 
 
-def parse(arguments: Sequence[str] | None = None) -> Args | OfflineArgs:
+def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
     """Read the command line.
 
     With ``--offline``, the algorithm determines the other options and their defaults.
@@ -66,7 +65,6 @@ def parse(arguments: Sequence[str] | None = None) -> Args | OfflineArgs:
         ValueError: A module of ``--import`` does not exist, or ``--offline`` and the
             algorithm do not fit together.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
     modes = [x for x in arguments if x not in ("-h", "--help")]
     mode, _ = tyro.cli(Mode, args=modes, return_unknown_args=True)
     if mode.offline:
