@@ -125,12 +125,19 @@ class Changing(Push):
         cube = client.create_box((size,) * 3, mass=1.0, position=(0, 0, height))
         if self.change == "friction":
             client.set_friction(cube, lateral=0.1 * self.count)
+        elif self.change == "gravity":
+            client.set_gravity(-self.count)
+        elif self.change == "sensor":
+            robot = client.bodies[0]
+            client.enable_wrench_sensor(robot, self.count)
         elif self.change == "number" and self.count > 1:
             client.create_marker((0.0, 0.0, 0.0))
         return Bodies(objects=(cube,))
 
 
-@pytest.mark.parametrize("change", ["size", "place", "friction", "number"])
+@pytest.mark.parametrize(
+    "change", ["size", "place", "friction", "gravity", "sensor", "number"]
+)
 def test_scenes_that_differ_between_clients_are_refused(change):
     with pytest.raises(BulletError, match="the same in every client"):
         make(Changing(change), num_envs=2)

@@ -76,7 +76,7 @@ class SetCollisionFilter(NamedTuple):
 
 
 class SetPhysics(NamedTuple):
-    """Changes physical properties of a link or joint, which renderers ignore.
+    """Changes the physics of a link, a joint or the world. Renderers ignore it.
 
     Attributes:
         method: Method of `PhysicsClient` that was called.

@@ -409,7 +409,7 @@ class PhysicsClient:
         command = capi.motor_init(handle, body, capi.CONTROL_MODE_POSITION_VELOCITY_PD)
         capi.motor_set_velocity(command, info.u_index, 0.0)
         capi.motor_set_kp(command, info.u_index, 0.0)
-        capi.motor_set_kd(command, info.u_index, 1.0)
+        capi.motor_set_kd(command, info.u_index, VELOCITY_GAIN)
         capi.motor_set_force(command, info.u_index, force)
         self.connection.submit(
             command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "set a motor"
@@ -440,6 +440,7 @@ class PhysicsClient:
         command = capi.sensor_init(handle, body)
         capi.sensor_enable_wrench(command, joint, 1)
         self._run(command, "add a sensor")
+        self._record(SetPhysics("enable_wrench_sensor", (body, joint)))
 
     # ---- moving the world --------------------------------------------------------
 
@@ -497,6 +498,7 @@ class PhysicsClient:
         command = capi.physics_init(self.connection.handle)
         capi.physics_set_gravity(command, 0.0, 0.0, gravity)
         self._run(command, "set gravity")
+        self._record(SetPhysics("set_gravity", (gravity,)))
 
     def save(self) -> int:
         """Take a snapshot of all poses, velocities and contacts; return its id."""
