@@ -14,7 +14,7 @@ from torch_panda.bullet import Blueprint, Scene, SimulationState, building, capi
 from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase, SetJoints
 from torch_panda.bullet.connection import BulletError, Connection, connect, doubles
 from torch_panda.bullet.library import library_path
-from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Shape, Sphere
+from torch_panda.bullet.shapes import WHITE, Box, Cylinder, Sphere
 from torch_panda.rendering.camera import Camera, HandCamera
 from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.mesh_decimation import decimated_urdf
@@ -26,9 +26,9 @@ _NOT_SHINY = doubles((0.0, 0.0, 0.0))
 
 
 class Image(NamedTuple):
-    """A camera's image, in views of Bullet's memory.
+    """A camera's image. The arrays share Bullet's memory.
 
-    The views are valid until the client's next command.
+    They are valid until the client's next command.
 
     Attributes:
         rgb: (height, width, 3) uint8.
@@ -55,8 +55,8 @@ class VisualClient:
 
     Args:
         blueprint: Commands that built the scene in a physics client.
-        layer: Bodies to draw: "solids", "markers", or "all". "all" needs a renderer
-            that supports translucency.
+        layer: Bodies to draw: "solids", "markers", or "all". "all" needs "egl" or a
+            window, because markers are translucent.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer. One
             thread must make, use and close a client of "egl".
         mesh_cell: Edge length of the cubes in which the vertices of a mesh are merged
@@ -76,9 +76,9 @@ class VisualClient:
         self._connection = connect() if connection is None else connection
         self._layer = layer
         self._mesh_cell = mesh_cell
-        # Number of pictures to draw and discard first: the shadows in the first two
+        # Number of pictures still to draw and discard: the shadows in the first two
         # pictures of Bullet's OpenGL renderer are wrong.
-        self._num_discarded = 2 if renderer == "egl" else 0
+        self._num_to_discard = 2 if renderer == "egl" else 0
         try:
             if renderer == "egl":
                 self._load_egl()
@@ -86,11 +86,6 @@ class VisualClient:
         except BaseException:
             self.close()
             raise
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the client was closed."""
-        return self._connection.is_closed
 
     def close(self) -> None:
         """Free the client. Closing again does nothing."""
@@ -108,13 +103,15 @@ class VisualClient:
             positions = state.joint_position[env].tolist()
             self._set_joints(scene.robot, scene.joints, positions)
             self._pose_bodies(scene.objects, state.object_pose[env])
-            positions, first = state.object_joint_position[env].tolist(), 0
+            positions = state.object_joint_position[env].tolist()
+            first = 0
             for body, joints in zip(scene.objects, scene.object_joints, strict=True):
                 last = first + len(joints)
                 if joints:
                     self._set_joints(body, joints, positions[first:last])
                 first = last
-        self._pose_bodies(scene.markers, state.marker_pose[env])
+        if self._layer != "solids":
+            self._pose_bodies(scene.markers, state.marker_pose[env])
 
     def _pose_bodies(self, bodies: Sequence[int], poses: Tensor) -> None:
         for body, pose in zip(bodies, poses.tolist(), strict=True):
@@ -160,8 +157,8 @@ class VisualClient:
             )
         aspect = camera.width / camera.height
         capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
-        while self._num_discarded:
-            self._num_discarded -= 1
+        while self._num_to_discard:
+            self._num_to_discard -= 1
             self.draw(camera, hand, shadow=shadow)
         command = capi.camera_init(self._connection.handle)
         capi.camera_set_matrices(command, view, projection)
@@ -237,17 +234,17 @@ class VisualClient:
         # a body that has no visual shape.
         shape = building.NO_SHAPE
         if command.shape is not None:
-            shape = self._create_shape(command.shape, command)
+            shape = self._create_shape(command)
         body = building.create_body(
             self._connection, command.position, visual_shape=shape
         )
         if command.visual.texture is not None and command.shape is not None:
             self._set_texture(body, command.visual.texture)
 
-    def _create_shape(self, shape: Shape, body: CreateBody) -> int:
+    def _create_shape(self, body: CreateBody) -> int:
         handle, visual = self._connection.handle, body.visual
         command = capi.visual_init(handle)
-        match shape:
+        match body.shape:
             case Box(half_extents) if visual.texture is not None:
                 add_textured_box(handle, command, half_extents)
             case Box(half_extents):
