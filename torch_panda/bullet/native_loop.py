@@ -94,7 +94,7 @@ class NativeLoop:
         self,
         control: MotorControl,
         setpoint: Doubles,
-        envs: Sequence[int] | None = None,
+        envs: Sequence[int] | None,
     ) -> list[int]:
         """Set the motors, advance time and read the state; see `VectorSimulation.step`.
 

@@ -117,7 +117,6 @@ class Episodes:
             n, robot.action_dim, dtype=torch.float32, device="cpu"
         )
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
-        self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
         self.physics = read_physics(physics)
         self.seeds = EpisodeSeeds(n, seed)
