@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 import torch_panda
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.solver import activate
+from torch_panda.envs import robot_task
 
 
 def push_towards(td, generator):
@@ -349,6 +350,13 @@ def test_reward_functions_pickle_without_the_simulator(env):
     goals = torch.zeros(2, 5, 3), torch.full((2, 5, 3), 0.01)
     assert torch.equal(reward(*goals), torch.zeros(2, 5, 1))
     assert success(*goals).all()
+
+
+def test_a_viewer_without_viser_is_refused(env, monkeypatch):
+    monkeypatch.setattr(robot_task, "find_spec", lambda name: None)
+    message = r"^viewers need viser: pip install 'torch_panda\[viewer\]'$"
+    with pytest.raises(ImportError, match=message):
+        env.open_viewer()
 
 
 def test_use_after_close_is_refused():

@@ -26,6 +26,7 @@ from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
 from torch_panda.envs.state import EXACT_KEYS, is_state, unpack_state
 from torch_panda.envs.state_support import StateSupport
+from torch_panda.extras import install_command
 from torch_panda.rendering import Camera, RendererName
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -209,12 +210,11 @@ class RobotTaskEnv(EnvBase):
         self, function: RewardFunction
     ) -> RewardFunction:
         """Convert a function of the task's goals to one of the observed goals."""
-        episodes = self.episodes
-        if self.goal == "task" or episodes.goal_indices is None:
+        if self.goal == "task":
             return function
-        return functools.partial(
-            apply_to_observations, function, episodes.goal_indices, episodes.goal_dim
-        )
+        goal_indices, size = self.episodes.goal_indices, self.episodes.goal_dim
+        assert goal_indices is not None  # `Episodes` has checked this
+        return functools.partial(apply_to_observations, function, goal_indices, size)
 
     def __repr__(self) -> str:
         """The class, the arguments that are not the defaults, and Bullet's solver."""
@@ -250,7 +250,8 @@ class RobotTaskEnv(EnvBase):
         Args:
             tensordict: May hold ``_reset``, a mask of the environments to reset, and a
                 state to start from: the result of `get_state`, or some of its entries.
-                The call does not change it.
+                Without a state, the call writes the observations into this tensordict
+                and returns it.
             set_state: Whether to start from this state. Entries that the state lacks
                 start as in any new episode. None starts from the state if the
                 tensordict holds one.
@@ -516,9 +517,7 @@ class RobotTaskEnv(EnvBase):
             BulletError: The environment is closed.
         """
         if find_spec("viser") is None:
-            raise ImportError(
-                "viewers need viser: pip install -c .ci/constraints.txt -e '.[viewer]'"
-            )
+            raise ImportError(f"viewers need viser: {install_command('viewer')}")
         from torch_panda.rendering.web_viewer import WebViewer
 
         episodes = self.episodes
