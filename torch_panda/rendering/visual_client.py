@@ -76,8 +76,7 @@ class VisualClient:
         self._connection = connect() if connection is None else connection
         self._layer = layer
         self._mesh_cell = mesh_cell
-        # Number of pictures still to draw and discard: the shadows in the first two
-        # pictures of Bullet's OpenGL renderer are wrong.
+        # The shadows in the first two pictures of Bullet's OpenGL renderer are wrong.
         self._num_to_discard = 2 if renderer == "egl" else 0
         try:
             if renderer == "egl":
@@ -103,13 +102,13 @@ class VisualClient:
             positions = state.joint_position[env].tolist()
             self._set_joints(scene.robot, scene.joints, positions)
             self._pose_bodies(scene.objects, state.object_pose[env])
-            positions = state.object_joint_position[env].tolist()
-            first = 0
-            for body, joints in zip(scene.objects, scene.object_joints, strict=True):
-                last = first + len(joints)
+            sizes = [len(joints) for joints in scene.object_joints]
+            parts = state.object_joint_position[env].split(sizes)
+            for body, joints, part in zip(
+                scene.objects, scene.object_joints, parts, strict=True
+            ):
                 if joints:
-                    self._set_joints(body, joints, positions[first:last])
-                first = last
+                    self._set_joints(body, joints, part.tolist())
         if self._layer != "solids":
             self._pose_bodies(scene.markers, state.marker_pose[env])
 
@@ -157,16 +156,15 @@ class VisualClient:
             )
         aspect = camera.width / camera.height
         capi.projection_matrix(camera.fov, aspect, camera.near, camera.far, projection)
-        while self._num_to_discard:
-            self._num_to_discard -= 1
-            self.draw(camera, hand, shadow=shadow)
-        command = capi.camera_init(self._connection.handle)
-        capi.camera_set_matrices(command, view, projection)
-        capi.camera_set_size(command, camera.width, camera.height)
-        capi.camera_set_shadow(command, int(shadow))
-        flags = 0 if segmentation else capi.ER_NO_SEGMENTATION_MASK
-        capi.camera_set_flags(command, flags)
-        self._connection.submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
+        for _ in range(self._num_to_discard + 1):
+            command = capi.camera_init(self._connection.handle)
+            capi.camera_set_matrices(command, view, projection)
+            capi.camera_set_size(command, camera.width, camera.height)
+            capi.camera_set_shadow(command, int(shadow))
+            flags = 0 if segmentation else capi.ER_NO_SEGMENTATION_MASK
+            capi.camera_set_flags(command, flags)
+            self._connection.submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
+        self._num_to_discard = 0
         data = capi.CameraImage()
         capi.camera_result(self._connection.handle, byref(data))
         size = (camera.height, camera.width)
