@@ -65,12 +65,12 @@ class Robot(Configured):
         ee_link: Index of the link whose centre of mass is the end-effector.
         ee_orientation: Orientation that the end-effector keeps under the control type
             "ee", quaternion xyzw, world frame.
-        num_arm_joints: Number of movable joints that belong to the arm, which are the
-            first ones; None means all joints except the gripper's. Further joints keep
-            their start positions.
-        control_type: Meaning of the arm's numbers. "ee": displacement of the
-            end-effector along x, y and z of the world. "ee_pose": this displacement and
-            a rotation vector in the end-effector's frame. "joints": displacement of
+        num_arm_joints: Number of the arm's joints, which are the first movable joints.
+            Without a gripper, the joints after them keep their start positions. None
+            means all joints except the gripper's.
+        control_type: Meaning of an action's numbers for the arm. "ee": displacement of
+            the end-effector along x, y and z of the world. "ee_pose": this displacement
+            and a rotation vector in the end-effector's frame. "joints": displacement of
             each joint. "joint_velocity": velocity of each joint. "joint_torque": torque
             of each joint, without compensation of gravity.
         action_scale: Displacement [m] or [rad], velocity [rad/s], or share of
@@ -155,8 +155,8 @@ class Robot(Configured):
                 f"the arm and {num_fingers} of the gripper, got {len(joint_forces)} "
                 f"joint_forces"
             )
-        rest = self.neutral_joint_position[self.num_arm_joints :]
-        self._rest = torch.tensor(rest, dtype=torch.float64, device="cpu")
+        others = self.neutral_joint_position[self.num_arm_joints :]
+        self._other_joints = torch.tensor(others, dtype=torch.float64, device="cpu")
         self.control_type: ControlType = control_type
         self.action_scale = action_scale
         self.gripper = gripper
@@ -244,7 +244,7 @@ class Robot(Configured):
         """
         if self.gripper is None or self.block_gripper:
             arm = self.arm_setpoint(action, simulation)
-            others = self._rest.expand(len(arm), -1)
+            others = self._other_joints.expand(len(arm), -1)
         else:
             arm = self.arm_setpoint(action[:, :-1], simulation)
             fingers = simulation.joint_position[:, self.num_arm_joints :]
@@ -264,22 +264,20 @@ class Robot(Configured):
             [rad], velocities [rad/s] or torques [N m] of the arm's joints, (num_envs,
             num_arm_joints).
         """
-        displacement = action * self.action_scale
+        scaled = action * self.action_scale
         match self.control_type:
             case "joint_velocity":
-                return displacement.double()
+                return scaled.double()
             case "joint_torque":
                 forces = simulation.joint_position.new_tensor(self.joint_forces)
-                return displacement * forces[: self.num_arm_joints]
+                return scaled * forces[: self.num_arm_joints]
             case "joints":
-                return (
-                    simulation.joint_position[:, : self.num_arm_joints] + displacement
-                )
-        position = simulation.ee_position + displacement[:, :3]
+                return simulation.joint_position[:, : self.num_arm_joints] + scaled
+        position = simulation.ee_position + scaled[:, :3]
         position = position.clamp(self._lowest, self._highest)
         if self.control_type == "ee":
             return position
-        rotation = rotation_vector_to_quaternion(displacement[:, 3:].double())
+        rotation = rotation_vector_to_quaternion(scaled[:, 3:].double())
         orientation = quaternion_product(simulation.ee_orientation, rotation)
         return torch.cat((position, orientation), dim=1)
 
@@ -288,8 +286,8 @@ class Robot(Configured):
     ) -> None:
         """Set the motors of the robot in one client.
 
-        It runs in the thread that steps the client. A subclass overrides it if
-        `motor_control` cannot describe its control. Python threads then step the
+        The thread that steps the client calls this method. A subclass overrides it for
+        a control that `MotorControl` cannot express. Python threads then step the
         clients.
 
         Args:
@@ -303,7 +301,7 @@ class Robot(Configured):
     def motor_control(self) -> MotorControl:
         """Description of `control` for the compiled loop.
 
-        It is read once, when an environment is made.
+        An environment reads it once, when it is made.
         """
         arm, forces = self.num_arm_joints, self.joint_forces
         if self.control_type == "ee":
@@ -315,7 +313,7 @@ class Robot(Configured):
 
     @property
     def controller(self) -> Control:
-        """`motor_control`, or the `control` of a subclass that overrides it."""
+        """`control` if a subclass overrides it, otherwise `motor_control`."""
         overrides = type(self).control is not Robot.control
         return self.control if overrides else self.motor_control
 
