@@ -121,7 +121,10 @@ def test_masses_change_and_a_state_can_set_them():
         env.reset()
         assert client.mass(cube) != 0.5
         factors = torch.full((3, 1), 1.5)
-        env.reset(TensorDict({"physics_parameters": factors}, [3]), set_state=True)
+        for set_state in (True, None):
+            state = TensorDict({"physics_parameters": factors}, [3])
+            env.reset(state, set_state=set_state)
+            assert (env.get_state()["physics_parameters"] == 1.5).all()
         assert client.mass(cube) == 3.0
 
 

@@ -249,9 +249,11 @@ def test_a_state_can_be_used_again(env):
     assert (first == again).all()
 
 
-@pytest.mark.parametrize("state", [None, TensorDict({}, [3])])
+@pytest.mark.parametrize("state", [{}, {"step_count": torch.zeros(3, 1)}, None])
 def test_starting_from_a_missing_state_is_refused(env, state):
-    with pytest.raises(ValueError, match="needs a state with some of joint_position"):
+    state = None if state is None else TensorDict(state, [3])
+    message = "some of joint_position, .*, object_velocity, desired_goal, got none"
+    with pytest.raises(ValueError, match=message):
         env.reset(state, set_state=True)
 
 

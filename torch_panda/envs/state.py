@@ -101,12 +101,13 @@ def is_state(
 ) -> bool:
     """Whether a reset without ``set_state`` should start from its argument.
 
-    torchrl may pass the last observations to any reset, so the keys have to show
-    whether the argument is a state or observations. It is a state in two cases:
+    A caller may also pass the last observations, so the keys have to show whether the
+    argument is a state or observations. It is a state in two cases:
 
     * It has entries of `BODY_KEYS`, or a nested state under ``state``, where
       `StateTransform` puts it.
-    * It has a ``desired_goal`` and no ``achieved_goal``. Observations have both.
+    * It has a ``desired_goal`` or entries of `PHYSICS_KEYS`, and no ``achieved_goal``.
+      Observations always have an ``achieved_goal``.
 
     A ``step_count`` alone is not a state: torchrl's `StepCounter` writes it too.
 
@@ -126,7 +127,7 @@ def is_state(
         keys -= set(observed_keys)
     is_nested = entries is not None and unpack_state(entries) is not entries
     if not is_nested and not keys.intersection(BODY_KEYS):
-        return "desired_goal" in keys and not is_observed
+        return not is_observed and not keys.isdisjoint({"desired_goal", *PHYSICS_KEYS})
     if is_observed:
         raise ValueError(
             f"the tensordict holds observations and a state (one of "
@@ -167,14 +168,15 @@ def read_state(
         Entries of shape (len(envs), ...), in the dtypes of ``present``.
 
     Raises:
-        ValueError: An entry has a wrong shape, is not finite, is above 1e6, or has a
-            quaternion that is not a unit quaternion. Or an exact state lacks entries.
-            Or there are no entries of a state. ``step_count`` alone does not count,
-            because torchrl's `StepCounter` writes it too.
+        ValueError: An entry has a wrong shape, or a number that is not finite or above
+            1e6 in magnitude; an object's quaternion is not a unit quaternion; an exact
+            state lacks entries; or there are no entries of a state. A ``step_count``
+            alone is not a state, because torchrl's `StepCounter` writes it too.
     """
     if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
+        accepted = [key for key in present if key != "step_count"]
         raise ValueError(
-            f"set_state=True needs a state with some of {', '.join(present)}, got "
+            f"set_state=True needs a state with some of {', '.join(accepted)}, got "
             "none; if a wrapper dropped it, put torch_panda.envs.StateTransform into "
             "the innermost TransformedEnv, and give the state under the key "
             f"{NESTED_STATE!r}"
