@@ -73,9 +73,9 @@ class Sensor(Configured, ABC):
 
 # Keys of an environment's outputs, and keys that torchrl uses.
 _ENVIRONMENT_KEYS = {
-    *("observation", "achieved_goal", "desired_goal", "success", "action", "reward"),
-    *("terminated", "truncated", "done", "next", "_reset", "_step"),
-}
+    "observation", "achieved_goal", "desired_goal", "success", "action", "reward",
+    "terminated", "truncated", "done", "next", "_reset", "_step",
+}  # fmt: skip
 
 
 def join_entries(

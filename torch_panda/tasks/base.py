@@ -18,11 +18,14 @@ RewardType = Literal["sparse", "dense"]
 Quantity = Literal[
     "position", "velocity", "euler_angles", "quaternion", "angular_velocity", "number"
 ]
-"""Kind of some entries of an observation. A "number" is one entry that does not change
-if the scene is rotated or mirrored. A quaternion (xyzw) has 4 entries. The others have
-3, in the world frame."""
+"""Meaning of consecutive entries of an observation. A "number" is one entry that does
+not change if the scene is rotated or mirrored. A quaternion (xyzw) has 4 entries. The
+others have 3, in the world frame."""
 OBJECT_LAYOUT: tuple[Quantity, ...] = (
-    *("position", "euler_angles", "velocity", "angular_velocity"),
+    "position",
+    "euler_angles",
+    "velocity",
+    "angular_velocity",
 )
 """Quantities of `object_observation`."""
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
@@ -50,7 +53,7 @@ class Start(NamedTuple):
         object_pose: Positions [m] and quaternions xyzw of the objects, world frame,
             (n_objects, 7).
         object_joint_position: Positions of the objects' joints [rad] or [m],
-            (n_object_joints,), or one number for all joints.
+            (n_object_joints,) or, for the same position in all joints, (1,).
     """
 
     goal: Sequence[float]
@@ -101,8 +104,8 @@ class Task(Configured, ABC):
     that a task leaves out is never called, so it costs nothing.
 
     Args:
-        reward_type: "sparse" gives 0 for success and -1 otherwise; "dense" gives minus
-            the distance to the goal.
+        reward_type: "sparse" gives -1 above ``distance_threshold`` and 0 otherwise;
+            "dense" gives minus the distance to the goal.
         distance_threshold: Distance below which a goal is reached.
 
     Raises:
@@ -126,7 +129,8 @@ class Task(Configured, ABC):
     The position of each object must precede its other quantities."""
     sampled_goal_height: ClassVar[float | None] = None
     """Height of all sampled goals [m], in a task whose objects come to rest below this
-    height, as in Slide. None in all other tasks."""
+    height, as in Slide. None in all other tasks. Relative inputs in training use it for
+    achieved goals too."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
@@ -178,7 +182,8 @@ class Task(Configured, ABC):
 
         Returns:
             Positions in the order of ``simulation.object_joint_position``,
-            (n_object_joints,), or one number for all joints. The default is 0.
+            (n_object_joints,) or, for the same position in all joints, (1,). The
+            default is 0.
         """
         return (0.0,)
 
@@ -187,7 +192,7 @@ class Task(Configured, ABC):
     ) -> None:
         """Change the physics of an environment before each of its episodes.
 
-        A hook. It runs in the thread that resets the environment. Its changes may
+        Optional. It runs in the thread that resets the environment. Its changes may
         depend on ``rng`` only. They last until the next change, so if it sets a
         property in one episode, it must set this property in every episode.
 
@@ -206,8 +211,8 @@ class Task(Configured, ABC):
     ) -> Tensor:
         """Reward of a step as a function of state and action.
 
-        A hook. Without it the reward is `compute_reward`. Hindsight relabelling always
-        calls `compute_reward`, so the two should be close.
+        Optional. Without it the reward is `compute_reward`. Hindsight relabelling
+        always calls `compute_reward`, so the two should be close.
 
         Args:
             simulation: The environments after the step.
@@ -221,9 +226,7 @@ class Task(Configured, ABC):
         return self.compute_reward(achieved_goal, desired_goal)
 
     def failure(self, simulation: VectorSimulation) -> Tensor:
-        """Whether episodes have failed; a failed one ends as ``terminated``.
-
-        A hook.
+        """Whether episodes have failed; a failed one ends as ``terminated``. Optional.
 
         Returns:
             (num_envs, 1) bool.
@@ -231,9 +234,7 @@ class Task(Configured, ABC):
         return torch.zeros(simulation.num_envs, 1, dtype=torch.bool, device="cpu")
 
     def extra_observation(self, simulation: VectorSimulation) -> dict[str, Tensor]:
-        """Further observed entries beside ``observation``.
-
-        A hook.
+        """Further observed entries beside ``observation``. Optional.
 
         Returns:
             Tensors (num_envs, ...) by key. A float64 tensor is observed as float32.
@@ -260,17 +261,16 @@ class Task(Configured, ABC):
                 f"{type(self).__name__} needs a marker_pose of its own, because a goal "
                 f"of {goal.shape[-1]} numbers is not a position for each marker"
             )
-        positions = goal.unflatten(-1, (-1, 3))
-        rotation = goal.new_tensor(NO_ROTATION).expand(*positions.shape[:-1], 4)
-        return torch.cat((positions, rotation), dim=-1)
+        return _poses(goal)
 
     @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation, (num_envs, observation_dim) float64.
 
-        The robot's part precedes it in ``observation``. If a task decorates this method
-        and `achieved_goal` with `bullet.selects_state`, C code does the work of both
-        methods. The C code saves about 50 microseconds per step.
+        The robot's part precedes it in ``observation``. The default has no entries. If
+        this method and `achieved_goal` only select entries of the state, a task may
+        decorate both with `bullet.selects_state`. C code then does their work, which
+        saves about 50 microseconds per step.
         """
         return simulation.ee_position[:, :0]
 
@@ -302,10 +302,7 @@ class Task(Configured, ABC):
                 f'goal="observation" needs {type(self).__name__}.objects_at_goal: its '
                 f"goals are not one position for each object"
             )
-        position = goal.unflatten(1, (-1, 3))
-        rotation = goal.new_tensor(NO_ROTATION).expand(*position.shape[:-1], 4)
-        pose = torch.cat((position, rotation), dim=-1)
-        return objects._replace(pose=pose)
+        return objects._replace(pose=_poses(goal))
 
     def distance(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Distance between goals, (..., 1). The dense reward is minus this distance."""
@@ -363,6 +360,13 @@ class Task(Configured, ABC):
                 f"(..., {self.goal_dim}), got {tuple(achieved_goal.shape)} and "
                 f"{tuple(desired_goal.shape)}"
             )
+
+
+def _poses(goal: Tensor) -> Tensor:
+    """Poses (..., n, 7), not rotated, at the n positions of goals (..., 3 * n)."""
+    position = goal.unflatten(-1, (-1, 3))
+    rotation = goal.new_tensor(NO_ROTATION).expand(*position.shape[:-1], 4)
+    return torch.cat((position, rotation), dim=-1)
 
 
 def object_observation(simulation: VectorSimulation, index: int) -> Tensor:
