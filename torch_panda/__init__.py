@@ -11,7 +11,7 @@ from torch_panda.registry import (
     make,
     max_episode_steps,
     register,
-    register_with_gymnasium,
+    register_all_with_gymnasium,
 )
 from torch_panda.rendering import Camera, HandCamera
 from torch_panda.robots import Gripper, Kuka, Panda, Robot, XArm6, XArm6Gripper
@@ -87,4 +87,4 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401
 
 # Importing the package registers the ids, so that Gymnasium users can write
 # `gymnasium.register_envs(torch_panda)`, as for other packages.
-register_with_gymnasium()
+register_all_with_gymnasium()

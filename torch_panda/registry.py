@@ -21,7 +21,7 @@ from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import Task
 from torch_panda.tasks.peg_insertion import GRASP_WIDTH
 
-Made = TypeVar("Made", Robot, Task)
+RobotOrTask = TypeVar("RobotOrTask", Robot, Task)
 Options = Mapping[str, Any]
 
 
@@ -65,7 +65,7 @@ class Family(NamedTuple):
         robot: Class of the robot.
         task: Class of the task.
         robot_options: Arguments of the robot.
-        v3_task: Arguments of the task that ``-v3`` changes; None means that there is no
+        v3_task: Arguments of the task that ``-v3`` changes; None if there is no
             ``-v3``.
         v3_robot: Arguments of the robot that ``-v3`` changes.
         joints: Whether there are ids with joint control.
@@ -103,29 +103,30 @@ class Family(NamedTuple):
 
 
 BLOCKED = {"block_gripper": True}
-FIRM = {"finger_friction": 5.0}
-SPINNING = {"finger_spinning_friction": 0.001}  # panda-gym 3.0.7; the URDF has 0.1
+FIRM_FINGERS = {"finger_friction": 5.0}
+# As in panda-gym 3.0.7. The default is the URDF's value, 0.1.
+SPIN_FRICTION = {"finger_spinning_friction": 0.001}
 
 # Load a robot or a task that is given as ``module:Class``.
 _robot = partial(load_class, "torch_panda.robots")
 _task = partial(load_class, "torch_panda.tasks")
 
-# To add a task or a robot, add its line here; nothing else imports its file. The page
-# tasks/README.md shows the numbers of both versions side by side, with their sources.
+# A new task or robot needs its file and a line here. The page tasks/README.md shows the
+# numbers of both versions side by side, with their sources.
 FAMILIES = (
     Family(
         Panda,
         _task("reach:Reach"),
         BLOCKED,
         v3_task={"table_friction": 0.5},
-        v3_robot=SPINNING,
+        v3_robot=SPIN_FRICTION,
     ),
     Family(
         Panda,
         _task("push:Push"),
         BLOCKED,
         v3_task={"table_friction": 0.5, "object_mass": 1.0},
-        v3_robot=SPINNING,
+        v3_robot=SPIN_FRICTION,
     ),
     Family(
         Panda,
@@ -140,19 +141,19 @@ FAMILIES = (
             "table_length": 1.4,
             "table_x_offset": -0.1,
         },
-        v3_robot=SPINNING,
+        v3_robot=SPIN_FRICTION,
     ),
     Family(
         Panda,
         _task("pick_and_place:PickAndPlace"),
-        FIRM,
+        FIRM_FINGERS,
         v3_task={"table_friction": 0.5, "object_mass": 1.0, "object_friction": 0.5},
-        v3_robot={"finger_friction": 1.0, **SPINNING},
+        v3_robot={"finger_friction": 1.0, **SPIN_FRICTION},
     ),
     Family(
         Panda,
         _task("stack:Stack"),
-        FIRM,
+        FIRM_FINGERS,
         v3_task={
             "table_friction": 0.5,
             "object_mass": (2.0, 1.0),
@@ -161,15 +162,15 @@ FAMILIES = (
             "per_object": False,
             "lower_color": BLUE,
         },
-        v3_robot={"finger_friction": 1.0, **SPINNING},
+        v3_robot={"finger_friction": 1.0, **SPIN_FRICTION},
     ),
-    # panda-gym 1.1.0 has no Flip, so its -v1 has the fingers of 3.0.7 too.
-    Family(Panda, _task("flip:Flip"), SPINNING, v3_task={"table_friction": 0.5}),
+    # panda-gym 1.1.0 has no Flip, so Flip-v1 has the finger friction of 3.0.7.
+    Family(Panda, _task("flip:Flip"), SPIN_FRICTION, v3_task={"table_friction": 0.5}),
     Family(Panda, _task("drawer:Drawer"), BLOCKED),
     Family(
         Panda,
         _task("peg_insertion:PegInsertion"),
-        BLOCKED | FIRM | {"fingers_width": GRASP_WIDTH},
+        BLOCKED | FIRM_FINGERS | {"fingers_width": GRASP_WIDTH},
     ),
     Family(_robot("kuka:Kuka"), _task("reach:Reach"), joints=False),
     Family(_robot("xarm:XArm6"), _task("reach:Reach"), joints=False),
@@ -177,7 +178,7 @@ FAMILIES = (
     Family(
         _robot("xarm:XArm6Gripper"),
         _task("pick_and_place:PickAndPlace"),
-        FIRM,
+        FIRM_FINGERS,
         joints=False,
     ),
 )
@@ -222,17 +223,17 @@ def make(
 ) -> RobotTaskEnv:
     """Make the environments of an id.
 
-    The ids ``-v1`` follow the paper (arXiv 2106.13687), with the physical constants of
-    panda-gym 1.1.0. The ids ``-v3`` equal panda-gym 3.0.7.
+    For the tasks of the paper (arXiv 2106.13687), ``-v1`` follows the paper, with the
+    physical constants of panda-gym 1.1.0, and ``-v3`` follows panda-gym 3.0.7.
 
     Args:
         env_id: One of `ENV_IDS`, or an id that was registered with `register`.
-        num_envs: Number of environments stepped in parallel, for batch size
-            [num_envs]; None makes one environment with batch size [].
+        num_envs: Number of environments stepped in parallel; the batch size is
+            [num_envs]. None makes one environment of batch size [].
         num_threads: Number of threads that step them; None means one per core, at most
             ``num_envs``.
-        seed: Seed of all random draws. Give each worker process a seed of its own.
-        device: Device of the outputs.
+        seed: Seed of all random draws; None draws one from the operating system.
+        device: Device of all outputs; None means the CPU.
         from_pixels: Observe ``pixels``, uint8 (*batch, height, width, 3).
         pixels_only: Leave ``observation`` out; the goals stay.
         depth: Observe ``depth``, float32 (*batch, height, width, 1) [m].
@@ -351,7 +352,7 @@ def max_episode_steps(env_id: str) -> int:
     return find_registration(env_id).max_episode_steps
 
 
-def register_with_gymnasium() -> None:
+def register_all_with_gymnasium() -> None:
     """Register ``torch_panda/{id}`` with Gymnasium for all shipped ids."""
     for env_id in ENV_IDS:
         _register_with_gymnasium(_REGISTRATIONS[env_id])
@@ -361,8 +362,8 @@ def _register_with_gymnasium(registration: Registration) -> None:
     """Register an id for ``gymnasium.make`` and ``make_vec``.
 
     The entry points are strings, so the classes are imported when the first environment
-    is made. ``gymnasium.make`` truncates with its own ``TimeLimit``, so that its
-    argument ``max_episode_steps`` works as for any other environment.
+    is made. Gymnasium's ``TimeLimit`` truncates, so ``gymnasium.make`` accepts another
+    ``max_episode_steps``.
     """
     name = f"torch_panda/{registration.env_id}"
     gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that it replaces.
@@ -407,11 +408,11 @@ def _check_options(registration: Registration, options: Options) -> None:
     if not unknown:
         return
     advice = dict(_ADVICE)
-    for argument, made in (
+    for argument, example in (
         ("task_options", registration.make_task()),
         ("robot_options", registration.make_robot()),
     ):
-        for name in inspect.signature(type(made)).parameters.keys() & set(unknown):
+        for name in inspect.signature(type(example)).parameters.keys() & set(unknown):
             advice[name] = f"use {argument}={{{name!r}: {options[name]!r}}}"
     dense_id = "Dense-".join(registration.env_id.rsplit("-", 1))
     if "reward_type" in advice and dense_id in ENV_IDS:
@@ -419,7 +420,9 @@ def _check_options(registration: Registration, options: Options) -> None:
     check_names("make", unknown, accepted, advice)
 
 
-def _call(factory: Callable[..., Made], owner: str, options: Options | None) -> Made:
+def _call(
+    factory: Callable[..., RobotOrTask], owner: str, options: Options | None
+) -> RobotOrTask:
     """Make a robot or a task with these arguments."""
     if options is not None and not isinstance(options, Mapping):
         raise TypeError(f"{owner} must be a mapping, got {options!r}")
