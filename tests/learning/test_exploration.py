@@ -21,14 +21,14 @@ from torch_panda.learning.exploration import (
 NUM_ENVS = 64
 
 
-def make_module(eps, *, moves_joints=False, action_size=4, objects=()):
+def make_module(eps, *, moves_joints=False, action_size=4, object_columns=()):
     return RandomPointModule(
         torch.as_tensor(eps).expand(NUM_ENVS).clone(),
         action_size=action_size,
         action_scale=0.05,
         moves_joints=moves_joints,
         num_arm_actions=7 if moves_joints else 3,
-        objects=objects,
+        object_columns=object_columns,
     )
 
 
@@ -97,7 +97,7 @@ def test_the_hand_reaches_points_of_the_region():
 
 def test_half_of_the_points_are_near_one_of_the_objects():
     torch.manual_seed(0)
-    module = make_module(1.0, objects=(3, 6))
+    module = make_module(1.0, object_columns=(3, 6))
     centres = torch.tensor([[2.0, 1.0, 0.02], [-3.0, 1.0, 0.3]])
     observation = torch.cat((torch.zeros(3), centres.flatten()))
     points = torch.cat(
@@ -120,12 +120,13 @@ def test_half_of_the_points_are_near_one_of_the_objects():
 
 @pytest.mark.parametrize(
     ("env_id", "objects"),
-    [("PandaReach-v1", ()), ("PandaPush-v1", (6,)), ("PandaStack-v1", (7, 19))],
+    [("PandaReach-v1", []), ("PandaPush-v1", [6]), ("PandaStack-v1", [7, 19])],
 )
 def test_agents_know_where_observations_have_objects(env_id, objects):
     with torch_panda.make(env_id, num_envs=2) as env:
         agent = make_agent(env, Hyperparameters(exploration="points"))
-        assert agent.random_points().objects == objects
+        columns = agent.random_points().position_columns
+        assert columns[:, 0].tolist() == objects
         td = env.reset()
     for start in objects:
         position = td["observation"][:, start : start + 3]

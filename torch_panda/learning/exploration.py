@@ -24,7 +24,8 @@ NEAR_OBJECTS = 0.5
 OBJECT_DISTANCE = 0.1
 OBJECT_HEIGHTS = (-0.02, 0.06)
 # In its first WARM_UP steps, each environment always moves to points, so that the
-# replay buffer soon has many contacts.
+# replay buffer soon has many contacts. In a training, torchrl's collector uses up one
+# of these steps when it is made.
 WARM_UP = 250
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point
@@ -37,11 +38,11 @@ class RandomPointModule(TensorDictModuleBase):
     In each step, an environment without a point draws one with a certain probability,
     and keeps it for several steps. In the first `WARM_UP` steps, every environment
     always moves to points. The gripper's action is drawn uniformly together with the
-    point. Under joint control, a point is a displacement of all joints.
+    point. Under joint control, a point is the remaining displacement of all joints.
 
-    Like torchrl's exploration modules, this module acts only under
-    ``ExplorationType.RANDOM``, and draws from torch's global random generator. Its
-    state is part of ``state_dict``.
+    Like torchrl's exploration modules, this module acts under
+    ``ExplorationType.RANDOM`` or None, and draws from torch's global random generator.
+    Its state is part of ``state_dict``.
 
     Args:
         eps: Fraction of the steps after the warm-up in which each environment moves to
@@ -54,8 +55,9 @@ class RandomPointModule(TensorDictModuleBase):
             three entries of ``observation`` are its position [m].
         num_arm_actions: Number of entries of an action that move the arm. They come
             first.
-        objects: Indices in ``observation`` at which the positions of objects start [m].
-            Without objects, all points are anywhere over the table.
+        object_columns: For each object, the first of the three columns of
+            ``observation`` with its position [m]. Without objects, all points are
+            anywhere over the table.
     """
 
     steps_left: Tensor
@@ -63,7 +65,7 @@ class RandomPointModule(TensorDictModuleBase):
     gripper: Tensor
     start_probability: Tensor
     warm_up_left: Tensor
-    columns: Tensor
+    position_columns: Tensor
 
     def __init__(
         self,
@@ -73,7 +75,7 @@ class RandomPointModule(TensorDictModuleBase):
         action_scale: float,
         moves_joints: bool,
         num_arm_actions: int,
-        objects: Sequence[int] = (),
+        object_columns: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.in_keys = ["observation", "action"]
@@ -88,10 +90,12 @@ class RandomPointModule(TensorDictModuleBase):
         )
         self.action_scale = action_scale
         self.moves_joints = moves_joints
-        self.objects = tuple(objects)
-        # Indices of the three coordinates of each object, (number of objects, 3).
-        starts = torch.tensor(self.objects, dtype=torch.int64).unsqueeze(-1)
-        self.register_buffer("columns", starts + torch.arange(3), persistent=False)
+        self.num_objects = len(object_columns)
+        # Columns of the three coordinates of each object, (num_objects, 3).
+        x_columns = torch.tensor(tuple(object_columns), dtype=torch.int64).unsqueeze(-1)
+        self.register_buffer(
+            "position_columns", x_columns + torch.arange(3), persistent=False
+        )
         self.register_buffer("warm_up_left", torch.tensor(WARM_UP))
         self.register_buffer("steps_left", torch.zeros(num_envs, dtype=torch.int64))
         self.register_buffer("point", torch.zeros(num_envs, num_arm_actions))
@@ -134,10 +138,10 @@ class RandomPointModule(TensorDictModuleBase):
         """Draw a point for the hand in each environment, (num_envs, 3) [m]."""
         low, high = map(self.point.new_tensor, (LOWEST_POINT, HIGHEST_POINT))
         point = low + (high - low) * torch.rand_like(self.point)
-        if not self.objects:
+        if not self.num_objects:
             return point
-        choice = torch.randint(len(self.objects), (len(point),), device=point.device)
-        centre = observation.gather(-1, self.columns[choice])
+        choice = torch.randint(self.num_objects, (len(point),), device=point.device)
+        centre = observation.gather(-1, self.position_columns[choice])
         lowest, highest = OBJECT_HEIGHTS
         low = point.new_tensor((-OBJECT_DISTANCE, -OBJECT_DISTANCE, lowest))
         high = point.new_tensor((OBJECT_DISTANCE, OBJECT_DISTANCE, highest))
@@ -150,8 +154,8 @@ class RandomPointModule(TensorDictModuleBase):
         """Return the arm's actions towards the points, before noise and clipping."""
         if not self.moves_joints:
             return (self.point - observation[..., :3]) / self.action_scale
-        # The positions of the joints are not observed. So `point` is the displacement
-        # that is left, from which each action is subtracted.
+        # The positions of the joints are not observed. So `point` holds the remaining
+        # displacement, and each action reduces it.
         action = (self.point / self.action_scale).clamp(-1.0, 1.0)
         moves = (self.steps_left > 0).unsqueeze(-1)
         self.point.sub_(torch.where(moves, self.action_scale * action, 0.0))

@@ -98,7 +98,7 @@ class Agent(nn.Module, ABC):
             moves_joints=spaces.moves_joints,
             num_arm_actions=spaces.action_size - gripper_size,
             # The first position of an observation is the hand's.
-            objects=() if geometry is None else geometry.positions[1:],
+            object_columns=() if geometry is None else geometry.positions[1:],
         )
 
     def update(
