@@ -32,9 +32,8 @@ class Evaluation:
         at_start: Whether each episode starts with its goal reached, (n,) bool.
         returns: Sum of the rewards of each episode, (n,).
         lengths: Number of steps of each episode, (n,).
-        tasks: Results of each of the five `evaluation_tasks` by its name, from the same
-            number of episodes each; empty for random starts. The other attributes hold
-            the results of all episodes together.
+        tasks: Results from each of the five `evaluation_tasks`, by name. Empty for
+            random starts.
     """
 
     success: Tensor
@@ -97,8 +96,8 @@ def evaluate(
         env_id: Id of the environment.
         episodes: Number of episodes.
         seed: Seed of the episodes; None draws a random seed.
-        num_envs: Number of environments stepped in parallel. No more than ``episodes``
-            are used.
+        num_envs: Number of environments stepped in parallel, at most one for each
+            episode.
         tasks: "random" draws the start and the goal of each episode. "fixed" takes them
             from the five `torch_panda.evaluation_tasks`, and also reports the success
             from each of these starts. ``episodes`` is then rounded up to a multiple of
@@ -145,13 +144,14 @@ def evaluate_fixed_starts(
 ) -> Evaluation:
     """Evaluate a policy from fixed starts, in a batch of environments.
 
+    The episodes do not depend on the number of environments.
+
     Args:
         env: Batched environment.
         policy: Policy that writes ``action``.
         episodes: Number of episodes, rounded up to the same number for each start.
         states: Start states by name, as `evaluation_tasks` returns them.
-        seed: Seed of the first `RANDOM_ACTIONS` actions; None draws a random seed. The
-            episodes do not depend on the number of environments.
+        seed: Seed of the first `RANDOM_ACTIONS` actions; None draws a random seed.
     """
     episodes += -episodes % len(states)  # round up
     num_envs = env.batch_size[0]

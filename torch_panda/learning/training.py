@@ -3,7 +3,7 @@
 Each iteration resets all environments, steps each of them for the length of an episode
 (with ``--start-at-object`` at most `MAX_STEPS_FROM_MIDDLE` steps), and then takes
 ``updates_per_step`` gradient steps per environment step. If success ends episodes, an
-environment plays several of them in one iteration.
+environment may play several of them in one iteration.
 
 A run is saved between two iterations only. The next iteration begins with a reset, so
 the state of the environments need not be saved, and ``--resume`` continues the run bit
@@ -57,8 +57,8 @@ class Run:
     Args:
         args: Options of the training.
         out: Folder of the results.
-        demos: Transitions (n,) of `torch_panda.datasets.read_demos`, from which the
-            agent learns in addition.
+        demos: Demonstrated transitions (n,), as `torch_panda.datasets.read_demos`
+            returns them. They are a part of each batch.
 
     Raises:
         ValueError: An option does not fit the task or another option, or the run to
@@ -84,9 +84,9 @@ class Run:
         self.env = make(
             args.env_id,
             num_envs=args.num_envs,
-            # Making the collector calls the exploration once, before the first
-            # `reseed`. With exploration "points", this call may draw a point near an
-            # object, which depends on the first observation and so on this seed.
+            # The constructor of the collector calls the exploration once, before the
+            # first `reseed`. With exploration "points", this call may draw a point near
+            # an object, which depends on the first observation and so on this seed.
             seed=args.seed,
             device=args.device,
             randomize=randomize,
@@ -175,7 +175,8 @@ class Run:
         batches = iter(self.collector)
         while not stopped:
             started, before = time.perf_counter(), progress.steps
-            reseed(self.env)  # so that a resumed run has the same episodes
+            # From torch's generator, so that a resumed run has the same episodes.
+            reseed(self.env)
             data = next(batches)
             progress.steps += data.numel()
             self.store(data)
