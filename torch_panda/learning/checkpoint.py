@@ -35,7 +35,8 @@ class Progress:
     Attributes:
         steps: Environment steps so far, or gradient steps of an offline run.
         pretrained: Gradient steps of imitation so far.
-        seconds: Time spent on stepping and learning, without evaluations.
+        seconds: Time spent on stepping and learning, without evaluations. In ``refine``
+            only the time of the imitation.
         curve: One row for each evaluation.
         loss_sums: In offline learning, the sum of each loss since the last evaluation.
             Empty in other runs.
@@ -53,7 +54,7 @@ class Progress:
         return f"{self.curve[-1]['success']:.0%}" if self.curve else "unknown"
 
 
-class Stored(Protocol):
+class TrainingData(Protocol):
     """The data that a run learns from: a replay buffer or a data set.
 
     A replay buffer is saved and restored. Of a data set only the hash is saved, so that
@@ -71,14 +72,14 @@ class Stored(Protocol):
 class Checkpoint:
     """The complete state of a run between two iterations.
 
-    Its file ``path`` is called resume.pt. The file checkpoint.pt beside it holds the
-    policy alone, for `load_policy`.
+    The file ``path``, which is called resume.pt, holds this state. The file
+    checkpoint.pt beside it holds the policy alone, for `load_policy`.
     """
 
     path: Path
     args: Any  # options of the run, a dataclass
     agent: AnyAgent
-    buffer: Stored
+    buffer: TrainingData
     progress: Progress
 
     def save(self) -> None:
@@ -159,7 +160,7 @@ def check_same(
 def write_options(
     out: Path,
     args: Any,  # noqa: ANN401 (a dataclass)
-    default: Any,  # noqa: ANN401 (of the same)
+    default: Any,  # noqa: ANN401 (the same dataclass)
     **more: str,
 ) -> None:
     """Make the folder of a run, and write its options into args.json.
@@ -239,7 +240,7 @@ class StopSignal:
     def _receive(self, number: int, frame: object) -> None:
         self.received = True
         self.release()
-        tqdm.write("stopping after this iteration; repeat to stop at once")
+        tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
 
     def release(self) -> None:
         """Give the signals their usual effect again."""
