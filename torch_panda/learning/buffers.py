@@ -52,7 +52,7 @@ def make_buffer(
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
             the goal is relabelled. "none" keeps the original goals.
-        desired_ratio: Fraction of the hindsight goals that are desired goals of other
+        desired_ratio: Fraction of the hindsight goals that are desired goals of random
             transitions. The rest are goals achieved later in the same episode.
         seed: Seed of the choice of goals.
 

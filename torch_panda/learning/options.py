@@ -30,8 +30,8 @@ class Args(Hyperparameters):
     preset: Preset = "paper"
     """defaults of the other options: those of the panda-gym paper ("paper"), the task's
     recipe for the least wall-clock time ("tuned"), or its recipe for the fewest
-    environment steps ("sample-efficient"). With the last two, the replay buffer gets
-    only a random tenth of the episodes in which no object moves"""
+    environment steps ("sample-efficient"). With the last two, the replay buffer stores
+    only a random tenth of the rollouts in which the achieved goal does not change"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
@@ -39,7 +39,7 @@ class Args(Hyperparameters):
     sampled ("relabel"), or the same with a separate draw for each object's part of the
     goal ("parts"). "none" uses no hindsight"""
     desired_ratio: Ratio = 0.0
-    """fraction of the hindsight goals that are desired goals of other transitions. The
+    """fraction of the hindsight goals that are desired goals of random transitions. The
     rest are goals achieved later in the same episode"""
     seed: Seed = 0
     """seed of the environments, the networks and the sampling"""

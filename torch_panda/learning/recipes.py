@@ -3,8 +3,8 @@
 ``--preset tuned`` learns a task in the least wall-clock time. ``--preset
 sample-efficient`` learns it in the fewest environment steps, with more gradient steps.
 
-An option that is not in a recipe keeps its default, which is the value of the panda-gym
-paper. An option on the command line overrides the recipe.
+An option that is not in a recipe keeps its default, the value of the preset "paper".
+An option on the command line overrides the recipe.
 """
 
 from dataclasses import asdict
@@ -33,13 +33,13 @@ OBJECT: dict[str, Any] = {
     "eval_interval": 5_000,
 }
 # Options that `find_changes` leaves out: the algorithm, which the labels of plots name
-# anyway, and options that may differ between the runs that one line
-# of a plot summarizes.
+# anyway, and options that may differ between the runs that one line of a plot
+# summarizes.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
     *("out", "resume", "device", "video", "logger", "imports"),
 }
-# Options that need the control type "ee". `find_recipe` drops them for other robots.
+# Options that need the control type "ee". `find_recipe` drops them for other types.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
 RECIPES: dict[type[Task], dict[str, Any]] = {
     Reach: {"num_envs": 8, "gamma": 0.95, "relative_inputs": "coarse"},
@@ -47,7 +47,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     # they take 30 and 100 %, as in `OBJECT`, learning needs twice as many steps.
     Push: {**OBJECT, "random_eps": (0.0, 0.5), "total_steps": 100_000},
     # The goals are out of the arm's reach and rarely achieved, so half of the hindsight
-    # goals are desired goals of other transitions. There are few random actions,
+    # goals are desired goals of random transitions. There are few random actions,
     # because a single one during a strike changes where the puck stops.
     Slide: {
         "num_envs": 8,
@@ -90,7 +90,7 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     },
     # For training with demonstrations: without them no training has solved the task. A
     # tenth of a millimetre separates a firm grasp from one in which the cube swings, so
-    # the recipe sets ``fine_fingers``, which enlarges small actions of the fingers.
+    # with ``fine_fingers`` the networks output the cube root of the fingers' action.
     Flip: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -109,8 +109,8 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
     },
 }
 
-# Changes to these recipes for ids whose episodes end with success, such as -v3. There,
-# a puck that slides through its goal succeeds. So Slide needs fewer environment steps.
+# Changes to `RECIPES` for ids in which success ends an episode, such as -v3. There, a
+# puck that slides through its goal succeeds. So Slide needs fewer environment steps.
 # The recipe takes more gradient steps per environment step, and explores towards random
 # points.
 CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
@@ -146,8 +146,9 @@ SAMPLE_EFFICIENT_CHANGES: dict[type[Task], dict[str, Any]] = {
         "eval_interval": 5_000,
     },
 }
-# Changes to these for ids whose episodes end with success, such as -v3. There, fingers
-# and cube of PickAndPlace have less friction, and random grasps rarely hold the cube.
+# Changes to SAMPLE_EFFICIENT_CHANGES for ids in which success ends an episode, such as
+# -v3. There, fingers and cube of PickAndPlace have less friction, and random grasps
+# rarely hold the cube.
 SAMPLE_EFFICIENT_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
     Push: {"total_steps": 40_000, "eval_interval": 5_000},
     PickAndPlace: {
