@@ -1,7 +1,7 @@
 """Generates data sets for offline learning from an id, a kind and a seed.
 
-There is nothing to download. The same arguments give the same numbers, whatever the
-numbers of environments and threads are. `sha256` verifies this.
+The same arguments give the same data, for any number of environments and threads.
+Compare data sets by their `sha256`.
 """
 
 import hashlib
@@ -41,8 +41,9 @@ def generate(
 ) -> TensorDict:
     """Generate a data set of whole episodes.
 
-    Episodes never end early. Episode e depends on (``seed``, e) alone, so ``num_envs``
-    and ``num_threads`` change only the time that it takes.
+    All episodes have the same length: neither success nor failure ends them. Episode e
+    depends on (``seed``, e) alone, so ``num_envs`` and ``num_threads`` change only the
+    running time.
 
     Args:
         env_id: Id of the task.
@@ -50,9 +51,8 @@ def generate(
             noise whose standard deviation is drawn per episode from 0 to `MAX_NOISE`.
             "play": by the expert, which pursues one goal after another without reset,
             for `PLAY_STEPS` steps. It gets the next goal when it has stayed at a goal
-            for `HOLD_STEPS` steps, or when it has pursued the goal for as many steps as
-            an episode of the task has.
-            "random": uniformly.
+            for `HOLD_STEPS` steps, or when it has pursued the goal for
+            `Task.max_episode_steps` steps. "random": uniformly.
         transitions: Number of transitions, rounded up to whole episodes.
         seed: Seed of the data set.
         num_envs: Number of environments stepped in parallel.
@@ -62,10 +62,10 @@ def generate(
 
     Returns:
         Transitions [episodes, steps] with ``observation``, ``achieved_goal``,
-        ``desired_goal``, ``action``, ``("collector", "traj_ids")``, and under ``next``
-        also ``reward``, ``success``, ``terminated``, ``truncated`` and ``done``. In
-        "play", ``desired_goal`` is the goal that the expert pursues in the step, and
-        the same goal is stored under ``next``.
+        ``desired_goal``, ``action`` and ``("collector", "traj_ids")``. Under ``next``
+        are the observation and goals after the action, ``reward``, ``success``,
+        ``terminated``, ``truncated`` and ``done``. In "play", both entries
+        ``desired_goal`` are the goal that the expert pursues in the step.
 
     Raises:
         ValueError: The kind is unknown, there is no expert for the id, a number is out
@@ -128,15 +128,16 @@ def generate_parts(
                 f'episode, but those of {env_id} do: use "noisy" or "random"'
             )
         for start in range(first, num_episodes, num_envs):
-            numbers = torch.arange(start, min(start + num_envs, num_episodes))
-            episodes = _Episodes(env, expert, kind, seed, start)
+            # In the last batch, environments may be left over: drop their episodes.
+            episode_ids = torch.arange(start, min(start + num_envs, num_episodes))
+            batch = _Batch(env, expert, kind, seed, start)
             rows = []
             for _ in range(steps):
-                rows.append(episodes.step())
+                rows.append(batch.step())
                 if progress is not None:
-                    progress(len(numbers))
-            part = TensorDict.stack(rows, 1)[: len(numbers)]
-            part["collector", "traj_ids"] = numbers[:, None].repeat(1, steps)
+                    progress(len(episode_ids))
+            part = TensorDict.stack(rows, 1)[: len(episode_ids)]
+            part["collector", "traj_ids"] = episode_ids[:, None].repeat(1, steps)
             yield part
 
 
@@ -172,17 +173,13 @@ def episode_seed(seed: int, number: int) -> int:
 def _spawn(seed: int, number: int) -> tuple[int, np.random.Generator]:
     """Seed of an episode's environment, and generator of its other random draws."""
     env_seed, other_seed = np.random.SeedSequence((seed, number)).spawn(2)
-    # `set_env_seed` takes an int64, so drop one of the 64 bits.
+    # Data sets store the seed as an int64, so drop one of the 64 bits.
     value = int(env_seed.generate_state(1, np.uint64)[0] >> 1)
     return value, np.random.default_rng(other_seed)
 
 
-class _Episodes:
-    """One episode in every environment of a batch.
-
-    ``first`` is the number of the episode in the first environment. The episodes of the
-    next environments have the following numbers.
-    """
+class _Batch:
+    """One episode in each environment: environment i plays episode ``first`` + i."""
 
     def __init__(
         self,
@@ -199,12 +196,13 @@ class _Episodes:
             env_seed, generator = _spawn(seed, first + index)
             env.set_env_seed(index, env_seed)
             self._generators.append(generator)
-            noise.append(self._generators[-1].uniform(0.0, MAX_NOISE))
+            # Draw it for all kinds, because the published hashes depend on this draw.
+            noise.append(generator.uniform(0.0, MAX_NOISE))
         self._noise = torch.tensor(noise, dtype=torch.float32).unsqueeze(1)
-        self._observed = [key for key in env.observation_spec if key != "success"]
-        self._state = env.reset()
+        self._keys = [key for key in env.observation_spec if key != "success"]
+        self._observations = env.reset()
         if kind == "play":
-            self._goal = self._state["desired_goal"].clone()
+            self._goal = self._observations["desired_goal"].clone()
             self._steps_at_goal = torch.zeros(env.batch_size[0], dtype=torch.int64)
             self._steps_since_goal = torch.zeros_like(self._steps_at_goal)
             self._max_steps_per_goal = type(env.task).max_episode_steps
@@ -217,13 +215,13 @@ class _Episodes:
             The transitions of all environments, (num_envs,).
         """
         env = self._env
-        row = self._state.select(*self._observed)
+        row = self._observations.select(*self._keys)
         if self._kind == "play":
             row["desired_goal"] = self._goal.clone()
         row["action"] = self._act(row)
         row = env.step(row)
         after: TensorDictBase = row["next"]  # type: ignore[assignment]
-        self._state = after.select(*self._observed)
+        self._observations = after.select(*self._keys)
         if self._kind == "play":
             self._apply_pursued_goals(row)
             self._change_goals(row)
@@ -248,7 +246,7 @@ class _Episodes:
         after["success"] = self._env.is_success(*goals)
 
     def _change_goals(self, row: TensorDictBase) -> None:
-        """Draw a new goal where the expert has held or given up the pursued one."""
+        """Draw a new goal where the expert stayed at its goal or ran out of steps."""
         success = row["next", "success"].squeeze(-1)
         self._steps_at_goal = torch.where(success, self._steps_at_goal + 1, 0)
         self._steps_since_goal += 1
