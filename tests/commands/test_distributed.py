@@ -1,16 +1,10 @@
 """The distributed command, on a Ray cluster of two nodes on this machine."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 
 import pytest
 import torch
 
-from tests.commands.runs import read_curve
 from torch_panda.commands import plot
 from torch_panda.learning import curve
 
@@ -139,14 +133,6 @@ def test_another_run_is_not_overwritten(tmp_path, monkeypatch):
     assert (tmp_path / "curve.csv").read_text() == "theirs"
 
 
-def test_something_must_explore(tmp_path, monkeypatch):
-    monkeypatch.setattr(distributed, "connect", pytest.fail)
-    args = distributed.Args(noise_eps=0.0, random_eps=(0.0, 0.0), out=tmp_path / "run")
-    with pytest.raises(SystemExit, match=r"^algo ddpg explores by noise_eps and "):
-        distributed.main(args)
-    assert not args.out.exists()
-
-
 @pytest.mark.usefixtures("quick")
 def test_a_run_is_drawn(address, tmp_path):
     args = distributed.Args(
@@ -165,34 +151,3 @@ def test_a_run_is_drawn(address, tmp_path):
     assert line == "distributed, num envs 4, steps per batch 5, updates per step 0.25"
     (drawn,) = runs["PandaReach-v1"]["DDPG"][line]
     assert [row["step"] for row in drawn] == [0, 40]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_an_interrupt_ends_the_run_with_its_last_evaluation(tmp_path):
-    """Ctrl-C in a process of its own."""
-    out = tmp_path / "run"
-    options = (
-        "--num-workers 1 --num-envs 2 --steps-per-batch 5 --eval-interval 100 "
-        f"--total-steps 100000 --out {out}"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-m", "torch_panda", "distributed", *options.split()],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | QUIET,
-    )
-    deadline = time.monotonic() + 300
-    while not (out / "curve.csv").exists() or len(read_curve(out)) < 2:
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=240)
-    assert process.returncode == 0, errors
-    assert "stopping after this iteration" in output
-    steps = int(read_curve(out)[-1]["step"])
-    assert f"after {steps} steps; see {out}" in output
-    assert 0 < steps < 100_000
-    assert (out / "checkpoint.pt").exists()

@@ -60,12 +60,6 @@ def test_training_refuses(tmp_path, option, value):
     assert not out.exists()
 
 
-def test_training_refuses_what_does_not_explore(tmp_path):
-    options = {"noise_eps": 0.0, "random_eps": (0.0, 0.5)}
-    message = "algo ddpg explores by noise_eps and random_eps: .*"
-    refused(train, message, num_envs=1, out=tmp_path / "run", **options)
-
-
 @pytest.mark.parametrize("device", ["", "nothing", "meta", "cuda:99"])
 def test_devices_that_do_not_work(tmp_path, device):
     message = f"device must be one that torch can use here, .* got '{device}': .+"
