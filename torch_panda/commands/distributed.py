@@ -66,7 +66,7 @@ class Args(Hyperparameters):
     """address of the Ray cluster; "local" starts one on this machine for this run,
     "auto" joins the cluster to which this machine belongs"""
     env_id: str = "PandaReach-v1"
-    """task to train"""
+    """id of the environment, shipped or registered by --import"""
     num_workers: Positive = 2
     """number of worker processes, spread over the machines"""
     num_envs: Positive = 8

@@ -1,12 +1,12 @@
-"""Record demonstrations of the scripted experts, or data sets for offline learning.
+"""Record demonstrations of the scripted experts, or generate data for offline learning.
 
 python -m torch_panda record --env-id PandaPush-v1 --episodes 200 --out demos.pt
 python -m torch_panda record --format minari --out panda/push-expert-v0
 python -m torch_panda record --format lerobot --out push_lerobot
 python -m torch_panda record --kind play --transitions 100000 --out push_play.pt
 
-Demonstrations come with the success rate of the expert. The other kinds are the data of
-`torch_panda.datasets.generate`, and come with their hash.
+The command prints the expert's success rate in demonstrations. For the other kinds,
+which are those of `torch_panda.datasets.generate`, it prints the hash of the data.
 """
 
 from collections.abc import Sequence
@@ -38,28 +38,28 @@ from torch_panda.learning.files import prepare, save
 from torch_panda.learning.limits import Finite, Positive, Seed, Weight, check_limits
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
-# Entries of pictures, which the hash leaves out.
+# Keys of pictures. The hash does not include them.
 PIXELS = ("pixels", ("next", "pixels"))
 
 
 @dataclass
 class Args:
-    """Record demonstrations of a scripted expert, or a data set."""
+    """Record demonstrations of a scripted expert, or generate data."""
 
     env_id: str = "PandaPush-v1"
-    """task of the expert, with end-effector control"""
+    """id of the environment. Experts need a Panda with end-effector control"""
     episodes: Positive | None = None
     """number of demonstrations (kind "expert"); None means 200"""
     seed: Seed = 0
-    """seed of the environments (kind "expert"), or of the data set"""
+    """seed of the environments (kind "expert"), or of the generated data"""
     num_envs: Positive = 32
     """number of environments stepped in parallel"""
     num_threads: Positive | None = None
     """number of threads that step the environments; None means one per core"""
     noise_eps: Weight = 0.0
     """standard deviation of Gaussian noise on the executed actions. The file holds the
-    actions without noise, so that imitating them teaches how to correct errors (DART,
-    arXiv 1703.09327)"""
+    expert's actions without noise, which correct the errors that the noise causes
+    (DART, arXiv 1703.09327)"""
     task_options: dict[str, Finite] = field(default_factory=dict)
     """arguments of the task to change, such as `clearance 0.0005`"""
     format: Literal["tensors", "minari", "lerobot"] = "tensors"
@@ -69,18 +69,18 @@ class Args:
     """file to write (tensors), id of the data set (minari) or its folder (lerobot).
     None only measures the expert's success"""
     image_size: Positive = 128
-    """height and width of the pictures of a LeRobot data set [pixels]"""
+    """height and width of the pictures [pixels], which only "lerobot" has"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     kind: Literal["expert", Kind] = "expert"
-    """demonstrations ("expert"), or a data set of `torch_panda.datasets.generate`: the
-    expert with noise on its actions ("noisy"), the expert pursuing goal after goal
-    without reset ("play"), or random actions ("random")"""
+    """demonstrations ("expert"), or data of `torch_panda.datasets.generate`: the expert
+    with noise on its actions ("noisy"), the expert pursuing goal after goal without
+    reset ("play"), or random actions ("random")"""
     transitions: Positive | None = None
-    """number of transitions of a data set, rounded up to whole episodes; None means
+    """number of generated transitions, rounded up to whole episodes; None means
     100,000"""
     resume: bool = False
-    """continue a data set whose recording was interrupted"""
+    """continue to generate data after an interruption"""
 
 
 def print_success(env_id: str, success: list[Tensor]) -> None:
@@ -118,15 +118,15 @@ def check(args: Args) -> None:
         ValueError: An option is out of its limits, or two do not fit together.
     """
     check_limits(args)
-    is_data = args.kind != "expert"
-    if is_data and (args.episodes is not None or args.noise_eps):
+    is_generated = args.kind != "expert"
+    if is_generated and (args.episodes is not None or args.noise_eps):
         raise ValueError(
             f"episodes and noise_eps do not work with the kind {args.kind}; use "
             "transitions, or the kind expert"
         )
-    if is_data and args.out is None:
+    if is_generated and args.out is None:
         raise ValueError(f"the kind {args.kind} needs a file or name to write, --out")
-    if not is_data and (args.transitions is not None or args.resume):
+    if not is_generated and (args.transitions is not None or args.resume):
         raise ValueError(
             "transitions and resume do not work with the kind expert; use episodes, or "
             "another kind"
@@ -160,7 +160,7 @@ def main(args: Args) -> None:
         if args.kind == "expert":
             record_demonstrations(args)
         else:
-            record_data(args, args.kind)
+            record_generated_data(args, args.kind)
     except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None
     except KeyboardInterrupt:
@@ -191,7 +191,8 @@ def record_demonstrations(args: Args) -> None:
     with env, tqdm(total=episodes, unit="episode", desc=args.env_id) as bar:
         while len(success) < episodes:
             first = len(success)
-            if args.format != "tensors":  # every episode stores its seed
+            if args.format != "tensors":
+                # These formats store the seed of each episode.
                 for index in range(env.batch_size[0]):
                     env.set_env_seed(index, args.seed + first + index)
             new = play(env, expert)[: episodes - first]
@@ -207,7 +208,7 @@ def record_demonstrations(args: Args) -> None:
         print(f"{steps} transitions in {writer.close()}")
 
 
-def record_data(args: Args, kind: Kind) -> None:
+def record_generated_data(args: Args, kind: Kind) -> None:
     """Generate a data set, save it, and print its hash.
 
     Raises:

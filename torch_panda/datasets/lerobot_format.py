@@ -128,9 +128,9 @@ def read(path: Path) -> TensorDict:
         return values.reshape(len(values), -1).to(dtype)
 
     achieved, desired = column(GOALS, torch.float32).chunk(2, dim=-1)
-    number = column("episode_index", torch.int64).squeeze(-1)
+    episode_ids = column("episode_index", torch.int64).squeeze(-1)
     # Keep the transitions whose next frame belongs to the same episode.
-    kept = number[:-1] == number[1:]
+    kept = episode_ids[:-1] == episode_ids[1:]
     observed = {
         "observation": column(STATE, torch.float32),
         "achieved_goal": achieved,
@@ -138,7 +138,7 @@ def read(path: Path) -> TensorDict:
     }
     data = {
         "action": column("action", torch.float32)[:-1],
-        ("collector", "traj_ids"): number[:-1],
+        ("collector", "traj_ids"): episode_ids[:-1],
         ("next", "reward"): column("next.reward", torch.float32)[:-1],
         ("next", "terminated"): column("next.terminated", torch.bool)[:-1],
         ("next", "success"): column("next.success", torch.bool)[:-1],
@@ -149,8 +149,8 @@ def read(path: Path) -> TensorDict:
     data["next", "desired_goal"] = data["desired_goal"]
     transitions: TensorDict
     transitions = TensorDict(data, [len(kept)])[kept]  # type: ignore[assignment]
-    numbers = transitions["collector", "traj_ids"]
-    last = numbers != numbers.roll(-1)
+    episode_ids = transitions["collector", "traj_ids"]
+    last = episode_ids != episode_ids.roll(-1)
     last[-1] = True
     transitions["next", "done"] = last.unsqueeze(-1)
     return transitions

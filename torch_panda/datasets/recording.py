@@ -36,8 +36,8 @@ class TensorWriter:
         """Write the file. If Ctrl-C interrupts this, there is no incomplete file."""
         demos = TensorDict.cat(self.episodes)
         lengths = torch.tensor([len(episode) for episode in self.episodes])
-        numbers = torch.arange(len(lengths)).repeat_interleave(lengths)
-        demos["collector", "traj_ids"] = numbers
+        episode_ids = torch.arange(len(lengths)).repeat_interleave(lengths)
+        demos["collector", "traj_ids"] = episode_ids
         save(self.path, demos.to_dict())
         return str(self.path)
 
