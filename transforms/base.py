@@ -111,7 +111,7 @@ class BufferTransform(envs.Transform):
         ignored = "action", "collector", "index", SERIAL_KEY, self.trajectory_key
         warned: set[str] = set()
         self._check_written = DataCheck(self._rewriter, ignored, warned)
-        # Transforms before this one in the buffer may add entries to sampled batches.
+        # A second check, because other transforms may have added entries when sampling.
         self._check_sampled = DataCheck(self._rewriter, ignored, warned)
         self._memory = GoalMemory()
         self._generator: torch.Generator | None = None
@@ -341,7 +341,7 @@ class BufferTransform(envs.Transform):
         return f"{type(self).__name__}({', '.join(options)})"
 
     def end_trajectories(self) -> None:
-        """Ends all trajectories: the next row of each id begins another one."""
+        """Ends all trajectories: the next row of each id begins a new trajectory."""
         with self._lock:
             self._memory.end_trajectories()
 

@@ -53,7 +53,7 @@ class GoalMemory:
                     `_goals[40 + 6]` holds the goals of the trajectory's next step
 
     Each trajectory has a block of successive rows in `_goals`. If the block is full,
-    its goals move to a larger block.
+    the remembered goals move to another block.
 
     A new transition continues the open trajectory with the same id. (A trajectory is
     open until one of its transitions is done.) But a second collector may reuse an id
@@ -78,7 +78,7 @@ class GoalMemory:
         # Column 0 holds achieved goals. Column 1 holds desired goals, if a strategy
         # draws from them. The shape is (rows, 1 or 2, *goal).
         self._goals: Goals = np.zeros((0, 1), dtype=np.float32)
-        self._num_rows = 0  # rows of `_goals` that belong to a block, used or free
+        self._num_block_rows = 0  # rows of `_goals` in blocks, also in free ones
         self._free_blocks: dict[int, list[int]] = {}  # block size -> first rows
 
     def write(
@@ -116,7 +116,7 @@ class GoalMemory:
         self._trajectories["end"][numbers] = steps + 1
         exceeds_block = steps >= self._trajectories["limit"].take(numbers)
         for number in set(numbers[exceeds_block].tolist()):
-            self._enlarge_block(number)
+            self._move_block(number)
         rows = self._trajectories["offset"].take(numbers) + steps
         for column, values in enumerate(goals):
             self._goals[rows, column] = values
@@ -157,7 +157,7 @@ class GoalMemory:
             self._free_numbers = [*range(size, len(self._trajectories))]
         return self._free_numbers.pop()
 
-    def _enlarge_block(self, number: int) -> None:
+    def _move_block(self, number: int) -> None:
         """Moves a trajectory's goals to a block that has room for all its steps."""
         first, end, offset, limit, _ = self._trajectories[number].tolist()
         goals = self._goals[offset + first : offset + limit].copy()
@@ -167,9 +167,9 @@ class GoalMemory:
         size = 1 << max(_MIN_BLOCK - 1, 9 * (end - first) // 8).bit_length()
         free_blocks = self._free_blocks.setdefault(size, [])
         if not free_blocks:
-            free_blocks.append(self._num_rows)
-            self._num_rows += size
-            self._goals = _grow(self._goals, self._num_rows)
+            free_blocks.append(self._num_block_rows)
+            self._num_block_rows += size
+            self._goals = _grow(self._goals, self._num_block_rows)
         block = free_blocks.pop()
         self._goals[block : block + len(goals)] = goals
         self._trajectories[number] = first, end, block - first, first + size, block
@@ -224,7 +224,7 @@ class GoalMemory:
         return np.isin(self.find(serials)[0], open_numbers)
 
     def end_trajectories(self) -> None:
-        """Ends all trajectories: the next row of each id begins another one."""
+        """Ends all trajectories: the next row of each id begins a new trajectory."""
         self._open.clear()
 
     def draw(
@@ -282,7 +282,7 @@ class GoalMemory:
             "_table": torch.from_numpy(trajectories.copy()),
             "_unused": self._free_numbers.copy(),
             "_goals": torch.from_numpy(self._goals.copy()),
-            "_used": self._num_rows,
+            "_used": self._num_block_rows,
             "_free_regions": copy.deepcopy(self._free_blocks),
         }
 
@@ -304,7 +304,7 @@ class GoalMemory:
         self._ring = to_array(state["_ring"]).view(_POSITION).ravel()
         self._trajectories = to_array(state["_table"]).view(_TRAJECTORY).ravel()
         self._free_numbers = [*state["_unused"]]
-        self._goals, self._num_rows = to_array(state["_goals"]), state["_used"]
+        self._goals, self._num_block_rows = to_array(state["_goals"]), state["_used"]
         self._free_blocks = copy.deepcopy(state["_free_regions"])
 
     def __getstate__(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from torch_panda.transforms.strategies import Integers, draw_uniform
 
 
 class HindsightRelabel(SampleTimeTransform):
-    """Gives sampled transitions goals that were achieved later in their trajectory.
+    """Gives sampled transitions hindsight goals.
 
     Hindsight experience replay (Andrychowicz et al. 2017, arXiv 1707.01495): a random
     fraction `her_ratio` of the sampled rows gets another goal, with the reward of that
@@ -39,8 +39,8 @@ class HindsightRelabel(SampleTimeTransform):
             arXiv 1906.03710).
         **options: `unit` and `capacity` (see `SampleTimeTransform`), and arguments of
             `BufferTransform`. If the buffer has a `SliceSampler`, make the sampler
-            with `truncated_key=None`. Otherwise it overwrites "terminated" and "done"
-            of relabelled rows.
+            with `truncated_key=None`. Otherwise it overwrites "terminated", "truncated"
+            and "done" of relabelled rows.
 
     Raises:
         TypeError: An argument is unknown.
@@ -95,7 +95,8 @@ class HindsightRelabel(SampleTimeTransform):
         """
         u = draw_uniform(len(last_serials), self._generator)
         is_chosen = u < self.her_ratio
-        # A row that another thread has overwritten since it was sampled keeps its goal.
+        # A row that another thread has overwritten since it was sampled keeps its goal,
+        # and so does its slice.
         is_forgotten = serials < self._memory.oldest
         is_chosen[is_forgotten if units is None else units[is_forgotten]] = False
         chosen_units = is_chosen.nonzero()[0]

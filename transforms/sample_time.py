@@ -28,8 +28,8 @@ class SampleTimeTransform(BufferTransform):
             goal for all rows of a sampled slice. It is drawn for the last of these
             rows, so that a "future" goal lies in the future of all of them.
         capacity: Number of transitions to remember, for a transform that is called
-            without a buffer. With a buffer, the transform remembers the transitions
-            that the buffer holds.
+            without a buffer or in a `ReplayBufferEnsemble`. Otherwise the transform
+            remembers the transitions that the buffer holds.
         **options: Other arguments of `BufferTransform`.
     """
 
@@ -92,12 +92,13 @@ class SampleTimeTransform(BufferTransform):
                 self._rewriter.check_entries(tensordict)
                 self._warn_of_slices(buffer)
             self._check_sampled(tensordict)
+            # A strategy that looks ahead never draws an overwritten step.
             if not all(m.only_looks_ahead for m in self._get_mixtures()):
                 self._memory.forget(oldest)
             serials = tags.numpy(force=True).reshape(-1)
             drawn = self._draw(serials, tensordict)
-        # `_sample` returns a copy, which may be changed in place. Other methods may
-        # return the storage itself, or a lazy stack.
+        # The buffer's `_sample` returns a copy, which may be changed in place. Other
+        # methods of the buffer may return the storage itself, or a lazy stack.
         is_copy = method == "_sample" and type(tensordict) is TensorDict
         inplace = is_copy and tensordict.ndim == 1
         batch = self._write(tensordict, drawn, inplace=inplace)
@@ -120,12 +121,15 @@ class SampleTimeTransform(BufferTransform):
         """Writes the goals that `_draw` returned into the batch, or into a copy."""
 
     def _find_oldest(self, buffer: ReplayBuffer | None) -> int:
-        """Returns the serial number of the oldest transition that the buffer holds."""
+        """Returns the serial number of the oldest transition that the buffer holds.
+
+        It is negative if the buffer holds transitions that were not remembered.
+        """
         stored, (before, written) = self._count_stored(buffer), self._last_write
         size = 0 if buffer is None else getattr(buffer.storage, "max_size", 0)
-        # Another thread may be in the middle of `extend`. The memory then counts its
-        # transitions already, but the length of the storage has not grown yet, so add
-        # them. (The length of a full storage never grows.)
+        # Another thread may be in the middle of `extend`. Then the memory already
+        # counts the new transitions, but the storage does not, so add them. (The length
+        # of a full storage never grows.)
         if stored == before < size:
             stored += written
         return self._memory.count - stored

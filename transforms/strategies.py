@@ -32,7 +32,7 @@ StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
 RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
 # These strategies draw the transition's own step or a later one. A buffer overwrites
-# old transitions first, so it still holds these steps.
+# old transitions first, so it still holds the drawn step.
 LOOKING_AHEAD = ("current", "future", "geometric", "final")
 NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
 
