@@ -284,6 +284,23 @@ def expectile_loss(diff: Tensor, advantage: Tensor, expectile: float) -> Tensor:
     return weight * diff.square()
 
 
+def ensemble_loss(q: Tensor, v: Tensor, v_target: Tensor, expectile: float) -> Tensor:
+    """Expectile regression of the two values of an `Ensemble`, a scalar.
+
+    HIQL's paper (2307.11949, eq. 4) has one value function. Here there are two, as in
+    OGBench, and each regresses to its own target. The sign of their common advantage
+    sets the weight of both squared errors.
+
+    Args:
+        q: Targets r + discount * V(s', g) of the target networks, (2, n).
+        v: Values V(s, g), (2, n).
+        v_target: Values V(s, g) of the target networks, (2, n).
+        expectile: See `expectile_loss`.
+    """
+    advantage = q.amin(0) - v_target.mean(0)
+    return expectile_loss(q - v, advantage, expectile).sum(0).mean()
+
+
 def weighted_regression(log_probs: Tensor, advantage: Tensor, alpha: float) -> Tensor:
     """Advantage-weighted regression, a scalar (2110.06169, eq. 7).
 

@@ -24,7 +24,7 @@ from torch_panda.learning.offline.base import (
     Ensemble,
     OfflineAgent,
     OfflineHyperparameters,
-    expectile_loss,
+    ensemble_loss,
     log_prob,
     move_towards,
     weighted_regression,
@@ -67,12 +67,8 @@ class GCIVL(OfflineAgent):
         x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * self.target_value(x_next)  # (2, n)
-            # The paper has one value function. Here there are two, as in OGBench. Each
-            # regresses to its own target. The sign of this advantage sets the weight of
-            # both squared errors.
-            advantage = q.amin(0) - self.target_value(x).mean(0)
-        diff = q - self.value(x)
-        return expectile_loss(diff, advantage, self.hp.expectile).sum(0).mean()
+            v_target = self.target_value(x)
+        return ensemble_loss(q, self.value(x), v_target, self.hp.expectile)
 
     def actor_loss(self, b: Batch) -> Tensor:
         """Weighted imitation with A = V(s', g) - V(s, g) (2307.11949, eq. 5)."""

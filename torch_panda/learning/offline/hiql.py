@@ -30,7 +30,7 @@ from torch_panda.learning.offline.base import (
     Ensemble,
     OfflineAgent,
     OfflineHyperparameters,
-    expectile_loss,
+    ensemble_loss,
     log_prob,
     make_gelu_mlp,
     move_towards,
@@ -148,9 +148,8 @@ class HIQL(OfflineAgent):
         x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * target(x_next)  # (2, n)
-            advantage = q.amin(0) - target(x).mean(0)
-        loss = expectile_loss(q - value(x), advantage, self.hp.expectile)
-        return loss.sum(0).mean()
+            v_target = target(x)
+        return ensemble_loss(q, value(x), v_target, self.hp.expectile)
 
     def waypoint_value_loss(
         self, s: Tensor, s_next: Tensor, w: Tensor, is_at_w: Tensor
@@ -161,9 +160,9 @@ class HIQL(OfflineAgent):
             v_next = value(s_next, self.represent(phi, s_next, w))
             # -1 per step, until s' is the waypoint: then 0, and the return ends.
             q = ~is_at_w * (self.hp.discount * v_next - 1)
-            advantage = q.amin(0) - value(s, self.represent(phi, s, w)).mean(0)
+            v_target = value(s, self.represent(phi, s, w))
         v = self.waypoint_value(s, self.represent(self.phi, s, w))
-        return expectile_loss(q - v, advantage, self.hp.expectile).sum(0).mean()
+        return ensemble_loss(q, v, v_target, self.hp.expectile)
 
     def high_actor_loss(self, b: Batch, s: Tensor, w: Tensor) -> Tensor:
         """Weighted imitation of waypoints, A = V(w, g) - V(s, g) (eq. 6)."""
