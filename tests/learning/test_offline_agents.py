@@ -247,7 +247,7 @@ def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, acto
     assert torch.equal(low[:, 1], torch.minimum(step[t] + 4, last).float())
     assert torch.equal(high[:, 1], torch.minimum(step[t] + 4, goal[:, 1]))
     is_own = (value == names[t]).all(-1)
-    assert torch.equal(is_own, batch["is_at_waypoint"])
+    assert torch.equal(is_own, batch["reaches_waypoint"])
     assert 0.2 < is_own.float().mean() < 0.5
 
 

@@ -38,7 +38,7 @@ from torch_panda.learning.offline.base import (
 )
 from torch_panda.learning.offline.data import OfflineData
 from torch_panda.learning.spaces import Spaces
-from torch_panda.transforms.strategies import draw_geometric
+from torch_panda.transforms.strategies import choose_steps
 
 
 @dataclass
@@ -91,49 +91,47 @@ class HIQL(OfflineAgent):
         )
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
-        """Draw a goal for the high level, and one waypoint for each of three losses.
+        """Draw a waypoint for each of three losses.
 
         The three losses are those of the high-level policy, the low-level policy and
-        the values of waypoints. Row t of the data holds a state s and the next state
-        s', so the state k steps after s is s' of row t + k - 1. The waypoint of the
-        high level does not lie beyond its goal, and the waypoint of the low level does
-        not lie beyond the end of the episode.
+        the values of waypoints. The waypoint of the low level does not lie beyond the
+        end of the episode. The waypoint of the high level does not lie beyond its goal,
+        which is drawn again, because its row must be known.
         """
-        t = batch["index"]
-        last = data.last[t]
-        # The goal of the high level is the goal achieved in `goal_row`, which is drawn
-        # from row t to the last row of the episode.
-        if self.hp.actor_goal == "future":
-            goal_row = t + (torch.rand(t.shape) * (last - t + 1)).long()
-        else:
-            goal_row = draw_geometric_rows(t, last, self.hp.discount)
+        t = batch["index"].cpu()
+        last = data.last[t].cpu()
+        goal_row = draw_rows(self.hp.actor_goal, t, last, self.hp.discount)
+        # Row t holds a state s and the next state s', so the state k steps after s is
+        # s' of row t + k - 1.
         waypoint_row = t + self.hp.subgoal_steps - 1
-        # The waypoint for the loss of V(s, phi(s, w)) is s' of row t, of a row drawn by
-        # `draw_geometric_rows`, or of a random row. VALUE_GOALS holds the probabilities
-        # of the three.
-        geometric = draw_geometric_rows(t, last, self.hp.discount)
-        random = torch.randint(len(data), t.shape)
-        weights = torch.tensor([*VALUE_GOALS.values()])
+        # The waypoint for the loss of V(s, phi(s, w)) is s' of a row that is drawn like
+        # the goals of V(s, g).
+        rows = {
+            "current": t,
+            "geometric": draw_rows("geometric", t, last, self.hp.discount),
+            "random": torch.randint(len(data), t.shape),
+        }
+        weights = torch.tensor([VALUE_GOALS[strategy] for strategy in rows])
         choice = torch.multinomial(weights, len(t), replacement=True)
-        value_row = torch.stack([t, geometric, random]).gather(0, choice[None])[0]
+        value_row = torch.stack([*rows.values()]).gather(0, choice[None])[0]
 
         observation = data.rows["next", "observation"]
         batch["actor_goal"] = data.rows["next", "achieved_goal"][goal_row]
         batch["high_waypoint"] = observation[waypoint_row.minimum(goal_row)]
         batch["low_waypoint"] = observation[waypoint_row.minimum(last)]
         batch["value_waypoint"] = observation[value_row]
-        batch["is_at_waypoint"] = value_row == t
+        batch["reaches_waypoint"] = value_row == t
         return batch
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """The losses of both values and both policies."""
         b = Batch.from_tensordict(batch)
         s, s_next = self.normalizer.state(b.s), self.normalizer.state(b.s_next)
-        w, is_at_w = batch["value_waypoint"], batch["is_at_waypoint"]
+        w, reaches_w = batch["value_waypoint"], batch["reaches_waypoint"]
         high_w, low_w = batch["high_waypoint"], batch["low_waypoint"]
         return {
             "goal_value_loss": self.goal_value_loss(b),
-            "waypoint_value_loss": self.waypoint_value_loss(s, s_next, w, is_at_w),
+            "waypoint_value_loss": self.waypoint_value_loss(s, s_next, w, reaches_w),
             "high_actor_loss": self.high_actor_loss(b, s, high_w),
             "low_actor_loss": self.low_actor_loss(b.a, s, s_next, low_w),
         }
@@ -152,14 +150,14 @@ class HIQL(OfflineAgent):
         return ensemble_loss(q, value(x), v_target, self.hp.expectile)
 
     def waypoint_value_loss(
-        self, s: Tensor, s_next: Tensor, w: Tensor, is_at_w: Tensor
+        self, s: Tensor, s_next: Tensor, w: Tensor, reaches_w: Tensor
     ) -> Tensor:
         """Expectile regression of V(s, phi(s, w)), which trains phi (section 5.2)."""
         phi, value = self.target["phi"], self.target["waypoint_value"]
         with torch.no_grad():
             v_next = value(s_next, self.represent(phi, s_next, w))
             # -1 per step, until s' is the waypoint: then 0, and the return ends.
-            q = ~is_at_w * (self.hp.discount * v_next - 1)
+            q = ~reaches_w * (self.hp.discount * v_next - 1)
             v_target = value(s, self.represent(phi, s, w))
         v = self.waypoint_value(s, self.represent(self.phi, s, w))
         return ensemble_loss(q, v, v_target, self.hp.expectile)
@@ -210,10 +208,10 @@ class HierarchicalActor(nn.Module):
         return self.low_actor(self.normalizer.state(s), z)
 
 
-def draw_geometric_rows(t: Tensor, last: Tensor, discount: float) -> Tensor:
-    """Draw rows t + k up to ``last``, with probability proportional to discount**k."""
-    steps = draw_geometric((last - t + 1).numpy(), discount, None)
-    return t + torch.from_numpy(steps)
+def draw_rows(strategy: str, t: Tensor, last: Tensor, discount: float) -> Tensor:
+    """Draw rows from t to ``last`` by a strategy of `GoalSampler`, (n,)."""
+    step, end = t.numpy(), last.numpy() + 1
+    return torch.from_numpy(choose_steps(strategy, step, step, end, discount, None))
 
 
 def normalize_length(z: Tensor) -> Tensor:
