@@ -21,7 +21,7 @@ from torch_panda.bullet.state import SimulationState
 
 
 class NativeLoop:
-    """Steps and resets clients in threads of ``loop.c``, which this object owns.
+    """Owns the C threads of ``loop.c``, which step and reset the clients.
 
     Args:
         clients: The clients.
@@ -64,8 +64,8 @@ class NativeLoop:
         self._state = state
         # Outcome of each client's last step or reset. The field `expected` is 0 if
         # nothing failed, DIVERGED if the state is not finite, and CLIENT_CLOSED if the
-        # client is closed. If a command failed, it is the status code that the command
-        # should have returned.
+        # client is closed. Otherwise a command failed, and `expected` is the status
+        # code of its success.
         self._failures = (native.Failure * n)()
         # A ctypes struct keeps alive the objects that it points to. It has only the
         # addresses of tensors, so `self._state` keeps the tensors alive.
@@ -77,9 +77,10 @@ class NativeLoop:
             state.marker_pose.data_ptr(),
             self._failures,
         )
+        # The control and the setpoints of the last step, and their conversions for C.
+        self._motor_control: MotorControl | None = None
         self._control = native.Control()
-        self._motor_control: MotorControl | None = None  # the source of _control
-        self._setpoint: Doubles | None = None  # of the last step
+        self._setpoint: Doubles | None = None
         self._setpoint_address = 0
         self._loop: int | None = None
         self._process = os.getpid()
@@ -152,17 +153,18 @@ class NativeLoop:
 
     def _convert(self, control: MotorControl) -> native.Control:
         return native.Control(
-            -1 if control.ik_link is None else control.ik_link,
-            control.num_arm_joints,
-            control.setpoint_dim,
-            control.ik_orientation is None,
-            native.ARM_MODES[control.arm_mode],
-            self._physics.ik_iterations,
-            control.ik_orientation or (),
-            self._physics.position_gain,
-            VELOCITY_GAIN,
-            doubles(control.forces),
-            doubles([self._physics.ik_damping] * len(control.forces)),
+            ik_link=-1 if control.ik_link is None else control.ik_link,
+            num_arm_joints=control.num_arm_joints,
+            setpoint_size=control.setpoint_dim,
+            # Setpoints contain the orientation unless the control fixes it.
+            has_orientation=control.ik_orientation is None,
+            arm_mode=native.ARM_MODES[control.arm_mode],
+            ik_iterations=self._physics.ik_iterations,
+            orientation=control.ik_orientation or (),
+            position_gain=self._physics.position_gain,
+            velocity_gain=VELOCITY_GAIN,
+            forces=doubles(control.forces),
+            ik_damping=doubles([self._physics.ik_damping] * len(control.forces)),
         )
 
     def _raise_first_error(self, envs: Sequence[int]) -> None:

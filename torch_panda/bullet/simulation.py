@@ -32,6 +32,7 @@ class VectorSimulation:
     Raises:
         BulletError: ``build`` built a different scene in a later client.
         TypeError: ``build`` did not return a `Scene`.
+        ImportError: The C library was compiled from other sources.
         ValueError: The environment variable ``TORCH_PANDA_LOOP`` is neither "native"
             (threads of C step the clients) nor "ctypes" (Python threads step them),
             or it is "native" and the C library is missing.
@@ -155,8 +156,8 @@ class VectorSimulation:
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
             if self._native is not None:
-                # `WorkerPool.run` waits for its threads after a first Ctrl-C, but not
-                # after a second one. So they may still be using clients.
+                # After a second Ctrl-C, the pool's threads may still use clients; see
+                # `WorkerPool.run`.
                 self._pool.wait()
                 return self._native.step(control, setpoint, envs)
 
@@ -186,7 +187,7 @@ class VectorSimulation:
         """
         self._pool.run(work, envs)
 
-    def reset(self, envs: Sequence[int], vary: Work | None = None) -> None:
+    def reset(self, envs: Sequence[int], randomize: Work | None = None) -> None:
         """Move the bodies of clients to the start of an episode.
 
         Before the call, write the start into the tensors of `state`. The reset moves
@@ -198,28 +199,27 @@ class VectorSimulation:
 
         Args:
             envs: Indices of the clients to reset.
-            vary: Function that gets the index of an environment, and changes the
-                physics of its client. It is called before the reset, in the same
-                thread.
+            randomize: Called with the index of each environment before its reset, in
+                the same thread, to change the physics of its client.
 
         Raises:
-            WorkerError: Bullet or ``vary`` failed in one or more clients. The error
-                names the first of them. Every client that did not fail was reset.
+            WorkerError: Bullet or ``randomize`` failed in one or more clients. The
+                error names the first of them. Every client that did not fail was reset.
         """
-        if self._native is not None and vary is None:
+        if self._native is not None and randomize is None:
             self._pool.wait()
             self._native.reset(envs)
             return
 
         def reset_one(env: int) -> None:
-            if vary is not None:
-                vary(env)
+            if randomize is not None:
+                randomize(env)
             if self._native is not None:
                 self._native.reset_one(env)
                 return
             client = self._clients[env]
             self._broad_phases[env].restore()
-            self.state.place(env, client)
+            self.state.place_bodies(env, client)
             self.state.read(env, client)
 
         self._pool.run(reset_one, envs)

@@ -93,7 +93,7 @@ class SimulationState:
             return []
         return (~self.rows.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
-    def place(self, env: int, client: PhysicsClient) -> None:
+    def place_bodies(self, env: int, client: PhysicsClient) -> None:
         """Move the bodies of a client to the state in the tensors."""
         scene = self._scene
         positions = self.joint_position[env].tolist()

@@ -217,7 +217,7 @@ class Episodes:
                 tensors = self._starts.state()
                 for key, value in (start_state.start or start_state.values).items():
                     tensors[key][envs] = value
-            self._place(envs)
+            self._start_episodes(envs)
             if start_state is not None and start_state.start:
                 self._repeat_actions(envs, start_state)
             self._needs_reset.difference_update(envs)
@@ -322,13 +322,13 @@ class Episodes:
 
     # ---- parts of a step and of a reset --------------------------------------------
 
-    def _place(self, envs: list[int]) -> None:
-        """Move the bodies to the starts of episodes that the state tensors hold."""
+    def _start_episodes(self, envs: list[int]) -> None:
+        """Start the episodes whose starts are in the state tensors."""
         self._starts.place_markers(envs)
         self._history.begin(envs)
         if self._goal_observer is not None:
             self._goal_observer.update(envs, self._starts.goal)
-        self._starts.place(envs)
+        self._starts.reset_simulation(envs)
         self._observer.after_reset(envs)
 
     def _observe(self, action: Tensor | None = None) -> Observed:
@@ -411,7 +411,7 @@ class Episodes:
         for env in envs:
             self.simulation.rebuild(env)
             self._starts.draw(env)
-        self._place(envs)
+        self._start_episodes(envs)
         if self.on_divergence == "raise":
             raise BulletError(
                 f"the physics of environments {envs} diverged: their state was not "

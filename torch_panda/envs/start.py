@@ -129,8 +129,8 @@ class EpisodeStarts:
             poses[env, :, :3] = goals[env].reshape(-1, 3)
             poses[env, :, 3:] = NO_ROTATION
 
-    def place(self, envs: list[int]) -> None:
-        """Reset the simulation to the state tensors."""
+    def reset_simulation(self, envs: list[int]) -> None:
+        """Reset the clients of some environments to the state tensors."""
         randomizer = self._randomizer
         self._simulation.reset(
             envs, randomizer.apply if randomizer.changes_physics else None
