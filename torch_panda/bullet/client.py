@@ -81,7 +81,7 @@ class PhysicsClient:
 
     Attributes:
         connection: The connection to Bullet, for commands that this class lacks.
-        native: The struct through which the native loop uses the client.
+        native: The struct through which the C threads of `NativeLoop` use the client.
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
@@ -96,9 +96,9 @@ class PhysicsClient:
         self._blueprint: list[Command] = []
         self._is_recording = True
         # Check that Bullet's status codes are those of `capi`. New versions of Bullet
-        # insert codes in the middle of the list, which shifts all higher codes.
-        # Collision detection has the highest code that torch_panda uses, so it fails
-        # after any such shift.
+        # insert codes in the middle of the list, which shifts all higher codes. One
+        # collision detection is enough as a check, because it has the highest code that
+        # torch_panda uses.
         try:
             self.detect_collisions()
         except BulletError as error:
@@ -395,10 +395,9 @@ class PhysicsClient:
     def set_joint_friction(self, body: int, joint: int, force: float) -> None:
         """Set the friction [N m] or [N] of a joint that nothing else controls.
 
-        Bullet imitates friction by a motor with target velocity 0 and maximum force
-        ``force``. Without this call, Bullet's default motor applies an impulse of
-        up to 1 N m s or 1 N s per substep. With the default substep of 2 ms, this
-        equals 500 N m or 500 N.
+        Every joint has a motor that brakes it. This call sets the largest force of this
+        motor. Bullet's default is an impulse of 1 N m s or 1 N s per substep, which is
+        500 N m or 500 N at the default substep of 2 ms.
 
         Raises:
             ValueError: The force is negative or not finite.
@@ -421,7 +420,7 @@ class PhysicsClient:
 
         Two links A and B can touch if ``group_A & mask_B`` or ``group_B & mask_A`` is
         not 0. (One of them suffices in pybullet; Bullet's own default needs both.)
-        Resets restore the filter that was set while the scene was built.
+        `VectorSimulation.reset` restores the filters that were set during building.
 
         Bullet removes the link from the broad phase and inserts it again, so the link
         loses its present overlaps and contacts.
@@ -501,7 +500,7 @@ class PhysicsClient:
         self._record(SetPhysics("set_gravity", (gravity,)))
 
     def save(self) -> int:
-        """Take a snapshot of all poses, velocities and contacts; return its id."""
+        """Take a snapshot of all poses and velocities, for `load`; return its id."""
         command = capi.save_init(self.connection.handle)
         status = self.connection.submit(
             command, capi.CMD_SAVE_STATE_COMPLETED, "save a state"
@@ -623,11 +622,10 @@ class PhysicsClient:
         """Contacts of the last substep.
 
         Args:
-            body_a: Return only contacts of this body, reversed where necessary, so that
-                this body is body a. None returns the contacts of all bodies as Bullet
-                stores them.
-            body_b: Of these contacts, return only those whose body b is this body; None
-                returns all.
+            body_a: Only contacts of this body, with the two bodies swapped where
+                necessary, so that this body is a. None means all contacts, unswapped.
+            body_b: Only contacts whose body b is this one (after swapping). None means
+                any body b.
         """
         from torch_panda.bullet.contacts import read_contact
 
