@@ -470,34 +470,10 @@ def test_padded_slices():
         assert (pieces == pieces[:, :1]).all()
 
 
-class SumTree(np.ndarray):
-    """Stands in for the tree of torchrl's compiled extension."""
-
-    def __new__(cls, size):
-        return np.zeros(size, np.float32).view(cls)
-
-    def query(self, first, end):
-        return self[first:end].sum()
-
-    def scan_lower_bound(self, mass):
-        return np.searchsorted(np.cumsum(self), mass)
-
-
-class MinTree(SumTree):
-    def query(self, first, end):
-        return self[first:end].min()
-
-
-@pytest.fixture
-def segment_trees(monkeypatch):
-    """Trees for prioritised samplers where torchrl's extension does not load."""
-    if prioritized.SumSegmentTreeFp32 is None:  # torchrl 0.14 with torch below 2.14
-        for dtype in ("Fp32", "Fp64"):
-            monkeypatch.setattr(prioritized, f"SumSegmentTree{dtype}", SumTree)
-            monkeypatch.setattr(prioritized, f"MinSegmentTree{dtype}", MinTree)
-
-
-@pytest.mark.usefixtures("segment_trees")
+@pytest.mark.skipif(
+    prioritized.SumSegmentTreeFp32 is None,
+    reason="torchrl 0.14's compiled extension needs torch 2.14 or later",
+)
 def test_prioritized_sampler():
     def make(transform):
         return buffer(
