@@ -31,8 +31,6 @@ from torch_panda.learning.offline.base import (
 )
 from torch_panda.learning.spaces import Spaces
 
-ContrastiveLoss = Literal["binary", "infonce"]
-
 
 @dataclass
 class CRLHyperparameters(OfflineHyperparameters):
@@ -43,10 +41,6 @@ class CRLHyperparameters(OfflineHyperparameters):
 
     algo: Literal["crl"] = "crl"
     """algorithm"""
-    contrastive_loss: ContrastiveLoss = "binary"
-    """"binary", as in the paper, decides for each pair of (s, a) and goal whether the
-    two belong together. "infonce" chooses the goal of each (s, a) among the goals of
-    the batch, and the (s, a) of each goal"""
     alpha: Weight = 0.1
     """weight of the imitation in the policy's loss"""
     latent_size: Positive = 128
@@ -80,7 +74,7 @@ class CRL(OfflineAgent):
         # Row i of the logits has (s, a) of row i, column j the goal of row j.
         logits = phi @ psi.mT / sqrt(self.hp.latent_size)  # (2, n, n)
         return {
-            "critic_loss": contrastive_loss(logits, self.hp.contrastive_loss),
+            "critic_loss": contrastive_loss(logits),
             "actor_loss": self.actor_loss(b),
         }
 
@@ -100,19 +94,11 @@ class CRL(OfflineAgent):
         return ascend_and_imitate(f, log_prob(mean, b.a), self.hp.alpha)
 
 
-def contrastive_loss(logits: Tensor, kind: ContrastiveLoss) -> Tensor:
-    """Tell the pairs on the diagonal from the others.
+def contrastive_loss(logits: Tensor) -> Tensor:
+    """NCE loss of section 4.2: tell the pairs on the diagonal from the others.
 
     Args:
         logits: f of every (s, a) with every goal of a batch, (..., n, n).
-        kind: "binary" for the NCE loss of section 4.2, "infonce" for the mean of the
-            cross entropies of rows and columns.
     """
-    n = logits.shape[-1]
-    if kind == "binary":
-        labels = torch.eye(n, device=logits.device).expand_as(logits)
-        return functional.binary_cross_entropy_with_logits(logits, labels)
-    of_rows, of_columns = (
-        -logits.log_softmax(dim).diagonal(dim1=-2, dim2=-1).mean() for dim in (-1, -2)
-    )
-    return (of_rows + of_columns) / 2
+    labels = torch.eye(logits.shape[-1], device=logits.device).expand_as(logits)
+    return functional.binary_cross_entropy_with_logits(logits, labels)
