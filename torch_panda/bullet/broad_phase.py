@@ -27,13 +27,13 @@ from torch_panda.bullet.client import PhysicsClient
 from torch_panda.rotations import rotate_vector
 
 # Position to which `restore` moves all bodies before it inserts their links into the
-# tree of AABBs again, one by one [m]. The position is so far from the scene that links
-# that are still there do not affect where in the tree Bullet inserts the others.
+# tree of AABBs again, one by one [m]. It is so far from the scene that links still
+# waiting there do not affect where in the tree Bullet inserts a link of the scene.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
-# `restore` restores the number of detections modulo this cycle, that is, its lowest 8
-# bits. A detection reads one bit per level of the tree. The trees of the shipped tasks
-# have up to 11 levels, but only the lowest 6 bits had an effect in 120 episodes. Each
-# further bit would double the number of detections that a reset needs.
+# `restore` restores the number of detections modulo this cycle: its lowest 8 bits. A
+# detection reads one bit per level of the tree, and the trees of the shipped tasks have
+# up to 11 levels. 8 bits are a compromise: only the lowest 6 had an effect in 120
+# episodes, and each further bit would double the detections that a reset needs.
 _DETECTION_CYCLE = 256
 
 _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing
@@ -74,12 +74,12 @@ class BroadPhase:
                 client.set_collision_filter(body, link, *_NO_CONTACTS)
         self._built = client.save()
         for body, poses in bodies.items():
-            self._read_links(body, poses)
+            self._plan_links(body, poses)
         for body in bodies:
             client.set_base(body, _FAR_AWAY)
         self._away = client.save()
-        # Two bodies. For one detection, `restore` lets only their bases overlap.
-        self._overlapping = client.bodies[:2]
+        # The two bodies whose overlap moves the cursor to the start; see `restore`.
+        self._pair = client.bodies[:2]
         client.native.broad_phase = pointer(self._describe())
         self.restore()
 
@@ -97,13 +97,13 @@ class BroadPhase:
             client.set_collision_filter(body, link, *_NO_CONTACTS)
         # Move the cursor back to the start of the list of pairs. A detection advances
         # the cursor modulo the number of pairs, so with exactly one pair it becomes 0.
-        for body in self._overlapping:
+        for body in self._pair:
             client.set_collision_filter(body, -1, *capi.FILTER_DYNAMIC)
         client.detect_collisions()
-        for body in self._overlapping:
+        for body in self._pair:
             client.set_collision_filter(body, -1, *_NO_CONTACTS)
-        # Advance the number of detections until it exceeds the number after building by
-        # a multiple of the cycle. While nothing overlaps, a detection takes about 1 us.
+        # Run detections until their number is that after building, modulo the cycle.
+        # While nothing overlaps, a detection takes about 1 us.
         num_since_built = client.num_detections - self._num_detections
         client.detect_collisions(-num_since_built % _DETECTION_CYCLE)
         for body, link, group_mask, snapshot in self._links:
@@ -113,27 +113,29 @@ class BroadPhase:
 
     def _describe(self) -> native.BroadPhase:
         """The struct with which ``reset.c`` does the same as `restore`."""
-        links = [native.Link(b, k, *filters, s) for b, k, filters, s in self._links]
+        links = [
+            native.Link(body, link, *group_mask, snapshot)
+            for body, link, group_mask, snapshot in self._links
+        ]
         return native.BroadPhase(
             self._num_detections,
             _DETECTION_CYCLE,
             self._away,
             self._built,
             len(links),
-            len(self._overlapping),
-            self._overlapping,
+            len(self._pair),
+            self._pair,
             (native.Link * len(links))(*links),
         )
 
-    def _read_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
+    def _plan_links(self, body: int, poses: list[tuple[float, ...]]) -> None:
         """Append a body's base and links to the list of links to insert.
 
-        While Bullet's URDF importer builds a body, it inserts the AABB of each link as
-        if the link's centre of mass were at the origin of the link's frame. At the end,
-        it moves the links to their poses without updating their AABBs. A link's AABB is
-        therefore displaced by the vector from its centre of mass to the origin of its
-        frame. To insert the same AABB again, `restore` loads a snapshot in which the
-        whole body is displaced by this vector.
+        Bullet's URDF importer inserts the AABB of a link as if the link's centre of
+        mass were at the origin of the link's frame. So the AABB is displaced by the
+        vector from the centre of mass to that origin. To insert the same AABB again,
+        `restore` loads a snapshot in which the whole body is displaced by this vector.
+        This method displaces the body for the snapshots and does not move it back.
 
         If a link's inertial frame is rotated, the importer also inserts the link with a
         different orientation. This method does not imitate that, because no shipped
