@@ -1,13 +1,14 @@
-"""Decides whether this package's solver replaces Bullet's, and installs it.
+"""Decides whether torch_panda's solver replaces Bullet's, and installs it if so.
 
-The replacement depends on the layout of Bullet's objects in memory. It is used only if
-all of these conditions hold; otherwise Bullet's own functions run:
+The solver of torch_panda is called "packed", because it packs the constraint rows
+into contiguous memory. It depends on the layout of Bullet's objects in memory, and is
+used only if all of these conditions hold; otherwise Bullet's own functions run:
 
 1. ``TORCH_PANDA_SOLVER`` is not ``bullet``.
 2. The process runs on x86-64 Linux. Compilers for other platforms fuse a multiplication
    with an addition, which rounds differently.
 3. The installed pybullet has the supported version.
-4. torch_panda was installed with its C library, compiled from the same sources.
+4. torch_panda was installed with its C library, compiled from sources of this version.
 5. pybullet's extension module has the symbols that are needed, and each table of
    virtual functions (vtable) has exactly one slot with the function to replace.
 6. In a known scene, Bullet's objects have the layout that ``bullet_types.h`` declares.
@@ -87,8 +88,8 @@ _REPLACED = (
         "P12btDispatcher",
     ),
 )
-# ctypes knows the address of an exported function. Comparing it with the address in the
-# file gives the load address of the library.
+# ctypes knows the address of this exported function. That address minus the function's
+# address in the file is where pybullet's extension module was loaded.
 _EXPORTED = "b3ConnectPhysicsDirect"
 
 
@@ -96,7 +97,7 @@ class SolverStatus(NamedTuple):
     """The solver that steps the clients of this process.
 
     Attributes:
-        name: "packed" is this package's solver, "bullet" is Bullet's own.
+        name: "packed" is torch_panda's solver, "bullet" is Bullet's own.
         reason: Why Bullet's own solver runs; empty for "packed".
     """
 
@@ -112,11 +113,12 @@ class SolverStatus(NamedTuple):
 def activate() -> SolverStatus:
     """Replace Bullet's solver in this process if all conditions of this module hold.
 
-    The first call decides. Later calls return its result.
+    The first call that raises no error decides. Later calls return its result.
 
     Raises:
         ValueError: The environment variable names an unknown solver.
-        RuntimeError: The environment variable demands "packed", and the gate refuses.
+        RuntimeError: The environment variable demands "packed", and a condition does
+            not hold.
     """
     global _status
     if _status is None:
@@ -160,11 +162,13 @@ def open_gate() -> None:
     check_version()
     solver = load_library()
     replacements = find_replacements(library.library_path())
+    tables = {
+        name: replacement.table
+        for (name, _), replacement in zip(_REPLACED, replacements, strict=True)
+    }
     solver.install(replacements)
     try:
-        run_self_test(
-            solver, motor_table=replacements[2].table, limit_table=replacements[3].table
-        )
+        run_self_test(solver, motor_table=tables[_MOTOR], limit_table=tables[_LIMIT])
     except GateError:
         solver.uninstall()
         raise
