@@ -51,7 +51,9 @@ def make_agent(env, algo, **options):
 
 def make_data(env, agent, transitions):
     """The data with the agent's goals; the agent gets their statistics."""
-    data = OfflineData(transitions.clone(), env, agent.goals, agent.hp.discount)
+    data = OfflineData(
+        transitions.clone(), env, agent.goal_strategies, agent.hp.discount
+    )
     batch = agent.extend(data.sample(2_000), data)
     agent.fit(batch["observation"], batch["actor_goal"])
     return data
@@ -118,7 +120,7 @@ def test_the_action_is_clipped_and_deterministic(env):
 
 
 def test_rewards_are_those_of_the_value_goal(env, transitions):
-    goals = make_agent(env, "gcivl").goals
+    goals = make_agent(env, "gcivl").goal_strategies
     data = OfflineData(transitions.clone(), env, goals, discount=0.99)
     batch = data.sample(1_000)
     b = Batch.from_tensordict(batch)
@@ -221,7 +223,7 @@ def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, acto
     rows = torch.zeros(50, 1)
     agent = make_agent(env, "hiql", subgoal_steps=5, actor_goal=actor_goal)
     named = named_transitions(env, episode, names, rows)
-    data = OfflineData(named, env, agent.goals, discount=0.9)
+    data = OfflineData(named, env, agent.goal_strategies, discount=0.9)
     batch = agent.extend(data.sample(5_000), data)
     t = batch["index"]
     last = torch.tensor(lengths)[episode[t]] - 1

@@ -1,9 +1,9 @@
 """Base class of the agents that learn offline, and the losses that several share.
 
 `fit` computes the mean and deviation of the data, `update` takes one gradient step on a
-batch of `OfflineData`, and `policy` acts. Agents differ in their ``goals``, which are
-strategies of `torch_panda.transforms.GoalSampler`, and in their `losses`. The docstring
-of each loss cites the equation or section of the paper.
+batch of `OfflineData`, and `policy` acts. Agents differ in their `losses`, and in the
+`goal_strategies` with which `torch_panda.transforms.GoalSampler` draws their goals. The
+docstring of each loss cites the equation or section of the paper.
 
 In the papers a goal is a state g. Here a goal is the part of a state that the task
 cares about, such as the position of a cube, because the policy gets ``desired_goal``.
@@ -46,12 +46,12 @@ class OfflineHyperparameters:
     algo: str = ""
     """algorithm"""
     discount: Discount = 0.99
-    """discount factor of values, and of goals of the strategy "geometric\""""
+    """discount factor of values and in the strategy "geometric\""""
     learning_rate: Ratio = 3e-4
     """learning rate of Adam"""
     tau: Ratio = 0.005
-    """fraction that target networks move towards their networks in each step (not the
-    tau of expectiles)"""
+    """fraction of the way to the trained networks that target networks move in each
+    step (not the tau of expectiles)"""
     hidden_size: Positive = 256
     """units of each of the three hidden layers, with GELU and LayerNorm"""
     batch_size: Positive = 256
@@ -61,9 +61,9 @@ class OfflineHyperparameters:
     OGBench ("future"), or k steps later with a probability in proportion to discount**k
     ("geometric")"""
     relative_inputs: RelativeInputs = "fine"
-    """further inputs of the networks: "coarse" adds the offsets of objects from the
-    hand, and of goals from objects. "fine" also adds these offsets clipped at 3 cm, so
-    that millimetres are large after standardisation"""
+    """additional inputs of the networks. "coarse" adds the offsets from the hand to
+    objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
+    so that differences of millimetres count"""
 
 
 class Batch(NamedTuple):
@@ -92,8 +92,9 @@ class Batch(NamedTuple):
 
     @classmethod
     def from_tensordict(cls, batch: TensorDictBase) -> "Batch":
-        """Read the rows of a buffer with a `GoalSampler`."""
+        """Read the transitions that `OfflineData` sampled."""
         after = batch.get("next")
+        # `OfflineData` terminates where the value goal is reached.
         reached = after.get("terminated").squeeze(-1)
         return cls(
             s=batch.get("observation"),
@@ -112,7 +113,7 @@ class OfflineAgent(nn.Module, ABC):
 
     Args:
         spaces: Sizes and layout of observations, goals and actions.
-        hp: Hyperparameters, of the class `Hyperparameters` of the agent.
+        hp: An instance of the agent's `Hyperparameters`.
 
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
@@ -133,13 +134,13 @@ class OfflineAgent(nn.Module, ABC):
     def __init__(self, spaces: Spaces, hp: OfflineHyperparameters) -> None:
         super().__init__()
         self.spaces, self.hp = spaces, hp
-        # Without a layout there are no offsets to add.
+        # Offsets need a `Geometry`, which some tasks do not have.
         relative_inputs = hp.relative_inputs if spaces.geometry else "none"
         self.normalizer = Normalizer(spaces, relative_inputs)
         self.updates = 0
 
     @property
-    def goals(self) -> dict[str, StrategyOption]:
+    def goal_strategies(self) -> dict[str, StrategyOption]:
         """The strategy with which `GoalSampler` draws the goals of each key."""
         return {"value_goal": self.value_goal, "actor_goal": self.hp.actor_goal}
 
@@ -170,7 +171,7 @@ class OfflineAgent(nn.Module, ABC):
         return batch
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Take one gradient step on a batch that has a goal for each key of ``goals``.
+        """Take one gradient step on a batch with goals by `goal_strategies`.
 
         Returns:
             The losses, scalars without gradients.
@@ -274,8 +275,8 @@ def expectile_loss(diff: Tensor, advantage: Tensor, expectile: float) -> Tensor:
     Args:
         diff: Target minus prediction, (..., n).
         advantage: Advantage of each row, (n,).
-        expectile: Weight of rows with a positive advantage, tau in the paper. Others
-            have the weight 1 - tau.
+        expectile: Weight of rows whose advantage is at least 0, tau in the paper.
+            Others have the weight 1 - tau.
 
     Returns:
         The weighted squares, (..., n).
@@ -307,9 +308,9 @@ def weighted_regression(log_probs: Tensor, advantage: Tensor, alpha: float) -> T
     The paper calls ``alpha`` beta.
 
     Args:
-        log_probs: Log probabilities of the actions of the data, (n,).
-        advantage: Advantages of these actions, (n,).
-        alpha: Inverse temperature. 0 imitates all actions alike.
+        log_probs: Log probabilities of the imitated actions or waypoints, (n,).
+        advantage: Their advantages, (n,).
+        alpha: Inverse temperature. 0 imitates all rows alike.
     """
     weight = (alpha * advantage.detach()).exp().clamp(max=MAX_WEIGHT)
     return -(weight * log_probs).mean()

@@ -25,8 +25,8 @@ class OfflineData:
             ``observation``, ``achieved_goal``, ``desired_goal``, ``reward``,
             ``terminated`` and ``done``. The rows of an episode are consecutive.
         env: Environment of the task.
-        goals: Strategy for each key under which goals are drawn. The first key holds
-            the value goals.
+        goal_strategies: Strategy for each key under which goals are drawn. The first
+            key holds the value goals.
         discount: Discount of the strategy "geometric".
         data_hash: Hash of the data. A resumed run compares it with the saved hash.
 
@@ -39,7 +39,7 @@ class OfflineData:
         self,
         data: TensorDictBase,
         env: RobotTaskEnv,
-        goals: Mapping[str, StrategyOption],
+        goal_strategies: Mapping[str, StrategyOption],
         discount: float,
         data_hash: str = "",
     ) -> None:
@@ -64,7 +64,7 @@ class OfflineData:
             data["next", "achieved_goal"], data["desired_goal"]
         )
         transform = GoalSampler(
-            goals,
+            goal_strategies,
             reward_fn=reward,
             terminated_fn=env.is_success,
             discount=discount,
@@ -82,8 +82,8 @@ class OfflineData:
         """Draw transitions and their goals.
 
         Returns:
-            Transitions (batch_size,) with a goal under each key of ``goals``, and with
-            their row numbers in the data under ``index``.
+            Transitions (batch_size,) with a goal under each key of
+            ``goal_strategies``, and with their row numbers in the data under ``index``.
         """
         return self._buffer.sample(batch_size)
 

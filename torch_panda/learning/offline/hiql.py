@@ -2,14 +2,14 @@
 
 The high-level policy outputs z = phi(s, w), the representation of a waypoint w that is
 to be reached k steps later. The low-level policy acts towards the waypoint. Both
-imitate the data in proportion to exp(alpha * advantage), with the action-free values of
-GCIVL.
+imitate the data in proportion to exp(alpha * advantage). The advantages come from state
+values without Q, as in `gcivl.py`.
 
 The paper's goals are states, so one value function judges waypoints and goals. Here a
 goal is a part of a state, such as the position of a cube. While the hand approaches the
-cube, the cube's position stays the same, so it cannot tell the waypoints of the
-approach apart. Therefore a waypoint w is a whole observation, and there are two value
-functions: V(s, phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
+cube, this position stays the same, so all waypoints of the approach would be equal.
+Therefore a waypoint w is a whole observation, and there are two value functions: V(s,
+phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
 """
 
 import copy
@@ -54,7 +54,7 @@ class HIQLHyperparameters(OfflineHyperparameters):
     low_alpha: Weight = 3.0
     """inverse temperature of the weights of imitated actions"""
     subgoal_steps: Positive = 10
-    """number k of steps from a state to its waypoint"""
+    """number k of steps from a state to its waypoint, OGBench's subgoal"""
     rep_dim: Positive = 10
     """size of the representation of a waypoint"""
 
@@ -69,7 +69,7 @@ class HIQL(OfflineAgent):
         super().__init__(spaces, hp)
         inputs, hidden_size = len(self.normalizer.mean), hp.hidden_size
         state_size = len(self.normalizer.state_columns)
-        # phi([s; w]), the values of waypoints and of goals, and targets of all three.
+        # phi(s, w), the values of waypoints and of goals, and targets of all three.
         self.phi = make_gelu_mlp(2 * state_size, hp.rep_dim, hidden_size)
         self.waypoint_value = Ensemble(state_size + hp.rep_dim, hidden_size)
         self.goal_value = Ensemble(inputs, hidden_size)
@@ -137,7 +137,7 @@ class HIQL(OfflineAgent):
         }
 
     def represent(self, phi: nn.Module, s: Tensor, w: Tensor) -> Tensor:
-        """phi([s; w]), scaled to the Euclidean norm sqrt(rep_dim), (n, rep_dim)."""
+        """phi(s, w), scaled to the Euclidean norm sqrt(rep_dim), (n, rep_dim)."""
         return normalize_length(phi(s, self.normalizer.state(w)))
 
     def goal_value_loss(self, b: Batch) -> Tensor:

@@ -52,7 +52,7 @@ class OfflineRun:
             self.agent = cls(read_spaces(self.env), args)
         data = data.to(args.device)
         self.data = OfflineData(
-            data, self.env, self.agent.goals, args.discount, data_hash
+            data, self.env, self.agent.goal_strategies, args.discount, data_hash
         )
         sample = self.sample(min(FIT_ROWS, len(self.data)))
         self.agent.fit(sample["observation"], sample["actor_goal"])
