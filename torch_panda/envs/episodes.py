@@ -50,7 +50,9 @@ _BYTES_PER_ENV = 44e6
 
 
 class Episodes:
-    """n environments of one robot and one task; see `RobotTaskEnv` for the arguments.
+    """Runs the episodes of n environments of one robot and one task.
+
+    `RobotTaskEnv` explains the arguments.
 
     All tensors are on the CPU and have n rows. Only actions and states that a caller
     passes have the batch shape of a `RobotTaskEnv`: (n,), or () if ``num_envs`` is None
@@ -62,10 +64,11 @@ class Episodes:
         simulation: The Bullet clients and their state.
         renderer: Draws the environments.
         seeds: Seeds of the episodes.
-        entries: Observed entries beside ``observation`` and the goals, by key.
-        goal_indices: Index in ``observation`` of each entry of the task's achieved
+        entries: Shape and dtype of each observed key beside ``observation`` and the
+            goals.
+        goal_indices: Column of ``observation`` of each number of the task's achieved
             goal, or None; see `RobotTaskEnv.goal_indices`.
-        goal_dim: Number of entries of ``achieved_goal`` and ``desired_goal``.
+        goal_dim: Size of ``achieved_goal`` and ``desired_goal``.
     """
 
     # Leave inference mode, because tensors made in this mode cannot be changed outside
@@ -208,17 +211,17 @@ class Episodes:
             start_state = None if state is None else self._read_state(state, envs)
             # If anything below raises, these environments need another reset.
             self._needs_reset.update(envs)
-            # If the last step raised, a diverged client may not have been rebuilt yet.
+            # A step that raised `WorkerError` did not rebuild the diverged clients.
             for env in set(envs).intersection(self.simulation.diverged()):
                 self.simulation.rebuild(env)
             for env in envs:
                 self._starts.draw(env)
             if start_state is not None:
                 tensors = self._starts.state()
-                for key, value in (start_state.start or start_state.values).items():
+                for key, value in (start_state.origin or start_state.values).items():
                     tensors[key][envs] = value
             self._start_episodes(envs)
-            if start_state is not None and start_state.start:
+            if start_state is not None and start_state.origin:
                 self._repeat_actions(envs, start_state)
             self._needs_reset.difference_update(envs)
             observed = self._observe()
@@ -248,7 +251,7 @@ class Episodes:
             TypeError: The action has an integer dtype.
         """
         with self._guard:
-            self._check_was_reset()
+            self._check_all_reset()
             action = self._begin_step(action, step_mask)
             envs = None if step_mask is None else indices(step_mask)
             self._history.record(action, step_mask)
@@ -267,7 +270,7 @@ class Episodes:
     def get_state(self, *, exact: bool = False) -> Observed:
         """The physical state, (n, ...) by key; see `RobotTaskEnv.get_state`."""
         with self._guard:
-            self._check_was_reset()
+            self._check_all_reset()
             state = {key: value.clone() for key, value in self._starts.state().items()}
             return {**state, **self._history.export()} if exact else state
 
@@ -284,12 +287,12 @@ class Episodes:
         Raises:
             BulletError: The environment is closed or needs a reset.
         """
-        self._check_was_reset()
+        self._check_all_reset()
         return self._observer.progress(self._starts.goal, self._starts.step_count)
 
     @contextmanager
     def exclusive(self) -> Iterator[None]:
-        """Context manager that keeps other threads out, as `reset` and `step` do.
+        """Context manager in which calls of other threads raise an error.
 
         Raises:
             BulletError: The environment is closed, or another thread is using it.
@@ -298,19 +301,20 @@ class Episodes:
             self._check_open()
             yield
 
-    def check_was_reset(self, env: int) -> None:
+    def check_index(self, env: int) -> None:
         """Check that an environment exists and was reset, so that it can be rendered.
 
         Raises:
             ValueError: The index is out of range, or the environment needs a reset.
             TypeError: The index is not an integer.
         """
-        exists = check_integer("an index", env) in range(self.num_envs)
-        if not exists or env in self._needs_reset:
+        if check_integer("an index", env) not in range(self.num_envs):
             raise ValueError(
-                f"environment {env} does not exist or was not reset: an index must be "
-                f"from 0 to {self.num_envs - 1}; call reset first"
+                f"an index of an environment must be from 0 to {self.num_envs - 1}, "
+                f"got {env}"
             )
+        if env in self._needs_reset:
+            raise ValueError(f"environment {env} was not reset: call reset first")
 
     def close(self) -> None:
         """Free all clients and threads. Closing again does nothing."""
@@ -387,7 +391,7 @@ class Episodes:
             action_dim=self.robot.action_dim,
         )
         self._randomizer.check_state(start_state.values, envs)
-        self._randomizer.check_state(start_state.start, envs)
+        self._randomizer.check_state(start_state.origin, envs)
         if self.simulation.scene.markers and "desired_goal" in start_state.values:
             # Raises if the task computes an invalid pose, before anything changes.
             self._starts.marker_pose(start_state.values["desired_goal"], envs)
@@ -426,7 +430,7 @@ class Episodes:
         if self.is_closed:
             raise BulletError("the environment is closed")
 
-    def _check_was_reset(self) -> None:
+    def _check_all_reset(self) -> None:
         self._check_open()
         if self._needs_reset:
             raise BulletError(

@@ -91,10 +91,10 @@ class RobotTaskEnv(EnvBase):
             to learn from pictures only. The goals are always observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
         on_divergence: What happens when a step leaves an environment in a state that
-            is not finite. With both values, the environment starts its next episode.
-            With "raise", the step raises `BulletError`. With "reset", it returns the
-            first observation of that episode, and the reward computed from this
-            observation; ``success`` is False and ``truncated`` is True.
+            is not finite. In any case, the environment starts its next episode.
+            "raise": the step raises `BulletError`. "reset": the step returns the first
+            observation of the next episode, and the reward of this observation;
+            ``success`` is False and ``truncated`` is True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
@@ -183,7 +183,7 @@ class RobotTaskEnv(EnvBase):
 
     @property
     def goal_indices(self) -> tuple[int, ...] | None:
-        """Index in ``observation`` of each entry of the task's achieved goal.
+        """Column of ``observation`` of each number of the task's achieved goal.
 
         None if the observation does not contain the achieved goal, or if the task does
         not declare `Task.goal_entries`.
@@ -194,7 +194,7 @@ class RobotTaskEnv(EnvBase):
     def compute_reward(self) -> RewardFunction:
         """The pure reward function of ``achieved_goal`` and ``desired_goal``.
 
-        It maps (..., goal_dim) to (..., 1); see `Task.compute_reward`.
+        It maps (..., goal size) to (..., 1); see `Task.compute_reward`.
         """
         return self._as_function_of_observed_goals(self.task.compute_reward)
 
@@ -202,7 +202,7 @@ class RobotTaskEnv(EnvBase):
     def is_success(self) -> RewardFunction:
         """The pure success function of ``achieved_goal`` and ``desired_goal``.
 
-        It maps (..., goal_dim) to (..., 1); see `Task.is_success`.
+        It maps (..., goal size) to (..., 1); see `Task.is_success`.
         """
         return self._as_function_of_observed_goals(self.task.is_success)
 
@@ -356,7 +356,7 @@ class RobotTaskEnv(EnvBase):
         """Seed one environment.
 
         From its next reset, it plays the episodes that environment 0 plays with
-        ``seed``. Interfaces such as Gymnasium's seed environments one by one.
+        ``seed``. Gymnasium, for example, seeds each environment separately.
 
         Raises:
             ValueError: The index is out of range, or the seed is negative.
@@ -379,12 +379,12 @@ class RobotTaskEnv(EnvBase):
         Returns:
             ``joint_position`` and ``joint_velocity`` (*batch, n_joints),
             ``object_pose`` (*batch, n_objects, 7), ``object_velocity`` (*batch,
-            n_objects, 6) and ``desired_goal`` (*batch, goal_dim), all float64, and
-            ``step_count`` (*batch, 1), int64. If objects have joints, also
+            n_objects, 6) and ``desired_goal`` (*batch, `Task.goal_dim`), all float64,
+            and ``step_count`` (*batch, 1), int64. If objects have joints, also
             ``object_joint_position`` and ``object_joint_velocity`` (*batch,
-            n_object_joints). If ``randomize`` has ranges, also
-            ``physics_parameters`` (*batch, k) float64. If the task overrides
-            `Task.randomize`, also ``physics_seed`` (*batch, 1) int64.
+            n_object_joints). If ``randomize`` has ranges, also ``physics_parameters``
+            (*batch, k) float64. If the task overrides `Task.randomize`, also
+            ``physics_seed`` (*batch, 1) int64.
 
         Raises:
             BulletError: The environment is closed or needs a reset.
@@ -396,7 +396,7 @@ class RobotTaskEnv(EnvBase):
         return self.episodes.seeds.state()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continue with the episodes that follow those of a ``state_dict``."""
+        """Restore seeds and episode numbers. The next reset starts the next episode."""
         self.episodes.seeds.load(state)
 
     def load_state_dict(
@@ -466,7 +466,7 @@ class RobotTaskEnv(EnvBase):
             chosen, is_single = np.atleast_1d(envs).tolist(), np.ndim(envs) == 0
         with episodes.exclusive():
             for env in chosen:
-                episodes.check_was_reset(env)
+                episodes.check_index(env)
             pixels = episodes.renderer.picture(chosen, camera).to(self.device)
         return pixels[0] if is_single else pixels
 
@@ -580,7 +580,7 @@ class RobotTaskEnv(EnvBase):
         return StateSupport(frozenset(self.episodes.entries))
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
-        """Whether a tensordict has a state under "state"; `TransformedEnv` asks."""
+        """Tell `TransformedEnv` whether a tensordict has a state under "state"."""
         return tensordict is not None and unpack_state(tensordict) is not tensordict
 
     def _set_seed(self, seed: int | None) -> None:
@@ -589,7 +589,7 @@ class RobotTaskEnv(EnvBase):
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Write a start into the caller's tensordict, as in torchrl.
+        """Write the first observations into the caller's tensordict, as in torchrl.
 
         torchrl's own method also adds missing ``done`` entries and checks that no
         episode is done at its start. `_reset` always returns these entries, and they

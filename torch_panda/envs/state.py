@@ -37,8 +37,8 @@ class StartState(NamedTuple):
 
     Attributes:
         values: Entries of the state, (k, ...) by key.
-        start: State at the start of the episode, (k, ...) by key; empty unless the
-            state is exact.
+        origin: State at the start of the episode, from which ``actions`` lead to
+            ``values``, (k, ...) by key; empty unless the state is exact.
         actions: Actions since the start of the episode, (k, length, action_dim) float32
             in [-1, 1]; None unless the state is exact.
         num_actions: Number of actions of each row, (k, 1) int64; None unless the state
@@ -46,7 +46,7 @@ class StartState(NamedTuple):
     """
 
     values: dict[str, Tensor]
-    start: dict[str, Tensor]
+    origin: dict[str, Tensor]
     actions: Tensor | None = None
     num_actions: Tensor | None = None
 
@@ -90,9 +90,9 @@ class StartState(NamedTuple):
                 raise ValueError(
                     f"the actions in the exact state of environment "
                     f"{envs[int(differs[0])]} do not lead to its {key}: the state was "
-                    f"changed or belongs to another environment; to start "
-                    f"from its other entries, leave out num_actions, actions and the "
-                    f"entries that begin with start_"
+                    f"changed or comes from an environment with other physics; to "
+                    f"start from its poses and velocities, leave out num_actions, "
+                    f"actions and the entries that begin with start_"
                 )
 
 
@@ -162,7 +162,7 @@ def read_state(
         batch_shape: Batch shape of the environment.
         present: The present state of all environments, (n, ...) by key.
         envs: The environments that start from the state.
-        action_dim: Number of action entries.
+        action_dim: Size of an action.
 
     Returns:
         Entries of shape (len(envs), ...), in the dtypes of ``present``.
@@ -170,8 +170,8 @@ def read_state(
     Raises:
         ValueError: An entry has a wrong shape, or a number that is not finite or above
             1e6 in magnitude; an object's quaternion is not a unit quaternion; an exact
-            state lacks entries; or there are no entries of a state. A ``step_count``
-            alone is not a state, because torchrl's `StepCounter` writes it too.
+            state lacks entries; or there is no state. A ``step_count`` alone is not a
+            state, because torchrl's `StepCounter` writes it too.
     """
     if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
         accepted = [key for key in present if key != "step_count"]
@@ -191,7 +191,7 @@ def read_state(
 
     exact_keys = set(EXACT_KEYS).intersection(state.keys())
     if not exact_keys:
-        return StartState(read(), start={})
+        return StartState(read(), origin={})
     required = {START + key for key in present} | {ACTIONS, NUM_ACTIONS}
     if missing := (required | present.keys()).difference(state.keys()):
         raise ValueError(
@@ -199,14 +199,14 @@ def read_state(
             f"leave out {sorted(exact_keys)} to start from the other entries"
         )
     n, length = len(next(iter(present.values()))), state[ACTIONS].shape[-2]
-    values, start = read(), read(START)
+    values, origin = read(), read(START)
     like = torch.zeros(n, length, action_dim, dtype=torch.float32, device="cpu")
     actions = _read_entry(ACTIONS, state[ACTIONS], batch_shape, like, envs)
     check_rows(ACTIONS, actions.abs() <= 1, envs, "in [-1, 1]")
     like = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
     count = _read_entry(NUM_ACTIONS, state[NUM_ACTIONS], batch_shape, like, envs)
     check_rows(NUM_ACTIONS, count <= length, envs, f"at most {length}")
-    return StartState(values, start, actions, count)
+    return StartState(values, origin, actions, count)
 
 
 def _read_entry(
