@@ -31,7 +31,7 @@ class History:
     Args:
         state: The tensors of the state, (n, ...) by key. They hold the starts of
             episodes whenever `begin` is called.
-        action_dim: Number of action entries.
+        action_dim: Size of an action.
     """
 
     def __init__(self, state: dict[str, Tensor], action_dim: int) -> None:

@@ -29,7 +29,8 @@ class EpisodeObserver:
         TypeError: A function of the robot or the task does not return a tensor.
 
     Attributes:
-        entries: Entries beside ``observation`` and the goals, by key.
+        entries: Shape and dtype of each observed key beside ``observation`` and the
+            goals.
     """
 
     def __init__(
@@ -67,14 +68,14 @@ class EpisodeObserver:
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._attached_sensors, extra]
-        # Keys that sensors and tasks may not observe, because a reset would take
-        # observations with these keys for entries of a state. The sensor "joint_state"
-        # may use two of them; see `is_state`.
+        # Keys that sensors and tasks may not observe, because a reset would mistake
+        # observations with these keys for a state. The sensor "joint_state" may use two
+        # of them; see `is_state`.
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}
-        # `join_entries` refuses reserved keys. The randomizer comes after it, because
-        # it may observe one.
+        # The randomizer may observe a reserved key, so add its entries after the check
+        # of `join_entries`.
         self.entries = join_entries(observers, reserved) | randomizer.entries
         observers.append(randomizer)
         self._observers = [observer for observer in observers if observer.entries]
@@ -144,7 +145,7 @@ class EpisodeObserver:
     def _add_outcome(
         self, observed: Observed, step_count: Tensor, action: Tensor | None
     ) -> None:
-        """Compute success and the end flags with torch, and after a step the reward."""
+        """Compute the outcome: success and end flags, and after a step the reward."""
         goals = observed["achieved_goal"], observed["desired_goal"]
         observed["success"] = self._task.is_success(*goals)
         observed |= self._ends(observed["success"], step_count)
