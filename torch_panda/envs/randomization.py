@@ -1,11 +1,12 @@
 """Domain randomization: the physics of every episode are drawn at random.
 
-`Randomization` holds the ranges. `PhysicsFactors` multiplies the physics of one client
-by factors. `DomainRandomizer` draws the factors of n environments and applies them.
+`Randomization` holds the ranges. `PhysicsFactors` multiplies the physics of a client by
+factors. `DomainRandomizer` draws the factors of n environments and applies them.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +31,8 @@ PARAMETERS = (
     "joint_damping",
     "gravity",
 )
-# No factor changes a nominal value of 0. If the nominal value of one of these
-# parameters is 0, the drawn number is therefore used as the value itself.
+# A factor times 0 is 0. So for these parameters, the drawn number replaces a nominal
+# value of 0.
 _ABSOLUTE_AT_ZERO = ("object_restitution", "joint_damping")
 
 # Entries of a state that determine the physics of an episode.
@@ -58,11 +59,12 @@ class Randomization:
         object_mass: Mass and inertia of all objects.
         object_friction: Lateral friction of all objects and their links. For a
             contact, Bullet multiplies the frictions of the two bodies.
-        table_friction: Lateral friction of the table and all other fixed bodies.
+        table_friction: Lateral friction of the table and the bases of all other fixed
+            bodies.
         finger_friction: Lateral friction of the robot's ``finger_links``.
         object_restitution: Restitution of all objects. If the nominal value is 0
             (Bullet's default), the drawn number replaces it instead of multiplying it.
-            This range also gives the table and all other fixed bodies a restitution of
+            This range also gives the table and the other fixed bases a restitution of
             1, because Bullet multiplies the restitutions of the two bodies in contact.
         joint_damping: Damping of the robot's joints. Where the nominal value is 0, as
             in the Panda, the drawn number is the damping itself [N m s/rad].
@@ -73,7 +75,9 @@ class Randomization:
             drawn factors, in the order above.
 
     Raises:
-        ValueError: A range is not (lowest, highest), finite and at least 0.
+        ValueError: A range is not (lowest, highest), finite and at least 0, and above 0
+            for ``object_mass``; ``joint_position`` is negative; or ``observe`` is true
+            without a range.
     """
 
     object_mass: Range | None = None
@@ -107,8 +111,22 @@ class Randomization:
         return np.array([getattr(self, name) for name in self.names]).T
 
 
+class _Target(NamedTuple):
+    """The properties that a factor multiplies.
+
+    Attributes:
+        argument: Argument of `PhysicsClient.set_dynamics` that sets the property.
+        links: The links that have it, as (body, link).
+        nominal_value: Reads the nominal value of a link.
+    """
+
+    argument: str
+    links: Sequence[tuple[int, int]]
+    nominal_value: Callable[[int, int], float]
+
+
 class PhysicsFactors:
-    """Multiplies physical properties of a client by factors.
+    """Holds the nominal physics of a scene, and multiplies clients' physics by factors.
 
     Args:
         names: Names of the factors, from `PARAMETERS`.
@@ -136,17 +154,15 @@ class PhysicsFactors:
         fingers = [(scene.robot, link) for link in finger_links]
         joints = [(scene.robot, joint) for joint in scene.joints]
         damping = {joint.number: joint.damping for joint in client.joints(scene.robot)}
-        # By name of the factor: the argument of `set_dynamics`, the links as (body,
-        # link) pairs, and the function that reads a link's nominal value.
-        targets: dict[
-            str, tuple[str, list[tuple[int, int]], Callable[[int, int], float]]
-        ] = {
-            "object_mass": ("mass", objects, client.mass),
-            "object_friction": ("lateral_friction", objects, client.friction),
-            "table_friction": ("lateral_friction", fixed, client.friction),
-            "finger_friction": ("lateral_friction", fingers, client.friction),
-            "object_restitution": ("restitution", objects, client.restitution),
-            "joint_damping": ("joint_damping", joints, lambda _, link: damping[link]),
+        targets = {
+            "object_mass": _Target("mass", objects, client.mass),
+            "object_friction": _Target("lateral_friction", objects, client.friction),
+            "table_friction": _Target("lateral_friction", fixed, client.friction),
+            "finger_friction": _Target("lateral_friction", fingers, client.friction),
+            "object_restitution": _Target("restitution", objects, client.restitution),
+            "joint_damping": _Target(
+                "joint_damping", joints, lambda _, joint: damping[joint]
+            ),
         }
         self._gravity: tuple[int, float] | None = None
         # By link: (argument of `set_dynamics`, index of the factor, nominal value).
@@ -155,17 +171,18 @@ class PhysicsFactors:
             if name == "gravity":
                 self._gravity = (index, physics.gravity)
                 continue
-            argument, links, nominal_value = targets[name]
-            # Replaces a nominal value of 0. With 1, the drawn number becomes the value.
-            # With 0, the link is left out and keeps its 0.
+            target = targets[name]
+            # Value to use instead of 0: 1, so that the drawn number becomes the value,
+            # or 0, which leaves the link out.
             zero_substitute = 1.0 if name in _ABSOLUTE_AT_ZERO else 0.0
-            for link in links:
-                if value := nominal_value(*link) or zero_substitute:
-                    self._changes.setdefault(link, []).append((argument, index, value))
+            for body, link in target.links:
+                if value := target.nominal_value(body, link) or zero_substitute:
+                    change = (target.argument, index, value)
+                    self._changes.setdefault((body, link), []).append(change)
             if name == "object_restitution":
-                for link in fixed:
+                for base in fixed:
                     change = ("restitution", _CONSTANT, 1.0)
-                    self._changes.setdefault(link, []).append(change)
+                    self._changes.setdefault(base, []).append(change)
 
     def apply(self, client: PhysicsClient, factors: Sequence[float]) -> None:
         """Set the physics of a client to the nominal values times k factors."""
@@ -271,7 +288,7 @@ class DomainRandomizer:
         return {PHYSICS_PARAMETERS: self.state[PHYSICS_PARAMETERS].float()}
 
     def check_state(self, values: dict[str, Tensor], envs: Sequence[int]) -> None:
-        """Check the physics in a state to start from, with entries (len(envs), ...).
+        """Check the factors (len(envs), k) in a state to start from.
 
         Raises:
             ValueError: A factor is negative, or the factor of a mass is 0: Bullet
