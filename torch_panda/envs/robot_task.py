@@ -24,7 +24,7 @@ from torch_panda.envs.next_root import NextRoot
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, is_state, unpack_state
+from torch_panda.envs.state import EXACT_KEYS, has_nested_state, is_state, unpack_state
 from torch_panda.envs.state_support import StateSupport
 from torch_panda.extras import install_command
 from torch_panda.rendering import Camera, RendererName
@@ -73,8 +73,8 @@ class RobotTaskEnv(EnvBase):
         task: The task.
         num_envs: Number of environments stepped in parallel; the batch size is
             [num_envs]. None makes one environment of batch size [].
-        num_threads: Number of threads that step them; None means one per core, at most
-            ``num_envs``.
+        num_threads: Number of threads that step the environments; None means one per
+            core, at most ``num_envs``.
         seed: Seed of all random draws; None draws one from the operating system. Two
             environments with the same seed play the same episodes, so give each worker
             process a seed of its own.
@@ -581,7 +581,7 @@ class RobotTaskEnv(EnvBase):
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
         """Tell `TransformedEnv` whether a tensordict has a state under "state"."""
-        return tensordict is not None and unpack_state(tensordict) is not tensordict
+        return has_nested_state(tensordict)
 
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)

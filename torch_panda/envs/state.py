@@ -125,8 +125,7 @@ def is_state(
     is_observed = "achieved_goal" in keys
     if is_observed:
         keys -= set(observed_keys)
-    is_nested = entries is not None and unpack_state(entries) is not entries
-    if not is_nested and not keys.intersection(BODY_KEYS):
+    if not has_nested_state(entries) and not keys.intersection(BODY_KEYS):
         return not is_observed and not keys.isdisjoint({"desired_goal", *PHYSICS_KEYS})
     if is_observed:
         raise ValueError(
@@ -137,13 +136,18 @@ def is_state(
     return True
 
 
-def unpack_state(entries: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The nested state under the key ``state``, or the entries if there is none.
+def has_nested_state(entries: Mapping[str, Any] | None) -> bool:
+    """Whether there is a state under the key ``state``.
 
     A tensor under this key is not a state, but an observation of a task or a sensor.
     """
-    nested = entries.get(NESTED_STATE, None)
-    return entries if nested is None or isinstance(nested, Tensor) else nested
+    nested = None if entries is None else entries.get(NESTED_STATE, None)
+    return nested is not None and not isinstance(nested, Tensor)
+
+
+def unpack_state(entries: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The nested state under the key ``state``, or the entries if there is none."""
+    return entries[NESTED_STATE] if has_nested_state(entries) else entries
 
 
 def read_state(

@@ -4,7 +4,7 @@ import sys
 
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from torch_panda.envs.state import BODY_KEYS, NESTED_STATE, unpack_state
+from torch_panda.envs.state import BODY_KEYS, NESTED_STATE, has_nested_state
 
 # torchrl's function that decides whether a reset starts from a state.
 _RESOLVE_CODE = EnvBase._resolve_set_state.__code__
@@ -46,7 +46,7 @@ class StateSupport:
             return True  # torchrl ignores the state
         if not isinstance(env, (TransformedEnv, SerialEnv, ParallelEnv)):
             return True
-        has_nested = entries is not None and unpack_state(entries) is not entries
+        has_nested = has_nested_state(entries)
         arrives = has_nested and NESTED_STATE in set(env.state_spec.keys())
         if isinstance(env, SerialEnv):
             # A SerialEnv passes all entries on, so its environments check them.
