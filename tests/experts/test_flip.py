@@ -76,7 +76,7 @@ UPRIGHT = torch.tensor(((0.0, 0.0, 0.0, 1.0),))
 
 def plan_for(goal, spin=STILL, table=SLIPPERY):
     plan = make_plan(UPRIGHT, spin, goal, table)
-    return plan.pitch.item(), plan.yaw.item(), plan.swing.item()
+    return plan.y_quarters.item(), plan.z_quarters.item(), plan.ends_with_swing.item()
 
 
 def test_a_cube_that_lies_well_is_left_alone():
@@ -96,10 +96,10 @@ def test_any_turn_about_y_is_a_swing(angle):
 def test_plans_lead_to_their_goal():
     """Plans reach 99.7 % of all orientations."""
     goal = orientations(2000)
-    lying, pitch, yaw, swing, _ = make_plan(
+    caught, pitch, yaw, swing, _ = make_plan(
         UPRIGHT.expand(2000, 4), STILL.expand(2000, 1), goal, SLIPPERY
     )
-    turned = compose(turn(1, pitch * math.pi / 2), lying)
+    turned = compose(turn(1, pitch * math.pi / 2), caught)
     turned = compose(turn(2, yaw * math.pi / 2), turned)
     left = torch.where(swing, best_pitch(turned, goal)[0], distance(turned, goal))
     assert (left < 0.2).double().mean() > 0.99
@@ -116,8 +116,8 @@ def test_a_cube_that_will_spin_to_its_goal_needs_no_tap(table, spin, quarters):
     assert plan_for(goal, angles(spin), table)[1] == quarters
 
 
-@pytest.mark.parametrize(("spin", "stops"), [(5.5, True), (7.0, False)])
-def test_a_cube_that_spins_past_its_goal_must_be_caught(spin, stops):
+@pytest.mark.parametrize(("spin", "waits"), [(5.5, True), (7.0, False)])
+def test_a_cube_that_spins_past_its_goal_must_be_caught(spin, waits):
     """A spin of 5.5 rad/s ends after 1.0 rad, near a quarter; 7 rad/s goes past it."""
     plan = make_plan(UPRIGHT, angles(spin), turn(2, angles(math.pi / 2)), SLIPPERY)
-    assert (plan.yaw.item(), plan.stops.item()) == (0, stops)
+    assert (plan.z_quarters.item(), plan.waits_for_rest.item()) == (0, waits)

@@ -29,26 +29,31 @@ WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0395
 CATCH = 0.034  # distance that stops a swing; a smaller one squeezes the cube out [m]
 LOOSEN, STAY = 0.0012, -0.001  # actions that loosen the grasp and keep it loose
 ASIDE = 0.014  # offset of the grasp from the centre, so that the cube swings [m]
-# The arm's first step upwards shifts the grasp towards -x by this distance [m], which
-# the grasp must anticipate.
+# The arm's first step upwards shifts the grasp by this distance towards -x, so the
+# fingers close this much farther towards +x [m].
 LAG = 0.004
-CLEAR, LIFTED = 0.035, 0.075  # heights at which the grasp loosens, and of the swing [m]
+CLEAR = 0.035  # height of the hand below which the fingers hold firmly [m]
+LIFTED = 0.075  # height of the hand during a swing [m]
 LOST = 0.025  # distance of the cube below the fingers at which it nearly falls [m]
-# Largest angle from the nearest straight orientation, about any axis, at which a cube
-# can swing without being straightened first [rad].
+# Largest angle from the nearest straight orientation (edges parallel to the world's
+# axes), about any axis, at which a cube can swing without being straightened first
+# [rad].
 TILT = 0.15
 TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
-SUCCESS, DONE = 0.2, 0.17  # distances at which the task succeeds, and the hand stops
-# Costs of a plan: each quarter turn about y, each about z, a swing as the last move,
-# the distance to the goal after the plan, and the part of this distance above `GOOD`,
-# or above `GOOD_LYING` if no swing comes last. A plan that does not end in success
-# costs 1 more.
-PITCH_COST, YAW_COST, SWING_COST, LEFT_COST, MISS_COST = 0.3, 0.15, 0.1, 0.2, 6.0
-GOOD, GOOD_LYING = 0.15, 0.13
+# Rotation distances to the goal at which the task succeeds, and the hand stops.
+SUCCESS, DONE = 0.2, 0.17
+# A plan costs the sum of these, and 1 more if it does not end in success.
+PITCH_COST = 0.3  # for each quarter turn about y
+YAW_COST = 0.15  # for each quarter turn about z
+SWING_COST = 0.1  # for a swing as the last move
+REMAINING_COST = 0.2  # times the distance to the goal after the plan
+MISS_COST = 6.0  # times the part of this distance above one of the next two limits
+GOOD_WITH_SWING = 0.15  # if a swing is the last move
+GOOD_WITHOUT_SWING = 0.13
 # Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
 QUARTERS = torch.cartesian_prod(*[torch.tensor((0.0, 1.0, -1.0, 2.0))] * 2)
 TURNS = compose(
-    *(turn(axis, QUARTERS[:, k : k + 1] * math.pi / 2) for axis, k in ((2, 1), (1, 0)))
+    turn(2, QUARTERS[:, 1:] * math.pi / 2), turn(1, QUARTERS[:, :1] * math.pi / 2)
 )
 TURN_COSTS = dot(QUARTERS.abs(), torch.tensor((PITCH_COST, YAW_COST)))
 
@@ -75,21 +80,20 @@ class Plan(NamedTuple):
     """A plan for a cube.
 
     Attributes:
-        lying: Orientation in which the hand catches the cube, now or during or after
-            its spin, rounded to a straight one (edges parallel to the world's axes),
-            (..., 4).
-        pitch: Quarter turns about y, which come first, (..., 1).
-        yaw: Quarter turns about z, which follow, (..., 1).
-        swing: Whether a swing comes last, (..., 1).
-        stops: Whether the hand waits until the spin ends before it catches the cube,
-            (..., 1).
+        caught: Orientation in which the hand catches the cube, now or during or after
+            its spin, rounded to a straight one, (..., 4).
+        y_quarters: Quarter turns about y, which come first, (..., 1).
+        z_quarters: Quarter turns about z, which follow, (..., 1).
+        ends_with_swing: Whether a swing comes last, (..., 1).
+        waits_for_rest: Whether the hand waits until the spin ends before it catches the
+            cube, (..., 1).
     """
 
-    lying: Tensor
-    pitch: Tensor
-    yaw: Tensor
-    swing: Tensor
-    stops: Tensor
+    caught: Tensor
+    y_quarters: Tensor
+    z_quarters: Tensor
+    ends_with_swing: Tensor
+    waits_for_rest: Tensor
 
 
 def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
@@ -105,23 +109,28 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
     # (..., 3, 4).
     ahead = (spin * spin.abs() / (2 * table.deceleration)).clamp(-2.0, 2.0)
     ahead = ahead[..., None, :] * ahead.new_tensor(((0.0,), (0.5,), (1.0,)))
-    lying = straighten(compose(turn(2, ahead), cube[..., None, :]))
+    caught = straighten(compose(turn(2, ahead), cube[..., None, :]))
     # Quarter turns follow, and then nothing or a swing: (..., 3, 16, 2).
-    turned = compose(TURNS.to(cube), lying[..., None, :])
+    turned = compose(TURNS.to(cube), caught[..., None, :])
     goal = goal[..., None, None, :]
-    left = torch.cat((distance(turned, goal), best_pitch(turned, goal)[0]), -1)
-    miss = (left - left.new_tensor((GOOD_LYING, GOOD))).clamp(min=0.0)
-    costs = MISS_COST * miss + LEFT_COST * left + TURN_COSTS.to(cube)
-    costs = costs + left.new_tensor((0.0, SWING_COST)) + (left > SUCCESS)
+    remaining = torch.cat((distance(turned, goal), best_pitch(turned, goal)[0]), -1)
+    good = remaining.new_tensor((GOOD_WITHOUT_SWING, GOOD_WITH_SWING))
+    miss = (remaining - good).clamp(min=0.0)
+    costs = MISS_COST * miss + REMAINING_COST * remaining + TURN_COSTS.to(cube)
+    costs = costs + remaining.new_tensor((0.0, SWING_COST)) + (remaining > SUCCESS)
     best = costs.flatten(-3).argmin(-1, keepdim=True)
-    caught, turns, swing = best // 32, best // 2 % 16, best % 2 == 1
-    lying = lying.take_along_dim(caught[..., None], -2).squeeze(-2)
-    pitch, yaw = QUARTERS.to(cube)[turns.squeeze(-1)].split(1, -1)
-    return Plan(lying, pitch, yaw, swing, caught == 2)
+    when, turns, swings = torch.unravel_index(best, (3, 16, 2))
+    caught = caught.take_along_dim(when[..., None], -2).squeeze(-2)
+    y_quarters, z_quarters = QUARTERS.to(cube)[turns.squeeze(-1)].split(1, -1)
+    return Plan(caught, y_quarters, z_quarters, swings == 1, when == 2)
 
 
 def descend(ee: Tensor, point: Tensor) -> Tensor:
-    """Descend to a point, with open fingers that pass on both sides of a cube."""
+    """Descend to a point, with room for open fingers on both sides of a cube.
+
+    Returns:
+        The action of the arm, (..., 3).
+    """
     offset = point - ee
     # The fingers pass the cube on both sides even if the hand is off by 3 cm along x.
     # If it is off by more than 1 cm along y, a finger would hit the cube: stay above.
@@ -138,18 +147,18 @@ def descend(ee: Tensor, point: Tensor) -> Tensor:
 
 
 def tap(
-    ee: Tensor, width: Tensor, position: Tensor, yaw: Tensor, table: Table
+    ee: Tensor, width: Tensor, position: Tensor, z_quarters: Tensor, table: Table
 ) -> Tensor:
     """Knock a corner of the cube with a finger, towards the middle of the table."""
     x, y, z = position.split(1, -1)
     towards_middle = torch.where(y > 0, -1.0, 1.0)  # sign of the knock along y
     ready = torch.cat(
-        (x + yaw.sign() * towards_middle * TAP_ASIDE, y, 0 * z + 0.02), -1
+        (x + z_quarters.sign() * towards_middle * TAP_ASIDE, y, 0 * z + 0.02), -1
     )
     error = ready - ee
     around = (error[..., :1].abs() < 0.005) & (error[..., 1:2].abs() < 0.03)
     around = around & ((error[..., 2:] - 0.002).abs() < 0.012) & (width > 0.07)
-    speed = torch.where(yaw.abs() > 1, table.half, table.quarter)
+    speed = torch.where(z_quarters.abs() > 1, table.half, table.quarter)
     sideways = speed * towards_middle
     knock = torch.cat((GAIN * error[..., :1], sideways, GAIN * error[..., 2:]), -1)
     action = torch.where(around, knock, descend(ee, ready))
@@ -162,19 +171,19 @@ def grasp(
     position: Tensor,
     velocity: Tensor,
     aside: Tensor,
-    ready: Tensor,
+    may_close: Tensor,
 ) -> Tensor:
     """Move the open fingers beside the cube's centre, and close them there.
 
-    They close at the distance ``aside`` from the centre along x [m], (n, 1), in the
-    environments where ``ready``, (n, 1) bool, is true.
+    They close at the distance ``aside`` from the centre along x [m], (..., 1), in the
+    environments where ``may_close``, (..., 1) bool, is true.
     """
     x, y, z = (position + 0.04 * velocity).split(1, -1)
     point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)
     error = (point - ee).abs()
-    slides = norm(velocity[..., :2]) > 0.05
+    is_sliding = norm(velocity[..., :2]) > 0.05
     near = (error < error.new_tensor((0.008, 0.02, 0.01))).all(-1, True)
-    near = near & (slides | (error[..., :1] < 0.006)) & ready
+    near = near & (is_sliding | (error[..., :1] < 0.006)) & may_close
     fingers = torch.where(near, open_to(width, CLOSE), open_to(width, WIDE))
     return torch.cat((descend(ee, point), fingers), -1)
 
@@ -185,7 +194,7 @@ def swing(
     offset: Tensor,
     spin: Tensor,
     pitch: Tensor,
-    left: Tensor,
+    remaining: Tensor,
     last: Tensor,
 ) -> Tensor:
     """Lift the cube, let it swing about y, and then hold it or set it down.
@@ -195,8 +204,8 @@ def swing(
         width: Distance between the fingers, (..., 1).
         offset: Offset of the cube from the end-effector, (..., 3).
         spin: Angular velocity of the cube [rad/s], (..., 3).
-        pitch: Rotation about y that is left to do [rad], (..., 1).
-        left: Distance to the goal, (..., 1).
+        pitch: Remaining rotation about y [rad], (..., 1).
+        remaining: Rotation distance to the goal, (..., 1).
         last: Whether to hold the cube after the swing, and not set it down, (..., 1).
     """
     height, rate, turning = ee[..., 2:] + offset[..., 2:], spin[..., 1:2], norm(spin)
@@ -204,20 +213,21 @@ def swing(
     firmly = open_to(width, HOLD + (CATCH - HOLD) * (turning > 0.5))
     slipping = offset[..., 2:] < -LOST
     arrived = (pitch.abs() < 0.2) | (pitch * (pitch - 0.04 * rate) < 0) | slipping
-    arrived = arrived | (left < DONE) | (ee[..., 2:] < CLEAR)
+    arrived = arrived | (remaining < DONE) | (ee[..., 2:] < CLEAR)
     loosely = torch.where(rate.abs() < 1, LOOSEN, STAY)
     loosely = torch.where(width < SLIP, open_to(width, SLIP + 0.0003), loosely)
     lift = GAIN * (LIFTED - ee[..., 2:])
     lift = torch.cat((zero, zero, lift, torch.where(arrived, firmly, loosely)), -1)
 
-    # Set the cube down if it has the wanted face up, or hangs without swinging.
+    # Set the cube down if it has the wanted face up, hangs without swinging, or nearly
+    # falls.
     hangs = (offset[..., :1].abs() < 0.004) & (offset[..., 2:] < -0.006)
-    over = (hangs | slipping) & (turning < 1) & (pitch.abs() > 0.5)
-    over = over | ~last & (pitch.abs() < 0.4) & (turning < 3)
-    over = over & ~((left < DONE) & (ee[..., 2:] > CLEAR))
+    set_down = (hangs | slipping) & (turning < 1) & (pitch.abs() > 0.5)
+    set_down = set_down | ~last & (pitch.abs() < 0.4) & (turning < 3)
+    set_down = set_down & ~((remaining < DONE) & (ee[..., 2:] > CLEAR))
     release = torch.where(height < 0.026, 1.0, firmly)
     down = torch.cat((zero, zero, GAIN * (0.019 - height), release), -1)
-    return torch.where(over, down, lift)
+    return torch.where(set_down, down, lift)
 
 
 def act(
@@ -230,20 +240,20 @@ def act(
     ee, width, position = (observation[..., a:b] for a, b in ((0, 3), (6, 7), (7, 10)))
     velocity, spin = observation[..., 14:17], observation[..., 17:20]
     cube, goal, offset = achieved_goal, desired_goal, position - ee
-    left, turning, zero = distance(cube, goal), norm(spin), torch.zeros_like(width)
+    remaining, turning, zero = distance(cube, goal), norm(spin), torch.zeros_like(width)
     on_table = position[..., 2:] < 0.024
     held = (width > 0.03) & (width < 0.05)
     held = held & (offset.abs() < ee.new_tensor((0.03, 0.04, 0.035))).all(-1, True)
 
     spin_z = spin[..., 2:]
     plan = make_plan(cube, torch.where(on_table & ~held, spin_z, 0.0), goal, table)
-    last = plan.swing & (plan.pitch == 0) & (plan.yaw == 0)
-    set_down = compose(turn(1, plan.pitch * math.pi / 2), plan.lying)
-    _, pitch = best_pitch(cube, torch.where(last, goal, set_down))
-    swings = plan.swing | (plan.pitch != 0)
-    stays = plan.stops | (spin_z.abs() < 0.5)
-    leave = ~swings & (plan.yaw == 0) & stays
-    leave = leave | (left < DONE) & (turning < 0.5) & on_table
+    last = plan.ends_with_swing & (plan.y_quarters == 0) & (plan.z_quarters == 0)
+    turned = compose(turn(1, plan.y_quarters * math.pi / 2), plan.caught)
+    _, pitch = best_pitch(cube, torch.where(last, goal, turned))
+    needs_swing = plan.ends_with_swing | (plan.y_quarters != 0)
+    comes_to_rest = plan.waits_for_rest | (spin_z.abs() < 0.5)
+    needs_nothing = ~needs_swing & (plan.z_quarters == 0) & comes_to_rest
+    needs_nothing = needs_nothing | (remaining < DONE) & (turning < 0.5) & on_table
 
     # Fingers that close on the centre straighten the cube. A straight cube is grasped
     # aside from its centre. A spinning cube is caught when it is nearly straight.
@@ -251,24 +261,26 @@ def act(
     tilt = 2 * dot(cube, now).abs().clamp(max=1.0).double().acos().to(cube)
     slow, straight = spin_z.abs() < 1.5, tilt < TILT
     aside = LAG - ASIDE * pitch.sign()
-    aside = torch.where(swings & straight & slow, aside, 0.0)
-    ready = (tilt < 0.25) | (tilt < 0.65) & slow
-    ready = ready & (distance(plan.lying, now) < 0.05)
+    aside = torch.where(needs_swing & straight & slow, aside, 0.0)
+    may_close = (tilt < 0.25) | (tilt < 0.65) & slow
+    may_close = may_close & (distance(plan.caught, now) < 0.05)
 
-    taps = (plan.pitch == 0) & (plan.yaw != 0)
-    action = grasp(ee, width, position, velocity, aside, ready)
-    action = torch.where(taps, tap(ee, width, position, plan.yaw, table), action)
+    needs_tap = (plan.y_quarters == 0) & (plan.z_quarters != 0)
+    action = grasp(ee, width, position, velocity, aside, may_close)
+    action = torch.where(
+        needs_tap, tap(ee, width, position, plan.z_quarters, table), action
+    )
     rise = (ee[..., 2:] < 0.12).to(ee.dtype)
     rise = torch.cat((zero, zero, rise, open_to(width, WIDE)), -1)
-    action = torch.where(leave, rise, action)
+    action = torch.where(needs_nothing, rise, action)
 
     # On the table, squeeze a crooked cube at its centre. Then open the fingers to grasp
     # it aside from its centre.
-    fresh = on_table & (offset[..., 2:].abs() < 0.012)
+    just_grasped = on_table & (offset[..., 2:].abs() < 0.012)
     centred = offset[..., :1].abs() < 0.008
-    crooked = fresh & ~straight & centred
-    again = fresh & (~straight | swings & centred & (pitch.abs() > 0.2))
+    crooked = just_grasped & ~straight & centred
+    regrasp = just_grasped & (~straight | needs_swing & centred & (pitch.abs() > 0.2))
     fingers = torch.where(crooked, open_to(width, CLOSE), 1.0)
     stay = torch.cat((zero, zero, zero, fingers), -1)
-    swinging = swing(ee, width, offset, spin, pitch, left, last)
-    return torch.where(held, torch.where(again, stay, swinging), action)
+    swinging = swing(ee, width, offset, spin, pitch, remaining, last)
+    return torch.where(held, torch.where(regrasp, stay, swinging), action)
