@@ -1,7 +1,6 @@
 import pytest
 import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
-from torchrl.envs import GymEnv, MultiStepTransform, TransformedEnv
 
 from tests.transforms.identifiable import (
     STORED_REWARD,
@@ -126,22 +125,6 @@ def test_ids_that_begin_anew(layout, rooted):
     assert sorted(kept + unfinished) == sorted(written)
 
 
-@pytest.mark.parametrize("rooted", [True, False])
-def test_new_collector_after_a_reload(rooted):
-    def chunk(envs):
-        data = envs.chunk(8).reshape(-1)
-        return data if rooted else data.exclude("achieved_goal")
-
-    rb, new = make_buffer(k=2), make_buffer(k=2)
-    for buffer in (rb, new):  # a storage is made lazily
-        buffer.extend(chunk(Envs(3, [5])))
-    new.load_state_dict(rb.state_dict())
-    new.extend(chunk(Envs(3, [5], first_env=10)))
-    stored = new.storage[:]
-    assert len(stored) == 3 * 3 * (5 + 3 + 5)
-    check_batch(stored, stored, "future")
-
-
 def test_adding_one_by_one_raises():
     rb, data = make_buffer(k=2), Envs(1, [4]).chunk(4)[0]
     with pytest.raises(ValueError, match="use `extend`"):
@@ -156,12 +139,3 @@ def test_default_device():
     with torch.device("meta"):
         stored = HindsightAugment(reward_fn, seed=0)._inv_call(data)
     check_batch(stored, stored, "future")
-
-
-def test_multi_step_and_environments_raise():
-    rb = make_buffer()
-    rb.append_transform(MultiStepTransform(n_steps=3, gamma=0.9))
-    with pytest.raises(RuntimeError, match="MultiStepTransform"):
-        rb.extend(Envs(3, [5]).chunk(20))
-    with pytest.raises(ValueError, match="replay buffers"):
-        TransformedEnv(GymEnv("Pendulum-v1"), HindsightAugment(reward_fn))

@@ -10,7 +10,6 @@ from torchrl.data import (
     SliceSampler,
     TensorDictReplayBuffer,
 )
-from torchrl.envs import CatTensors, TransformedEnv
 
 from tests.transforms.identifiable import (
     Envs,
@@ -19,7 +18,7 @@ from tests.transforms.identifiable import (
     reward_fn,
     terminated_fn,
 )
-from tests.transforms.pipelines import buffer, collect, make
+from tests.transforms.pipelines import buffer
 from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
 
 NAMES = ["current", "future", "geometric", "final", "episode", "random", "desired"]
@@ -135,43 +134,6 @@ def test_rows_that_were_overwritten_get_their_own_goal():
     for key in ALL:
         assert torch.equal(batch[key][old], data["next", "achieved_goal"][old])
         assert key == "current_goal" or (batch[key] != batch["current_goal"]).any()
-
-
-def test_a_reloaded_buffer_draws_the_same_goals(tmp_path):
-    def make_buffer():
-        return buffer(GoalSampler(ALL, reward_fn, seed=3))
-
-    rb, new = make_buffer(), make_buffer()
-    rb.extend(name_goals(Envs(3, [5, 9]).chunk(50)).reshape(-1))
-    rb.dumps(tmp_path)
-    new.loads(tmp_path)
-    batches = []
-    for loaded in (rb, new):
-        torch.manual_seed(0)
-        batches.append(loaded.sample())
-    assert (batches[0] == batches[1]).all()
-
-
-def test_from_env_reads_what_belongs_together():
-    env = make("PandaReach-v3")
-    strategies = {"value_goal": {"current": 1, "random": 1}}
-    rb = buffer(GoalSampler.from_env(env, strategies, seed=0))
-    for data in collect(env):
-        rb.extend(data.reshape(-1))
-    batch = rb.sample()
-    goals = batch["next", "achieved_goal"], batch["value_goal"]
-    success = env.is_success(*goals)
-    assert torch.equal(batch["next", "reward"], env.compute_reward(*goals))
-    assert torch.equal(batch["next", "success"], success)
-    assert torch.equal(batch["next", "terminated"], success)
-
-
-def test_data_are_refused_as_by_hindsight():
-    cat = CatTensors(["observation", "desired_goal"], "policy_input", del_keys=False)
-    env = TransformedEnv(make(), cat)
-    rb = buffer(GoalSampler.from_env(env, {"value_goal": "future"}))
-    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
-        rb.extend(next(iter(collect(env))).reshape(-1))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     PrioritizedSampler,
-    ReplayBuffer,
     SamplerWithoutReplacement,
     SliceSampler,
 )
@@ -148,18 +147,6 @@ def test_share_and_position_of_relabelled_rows(her_ratio):
     assert abs(mask.mean() - her_ratio) <= 4 * error / mask.numel() ** 0.5
     position = (mask.mean(0) - her_ratio).abs()
     assert (position <= 5 * error / len(mask) ** 0.5).all()
-
-
-def test_strategy_of_the_user():
-    def next_step(step, first, end, generator):
-        return torch.minimum(step + 1, end - 1)
-
-    rb = make_buffer(strategy=next_step, her_ratio=1.0)
-    rb.extend(Envs(3, [6]).chunk(18).reshape(-1))
-    batch = rb.sample()
-    step, goal = batch["next", "achieved_goal"][:, 2], batch["desired_goal"][:, 2]
-    assert (goal == (step + 1).clamp(max=6)).all()
-    assert not is_mixed(batch).any()
 
 
 @pytest.mark.parametrize(
@@ -411,20 +398,6 @@ def test_reading_one_row_or_all_of_two_dimensions():
     assert (rb.storage[:] == before).all(), "the storage was written into"
 
 
-@pytest.mark.parametrize("strategy", ["future", "random"])
-def test_plain_replay_buffer(strategy):
-    rb = buffer(
-        HindsightRelabel(reward_fn, strategy=strategy),
-        capacity=50,
-        cls=ReplayBuffer,
-        batch_size=32,
-    )
-    envs = Envs(3, [5, 9])
-    for _ in range(30):
-        rb.extend(envs.chunk(3).reshape(-1))
-        check_batch(rb.sample(), rb.storage[:], strategy)
-
-
 @pytest.mark.parametrize("strict", [True, False])
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_slices_share_a_goal(strategy, strict):
@@ -621,17 +594,6 @@ def test_seed_does_not_touch_torchs_generator():
     rb.extend(data)
     for a, b in zip(goals(plain), goals(rb), strict=True):
         assert (a == b).all()
-
-
-def test_random_numbers_are_reproducible():
-    def sample(seed):
-        rb = make_buffer(100, seed=seed)
-        rb.extend(Envs(3, [5, 9]).chunk(20).reshape(-1))
-        torch.manual_seed(0)
-        return rb.sample()["desired_goal"]
-
-    assert (sample(1) == sample(1)).all()
-    assert (sample(1) != sample(2)).any()
 
 
 # -- what it cannot be combined with --------------------------------------------------

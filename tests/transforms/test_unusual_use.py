@@ -104,13 +104,3 @@ def test_a_learned_reward_gets_no_gradient(hindsight):
     for _ in range(2):
         (scale - rb.sample()["next", "reward"]).square().mean().backward()
     assert network.weight.grad is None
-
-
-def test_parts_are_of_vectors():
-    data = play()
-    for place in (data, data["next"]):
-        for key in ("achieved_goal", "desired_goal"):
-            place[key] = place[key][:, :, None].expand(-1, 3, 2).clone()
-    rb = buffer(HindsightRelabel(reward_fn, goal_parts=(1, 1)))
-    with pytest.raises(ValueError, match="the size of the goal vector"):
-        rb.extend(data)
