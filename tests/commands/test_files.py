@@ -24,32 +24,17 @@ def save(path, content):
         path.write_bytes(data[: len(data) // 2])
 
 
-BAD = pytest.mark.parametrize(
+@pytest.mark.parametrize(
     "content",
     [b"", b"hello", b"\x80\x02]", "half", {"steps": 1}, [1, 2], TensorDict(x=1)],
     ids=["empty", "text", "pickle", "half", "state", "list", "tensordict"],
 )
-
-
-@BAD
 def test_files_that_hold_no_policy(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
     save(path, content)
     message = f"^{path} does not hold a policy, or is damaged \\(.+\\)$"
     with pytest.raises(SystemExit, match=message):
         evaluate.main(evaluate.Args(run=path))
-
-
-@BAD
-def test_files_that_hold_no_demonstrations(tmp_path, content):
-    path = tmp_path / "demos.pt"
-    save(path, content)
-    message = f"^{path} does not hold demonstrations, or is damaged \\(.+\\)$"
-    with (
-        torch_panda.make("PandaReach-v1", num_envs=1) as env,
-        pytest.raises(ValueError, match=message),
-    ):
-        read_demos(path, env)
 
 
 class Intruder:
@@ -86,14 +71,6 @@ def test_damaged_state_of_a_run(tmp_path, content):
     with pytest.raises(SystemExit, match=message):
         train.main(train.Args(resume=True, out=tmp_path))
     assert (tmp_path / "resume.pt").read_bytes() == before
-
-
-def test_demonstrations_go_into_a_new_folder(tmp_path):
-    path = tmp_path / "new" / "folder" / "demos.pt"
-    record_demos.main(
-        record_demos.Args(env_id="PandaReach-v3", episodes=2, num_envs=2, out=path)
-    )
-    assert len(torch.load(path)["action"]) > 2
 
 
 @pytest.mark.parametrize(

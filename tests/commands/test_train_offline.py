@@ -1,14 +1,14 @@
 """``train --offline`` writes its files, stops, resumes and explains errors."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
 import torch_panda
 from tests.commands.runs import After, points, read_curve, weights
-from torch_panda.commands import evaluate, plot, refine, train, watch
+from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.offline.options import make_args_class
@@ -40,12 +40,7 @@ def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
     policy = torch_panda.load_policy(out)
     result = torch_panda.evaluate(policy, "PandaReach-v1", episodes=2)
     assert len(result.success) == 2
-    evaluate.main(evaluate.Args(run=str(out), episodes=4))
-    assert "PandaReach-v1, 4 episodes" in capsys.readouterr().out
-    watch.main(watch.Args(policy=str(out), num_envs=1, out=tmp_path / "watch.gif"))
-    assert (tmp_path / "watch.gif").read_bytes().startswith(b"GIF8")
-    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "all.png"))
-    assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
+    assert list(plot.read_runs([tmp_path])) == ["PandaReach-v1, offline"]
     with pytest.raises(SystemExit, match="was learned offline by gcbc, but refine"):
         refine.main(refine.Args(policy=out, out=tmp_path / "refined"))
 
@@ -104,18 +99,10 @@ def test_data_of_a_file(tmp_path):
         train.main(replace(args, resume=True))
 
 
-def test_the_options_are_those_of_the_algorithm(capsys):
+def test_the_options_are_those_of_the_algorithm():
     options = ["--algo", "hiql", "--subgoal-steps", "7", "--data", "play"]
     args = parse(["--offline", *options])
-    expected = make_args_class("hiql")(subgoal_steps=7, data="play")
-    assert args == expected
-    with pytest.raises(SystemExit):
-        parse(["--offline", "--algo", "hiql", "--help"])
-    text = capsys.readouterr().out
-    names = [field.name.replace("_", "-") for field in fields(expected)]
-    names[names.index("imports")] = "import"
-    assert [name for name in names if f"--{name}" not in text] == []
-    assert "number k of steps from a state to its waypoint" in " ".join(text.split())
+    assert args == make_args_class("hiql")(subgoal_steps=7, data="play")
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,10 @@
 
 import pytest
 import torch
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import torch_panda
 from torch_panda import datasets
 from torch_panda.datasets import generation
-from torch_panda.transforms import HindsightRelabel
 
 KINDS = ["noisy", "play", "random"]
 
@@ -73,15 +71,6 @@ def test_play_pursues_goal_after_goal():
     env_reward = torch_panda.Reach().compute_reward(achieved, goals)
     assert torch.equal(data["next", "reward"], env_reward)
     assert data["next", "success"].float().mean() > 0.4
-
-
-def test_hindsight_takes_generated_data():
-    relabel = HindsightRelabel(torch_panda.Reach().compute_reward, seed=0)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(1000), transform=relabel, batch_size=64
-    )
-    buffer.extend(generate("random").reshape(-1))
-    assert buffer.sample()["next", "reward"].shape == (64, 1)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torchrl.collectors import Collector
 
 import torch_panda
 from torch_panda import experts
@@ -55,16 +54,6 @@ def test_a_single_environment_has_no_batch_dimension():
     with torch_panda.make("PandaFlip-v1", seed=0) as env:
         rollout = env.rollout(3, experts.make_expert("PandaFlip-v1"))
     assert rollout["action"].shape == (3, 4)
-
-
-def test_collectors_take_an_expert():
-    env = torch_panda.make("PandaReach-v1", num_envs=4, seed=0)
-    expert = experts.make_expert("PandaReach-v1")
-    collector = Collector(env, expert, frames_per_batch=400, total_frames=400)
-    (data,) = list(collector)
-    collector.shutdown()
-    # The last steps of the two episodes of each environment.
-    assert data["next", "success"][:, [49, 99]].all()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
@@ -91,22 +90,11 @@ def test_shipped_policies_have_the_spaces_of_their_environment(env_id):
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])
-def test_a_loaded_policy_serves_rollouts_and_collectors(num_envs):
+def test_a_loaded_policy_serves_rollouts(num_envs):
     policy = torch_panda.load_policy("PandaReach-v1")
     env = torch_panda.make("PandaReach-v1", num_envs=num_envs, seed=0)
     rollout = env.rollout(50, policy)
     assert rollout["next", "success"][..., -1, :].all()
-    frames = 50 * (num_envs or 1)
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=frames,
-        total_frames=frames,
-        auto_register_policy_transforms=True,
-    )
-    (data,) = list(collector)
-    collector.shutdown()
-    assert data["next", "success"][..., -1, :].all()
 
 
 def test_a_policy_of_an_unregistered_id_loads(tmp_path):
