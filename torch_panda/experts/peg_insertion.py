@@ -16,11 +16,11 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     """Bring the peg over the hole, and lower it when it fits."""
     offset = desired_goal - achieved_goal
     sideways, rise = offset[..., :2], offset[..., 2:]
-    inside = rise > -INSIDE
-    goes_down = inside | (norm(sideways) < FITS)
+    is_inside = rise > -INSIDE
+    may_descend = is_inside | (norm(sideways) < FITS)
     descent = torch.where(rise.abs() < DONE, 0.0, rise.clamp(min=-DESCENT))
     # In the hole the walls guide the peg. A sideways move would press the peg against
     # them and rotate it.
-    sideways = torch.where(inside, 0.0, sideways)
-    vertical = torch.where(goes_down, descent, rise + CLEAR)
+    sideways = torch.where(is_inside, 0.0, sideways)
+    vertical = torch.where(may_descend, descent, rise + CLEAR)
     return move(torch.cat((sideways, vertical), -1))

@@ -15,12 +15,12 @@ def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Te
     """
     ee, cube = observation[..., :3], achieved_goal
     sideways, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE / 2 + ON_TOP
-    presses = (norm(sideways) < CUBE / 2) & (ee[..., 2:] < top + 0.004)
+    is_pressing = (norm(sideways) < CUBE / 2) & (ee[..., 2:] < top + 0.004)
     step = 0.6 * (desired_goal - cube)[..., :2]
     step = step / (norm(step) / 0.02).clamp(min=1.0)
     drag_action = torch.cat((step, torch.full_like(top, -0.01)), -1) / 0.05
     on_top = torch.cat((cube[..., :2], top - 0.003), -1)
-    return torch.where(presses, drag_action, go_over(ee, on_top, 0.04))
+    return torch.where(is_pressing, drag_action, go_over(ee, on_top, 0.04))
 
 
 def push(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:

@@ -24,13 +24,13 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     placed = arrived(norm(lower - goal), lower_speed, lower_held, 0.025)
     stacked = arrived(norm(upper - top), upper_speed, upper_held, 0.02)
     to_lower, to_upper = norm(ee - lower), norm(ee - upper)
-    leave = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
-    leave = leave | placed & stacked & (ee[..., 2:] < 0.15)
+    must_rise = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
+    must_rise = must_rise | placed & stacked & (ee[..., 2:] < 0.15)
     # Rise with closed or wide open fingers: opening ones would lift the cube.
     upwards = torch.where((width < 0.02) | (width > 0.06), 1.0, 0.0)
     rise = torch.cat((0 * ee[..., :2], upwards, 0.4 + 0 * width), -1)
     finish = torch.where(stacked, 0.0, carry(ee, width, upper, top, clearance=0.06))
-    finish = torch.where(leave, rise, finish)
+    finish = torch.where(must_rise, rise, finish)
 
     # The fingers need room beside the lower cube and beside its goal.
     room = upper.new_tensor((0.045, 0.085))
@@ -39,25 +39,25 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
         return ((upper - point)[..., :2].abs() < room).all(-1, True)
 
     # Push the upper cube away from the point that it crowds, along x or along y.
-    crowded = torch.where(upper_crowds(lower) | placed, lower, goal)
-    apart = (upper - crowded)[..., :2]
+    crowded_point = torch.where(upper_crowds(lower) | placed, lower, goal)
+    apart = (upper - crowded_point)[..., :2]
     along_x = apart[..., :1].abs() > apart[..., 1:].abs()
     # Aim 3 cm too far, because `push_to` may stop the cube 3 cm before its target.
     sign = torch.where(apart < 0, -1.0, 1.0)
-    side = crowded[..., :2] + sign * apart.new_tensor((0.1, 0.125))
+    side = crowded_point[..., :2] + sign * apart.new_tensor((0.1, 0.125))
     x, y, z = upper.split(1, -1)
     x, y = (
         torch.where(along_x, side[..., :1], x),
         torch.where(along_x, y, side[..., 1:]),
     )
     aside = torch.cat((x, y, z), -1)
-    clear = push_to(ee, upper, observation[..., 25:27], aside)
-    clear = torch.cat((clear, 0 * width - 1), -1)
+    push_aside = push_to(ee, upper, observation[..., 25:27], aside)
+    push_aside = torch.cat((push_aside, 0 * width - 1), -1)
     on_top = upper[..., 2:] > 0.03
     is_holding = lower_held | upper_held
-    blocked = upper_crowds(crowded) & ~(is_holding | placed & on_top)
+    blocked = upper_crowds(crowded_point) & ~(is_holding | placed & on_top)
     action = torch.where(placed, finish, carry(ee, width, lower, goal))
-    action = torch.where(blocked, torch.where(leave, rise, clear), action)
+    action = torch.where(blocked, torch.where(must_rise, rise, push_aside), action)
     # If both cubes are at their goals, do not touch them any more.
     done = torch.maximum(norm(lower - goal), norm(upper - desired_goal[..., 3:])) < 0.03
     hold = torch.cat((0 * ee, torch.where(upper_held, -1.0, 0.0)), -1)
