@@ -71,7 +71,7 @@ def test_a_wrong_declaration_is_refused():
     ):
         env.reset()
     short = type("Short", (Push,), {"goal_entries": GoalEntries("task", (0, 1))})
-    with pytest.raises(ValueError, match=r"Short.goal_entries must name 3 entries of"):
+    with pytest.raises(ValueError, match=r"Short.goal_entries must name 3 numbers of"):
         RobotTaskEnv(robot=Panda(), task=short())
 
 

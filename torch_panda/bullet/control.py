@@ -51,7 +51,7 @@ class MotorControl:
 
     @property
     def setpoint_dim(self) -> int:
-        """Number of entries of a setpoint."""
+        """Size of a setpoint."""
         if self.ik_link is None:
             return len(self.forces)
         return self._pose_dim + len(self.forces) - self.num_arm_joints

@@ -16,10 +16,10 @@ GoalName = Literal["task", "observation"]
 
 
 def find_goal_indices(robot: Robot, task: Task) -> tuple[int, ...] | None:
-    """Indices of the observation's entries that are the achieved goal.
+    """Columns of the observation that hold the achieved goal.
 
     Returns:
-        ``goal_dim`` indices. None if the task does not declare ``goal_entries``, or if
+        ``goal_dim`` columns. None if the task does not declare ``goal_entries``, or if
         a subclass overrides a function that the declaration describes.
     """
     entries = task.goal_entries
@@ -56,8 +56,8 @@ def apply_to_observations(
 
     Args:
         function: The function of two goals, (..., goal_dim) each.
-        goal_indices: The entries of an observation that are the task's goal.
-        observation_dim: Number of entries of an observation.
+        goal_indices: Columns of an observation that hold the task's goal.
+        observation_dim: Size of an observation.
         achieved_goal: (..., observation_dim).
         desired_goal: (..., observation_dim).
 

@@ -108,8 +108,8 @@ class EpisodeObserver:
 
         Raises:
             ValueError: One of the first observations or rewards is NaN or infinite, or
-                the observation does not hold the achieved goal at the entries that
-                `Task.goal_entries` declares.
+                the observation does not hold the achieved goal where
+                `Task.goal_entries` declares it.
         """
         if self._compiled is None:
             observed, has_outcome = self._observe_goals(goal), False
@@ -210,13 +210,13 @@ class EpisodeObserver:
             function, values = f"{task}.extra_observation[{key!r}]", observed[key]
             self._check_valid(function, values, ~values.isnan(), "no NaN")
         if self._goal_indices is not None:
-            entries = observation[:, self._goal_indices]
+            numbers = observation[:, self._goal_indices]
             achieved_goal = observed["achieved_goal"]
-            if not torch.allclose(entries, achieved_goal, equal_nan=True):
+            if not torch.allclose(numbers, achieved_goal, equal_nan=True):
                 raise ValueError(
-                    f"the entries {self._goal_indices} of the observation must be the "
+                    f"the columns {self._goal_indices} of the observation must be the "
                     f"achieved goal, as {task}.goal_entries says, but they differ: "
-                    f"{entries.tolist()} and {achieved_goal.tolist()}"
+                    f"{numbers.tolist()} and {achieved_goal.tolist()}"
                 )
 
     def _check_valid(
@@ -269,9 +269,9 @@ class EpisodeObserver:
             is_inside = all(0 <= index < size for index in self._goal_indices)
             if len(self._goal_indices) != task.goal_dim or not is_inside:
                 raise ValueError(
-                    f"{task_name}.goal_entries must name {task.goal_dim} entries of an "
+                    f"{task_name}.goal_entries must name {task.goal_dim} numbers of an "
                     f"observation, got {task.goal_entries}; the robot's part has "
-                    f"{robot.observation_dim} entries, and the task's part has "
+                    f"{robot.observation_dim} numbers, and the task's part has "
                     f"{task.observation_dim}"
                 )
 

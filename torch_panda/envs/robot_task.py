@@ -101,7 +101,7 @@ class RobotTaskEnv(EnvBase):
             and ``desired_goal`` full observations: the desired goal is the observation
             of a state in which the task's goal is reached, with the objects at their
             goals and at rest, and the hand in its neutral pose (in Reach at the goal).
-            Reward and success stay the task's, computed from the entries at
+            Reward and success stay the task's, computed from the numbers at
             `goal_indices`. The ``desired_goal`` in states (`get_state`, `reset`) stays
             the task's goal.
 

@@ -177,12 +177,12 @@ class Robot(Configured):
 
     @property
     def action_dim(self) -> int:
-        """Number of entries of an action."""
+        """Size of an action."""
         return self._arm_action_dim + self.has_free_gripper
 
     @property
     def observation_dim(self) -> int:
-        """Number of entries of the robot's part of the observation."""
+        """Size of the robot's part of the observation."""
         return 6 + self.has_free_gripper
 
     @property
@@ -191,7 +191,7 @@ class Robot(Configured):
 
     @property
     def has_free_gripper(self) -> bool:
-        """Whether the last action entry moves the fingers."""
+        """Whether the last number of an action moves the fingers."""
         return self.gripper is not None and not self.block_gripper
 
     def build(self, client: PhysicsClient) -> int:
@@ -255,7 +255,7 @@ class Robot(Configured):
         """Setpoints of the arm for its part of actions.
 
         Args:
-            action: Clipped actions without the gripper's entry, (num_envs, j) float32.
+            action: Clipped actions without the gripper's number, (num_envs, j) float32.
             simulation: The environments.
 
         Returns:

@@ -18,9 +18,9 @@ RewardType = Literal["sparse", "dense"]
 Quantity = Literal[
     "position", "velocity", "euler_angles", "quaternion", "angular_velocity", "number"
 ]
-"""Meaning of consecutive entries of an observation. A "number" is one entry that does
-not change if the scene is rotated or mirrored. A quaternion (xyzw) has 4 entries. The
-others have 3, in the world frame."""
+"""What consecutive numbers of an observation mean. A "number" is a single one that does
+not change if the scene is rotated or mirrored. A quaternion (xyzw) has 4 numbers. The
+other quantities have 3, in the world frame."""
 OBJECT_LAYOUT: tuple[Quantity, ...] = (
     "position",
     "euler_angles",
@@ -65,8 +65,8 @@ class GoalEntries(NamedTuple):
     """Where an observation holds the achieved goal.
 
     Attributes:
-        part: "task" for entries of `Task.observation`, "robot" for entries of
-            `Robot.observation`, which begins with the end-effector's position.
+        part: "task" if `Task.observation` holds it, "robot" if `Robot.observation`
+            does, which begins with the end-effector's position.
         indices: Indices in this part, in the order of the goal, (goal_dim,).
     """
 
@@ -267,10 +267,10 @@ class Task(Configured, ABC):
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation, (num_envs, observation_dim) float64.
 
-        The robot's part precedes it in ``observation``. The default has no entries. If
-        this method and `achieved_goal` only select entries of the state, a task may
-        decorate both with `bullet.selects_state`. C code then does their work, which
-        saves about 50 microseconds per step.
+        The robot's part precedes it in ``observation``. The default is empty. If this
+        method and `achieved_goal` only copy numbers of the state, a task may decorate
+        both with `bullet.selects_state`. C code then does their work, which saves about
+        50 microseconds per step.
         """
         return simulation.ee_position[:, :0]
 
