@@ -22,7 +22,7 @@ def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
     """Return five named start states of a task, each with its goal.
 
     They are selected from `NUM_STARTS` random starts of the task, by the distance
-    between achieved and desired goal. Tasks that you registered have them, too.
+    between achieved and desired goal. Ids that you registered have them too.
 
     Args:
         env_id: Id of the task.

@@ -40,7 +40,7 @@ class Part(NamedTuple):
 
     Attributes:
         quantity: The quantity.
-        start: Index of its first entry.
+        start: Its first column.
     """
 
     quantity: Quantity
@@ -62,13 +62,13 @@ class Geometry:
         observation: Factors that mirror an observation, (observation size,).
         goal: Factors that mirror a goal, (goal size,).
         action: Factors that mirror an action, (action size,); None for joint control.
-        positions: Indices at which positions start in an observation.
-        goal_positions: Indices at which positions start in a goal.
+        positions: First column of each position in an observation.
+        goal_positions: First column of each position in a goal.
         goal_height: Height of all goals that the task draws [m]. Networks that see
             differences of positions get this height for all goals, because achieved
             goals are lower. None leaves the goals unchanged.
-        orientation: Index at which the object's quaternion starts in an observation, if
-            goals are orientations; else None.
+        orientation: First column of the object's quaternion in an observation, if goals
+            are orientations; else None.
     """
 
     points: tuple[int, ...]
@@ -116,7 +116,12 @@ class Geometry:
 
 
 def read_geometry(env: RobotTaskEnv) -> Geometry | None:
-    """Return the geometry of an environment, or None if its task declares no layout."""
+    """Return the geometry of an environment.
+
+    Returns:
+        None if the task does not declare ``observation_layout`` and ``goal_entries``,
+        or if they do not fit its observations and goals.
+    """
     robot, task = env.robot, env.task
     if task.observation_layout is None or task.goal_entries is None:
         return None
@@ -152,7 +157,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
 
 
 def locate(layout: Sequence[Quantity]) -> list[Part]:
-    """Return the quantities of an observation, with the indices of their starts."""
+    """Return the quantities of an observation with their first columns."""
     parts, start = [], 0
     for quantity in layout:
         parts.append(Part(quantity, start))
@@ -168,11 +173,11 @@ def locate_goals(
     Args:
         parts: Quantities of the observation.
         task: The task.
-        first: Index at which the task's part of an observation starts.
+        first: First column of the task's part of an observation.
 
     Returns:
-        Each quantity of the goal as a part of the observation, and the index at which
-        it starts in a goal.
+        Each quantity of the goal as a part of the observation, and its first column in
+        a goal.
     """
     assert task.goal_entries is not None
     offset = first if task.goal_entries.part == "task" else 0

@@ -115,8 +115,8 @@ class DDPG(Agent):
             difference = (action - rows.action)[-num_demos:]
             imitation_loss = (difference.square() * is_preferred).mean()
             actor_loss = actor_loss + BC_WEIGHT * imitation_loss
-        # Compute gradients for the actor only. The critics have those of their own
-        # loss.
+        # Compute gradients for the actor only. The critics keep the gradients of their
+        # own loss.
         actor_loss.backward(inputs=self.actor_parameters)
         return {"critic_loss": critic_loss, "actor_loss": actor_loss}
 
