@@ -9,7 +9,6 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs import SerialEnv
 
 import torch_panda
 
@@ -139,21 +138,6 @@ def test_a_resumed_collector_goes_on():
     assert torch.equal(goals(expected), goals(actual))
     first.shutdown()
     second.shutdown()
-
-
-def test_batched_environments_are_resumed():
-    def serial():
-        return SerialEnv(2, make)
-
-    first, second = serial(), serial()
-    first.set_seed(0)
-    first.reset()
-    state = first.state_dict()
-    second.load_state_dict(state)
-    expected, actual = first.reset(), second.reset()
-    assert torch.equal(expected["desired_goal"], actual["desired_goal"])
-    first.close()
-    second.close()
 
 
 def test_a_state_dict_of_other_environments():

@@ -53,10 +53,7 @@ def test_parallel_env():
     assert time.monotonic() - start < PATIENCE
 
 
-@pytest.mark.parametrize(
-    "collector_class",
-    [MultiSyncCollector, pytest.param(MultiAsyncCollector, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("collector_class", [MultiSyncCollector, MultiAsyncCollector])
 def test_collectors(collector_class):
     frames = 2 * NUM_ENVS * STEPS
     expected = first_goals(seed=0, num_workers=2)

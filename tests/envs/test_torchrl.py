@@ -5,7 +5,7 @@ import functools
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector, MultiAsyncCollector
+from torchrl.collectors import Collector
 from torchrl.data import Unbounded
 from torchrl.envs import (
     CatTensors,
@@ -201,20 +201,3 @@ def test_collector():
     assert data["next", "truncated"][:, 49].all()
     ids = data["collector", "traj_ids"]
     assert (ids[:, 50] != ids[:, 49]).all()
-
-
-def test_multi_process_collector():
-    """The asynchronous collector. `test_multi_process` tests the synchronous one."""
-    collector = MultiAsyncCollector(
-        [make_env, make_env],
-        RandomPolicy(make_env().action_spec),
-        frames_per_batch=80,
-        total_frames=160,
-    )
-    collector.set_seed(0)
-    batches = [data.clone() for data in collector]
-    collector.shutdown()
-    goals = torch.cat([b["desired_goal"].reshape(-1, 3) for b in batches])
-    assert sum(b.numel() for b in batches) == 160
-    # Two workers of two environments: four goals that differ.
-    assert len(goals.unique(dim=0)) == 4
