@@ -300,13 +300,3 @@ def test_fine_fingers_need_fingers(env):
         ValueError, match="fine_fingers needs a task whose actions move the fingers"
     ):
         make(env, "ddpg", fine_fingers=True)
-
-
-@pytest.mark.parametrize("algo", ["ddpg", "sac"])
-def test_learning_rate(env, algo):
-    agent = make(env, algo)
-    agent.set_learning_rate(0.0)
-    agent.hp.target_interval = 2  # otherwise the target networks would move
-    before = [x.clone() for x in agent.parameters()]
-    agent.update(make_transitions(env, 16))
-    assert all(map(torch.equal, before, agent.parameters()))
