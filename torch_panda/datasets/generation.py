@@ -92,8 +92,8 @@ def generate_parts(
     transitions: int,
     seed: int,
     num_envs: int,
-    num_threads: int | None = None,
-    progress: Callable[[int], object] | None = None,
+    num_threads: int | None,
+    progress: Callable[[int], object] | None,
     first: int = 0,
     **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> Iterator[TensorDict]:

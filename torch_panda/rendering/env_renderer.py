@@ -24,8 +24,8 @@ class EnvRenderer:
         self,
         simulation: VectorSimulation,
         *,
-        renderer: RendererName = "tiny",
-        mesh_cell: float = 0.0,
+        renderer: RendererName,
+        mesh_cell: float,
     ) -> None:
         self._simulation = simulation
         blueprint = simulation.blueprint

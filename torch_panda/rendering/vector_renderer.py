@@ -37,7 +37,7 @@ class VectorRenderer:
         self,
         simulation: VectorSimulation,
         *,
-        renderer: RendererName = "tiny",
+        renderer: RendererName,
     ) -> None:
         self._simulation = simulation
         self._renderer: RendererName = renderer

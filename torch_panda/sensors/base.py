@@ -79,7 +79,7 @@ _ENVIRONMENT_KEYS = {
 
 
 def join_entries(
-    observers: Sequence[Observer], reserved: Collection[str] = ()
+    observers: Sequence[Observer], reserved: Collection[str]
 ) -> dict[str, Entry]:
     """Join the entries of all observers.
 
