@@ -62,6 +62,7 @@ class EpisodeObserver:
             max_episode_steps=max_episode_steps,
             terminate_on_success=terminate_on_success,
         )
+        # Sensors also follow resets and steps; the other observers only observe.
         self._attached_sensors = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]

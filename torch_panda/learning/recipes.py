@@ -168,7 +168,7 @@ def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
 
     Returns:
         The options that differ from their defaults, by name. For a user's own task,
-        "tuned" changes none, and "sample-efficient" those of `SAMPLE_EFFICIENT`.
+        "tuned" changes no option, and "sample-efficient" changes `SAMPLE_EFFICIENT`.
 
     Raises:
         ValueError: The id is unknown.
