@@ -14,7 +14,7 @@ RECIPE = "recipe.json"  # file of the options that determine the data
 
 
 class Parts:
-    """The folder of the finished parts. The name of a file is its first episode.
+    """The folder of the finished parts. A file's name is the id of its first episode.
 
     Args:
         folder: The folder.

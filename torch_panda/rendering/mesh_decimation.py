@@ -100,8 +100,8 @@ def merge_vertices(
     sums = np.stack([np.bincount(cube, column) for column in vertices.T], axis=1)
     means: Floats = sums / np.bincount(cube)[:, None]
     color = np.floor(coordinates / _TEXTURE_CELL).astype(np.int64)
-    # Make a new vertex for each pair of cube and colour. It takes its
-    # texture coordinates from one of the corners that it replaces.
+    # Make a new vertex for each pair of cube and colour. It takes its texture
+    # coordinates from one of the corners that it replaces.
     flat = corners.reshape(-1, 2)
     keys = np.column_stack((cube[flat[:, 0]], color[flat[:, 1]]))
     keys, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)

@@ -73,7 +73,7 @@ class Gripper:
         return (joints * self._weights).sum(dim=1, keepdim=True) + self._offset
 
     def describe(self, column: int) -> native.Gripper:
-        """This gripper, which must have two joints, for C.
+        """Description for the C code of this gripper, which must have two joints.
 
         Args:
             column: Column of the first joint's position in the rows of the state.

@@ -11,8 +11,7 @@ from torch_panda.rotations import NO_ROTATION
 NEUTRAL_JOINT_POSITION = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 JOINT_FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 EE_LINK = 11
-# The mount of the hand.
-WRIST_JOINT = 8
+WRIST_JOINT = 8  # the fixed joint that carries the hand
 FINGER_LINKS = (9, 10)
 GRIPPER = Gripper(closed=(0.0, 0.0), opened=(0.04, 0.04), width=0.08)
 

@@ -68,7 +68,7 @@ class Sensor(Configured, ABC):
     def attach(
         self, simulation: VectorSimulation, renderer: VectorRenderer, robot: Robot
     ) -> Reading:
-        """Read the sensor in all environments of a simulation."""
+        """Make the `Reading` for all environments of a simulation."""
 
 
 # Keys of an environment's outputs, and keys that torchrl uses.

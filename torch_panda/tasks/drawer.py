@@ -79,7 +79,7 @@ class Drawer(Task):
         )
 
     def sample_start(self, rng: np.random.Generator) -> Start:
-        """Draw the cabinet's position, and how far it is open at start and goal."""
+        """Draw the cabinet's position, and the drawer's openings at start and goal."""
         x = CABINET_X + self.cabinet_x_range * rng.uniform(-0.5, 0.5)
         y = self.cabinet_y_range * rng.uniform(-0.5, 0.5)
         # Rejection sampling: uniform among the pairs that are far enough apart.
@@ -105,7 +105,7 @@ class Drawer(Task):
         return pose[:, :3] + rotate(pose[:, 3:], handle)
 
     def objects_at_goal(self, goal: Tensor, objects: ObjectState) -> ObjectState:
-        """The cabinet where it is, with the drawer's handle at the goal."""
+        """The unmoved cabinet, with the drawer's handle at the goal."""
         pose = objects.pose[:, 0]
         closed = pose[:, :3] + rotate(pose[:, 3:], pose.new_tensor(HANDLE))
         outwards = rotate(pose[:, 3:], pose.new_tensor((-1.0, 0.0, 0.0)))
