@@ -43,8 +43,8 @@ TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m
 # Rotation distances to the goal at which the task succeeds, and the hand stops.
 SUCCESS, DONE = 0.2, 0.17
 # A plan costs the sum of these, and 1 more if it does not end in success.
-PITCH_COST = 0.3  # for each quarter turn about y
-YAW_COST = 0.15  # for each quarter turn about z
+Y_QUARTER_COST = 0.3  # for each quarter turn about y
+Z_QUARTER_COST = 0.15  # for each quarter turn about z
 SWING_COST = 0.1  # for a swing as the last move
 REMAINING_COST = 0.2  # times the distance to the goal after the plan
 MISS_COST = 6.0  # times the part of this distance above one of the next two limits
@@ -55,7 +55,7 @@ QUARTERS = torch.cartesian_prod(*[torch.tensor((0.0, 1.0, -1.0, 2.0))] * 2)
 TURNS = compose(
     turn(2, QUARTERS[:, 1:] * math.pi / 2), turn(1, QUARTERS[:, :1] * math.pi / 2)
 )
-TURN_COSTS = dot(QUARTERS.abs(), torch.tensor((PITCH_COST, YAW_COST)))
+TURN_COSTS = dot(QUARTERS.abs(), torch.tensor((Y_QUARTER_COST, Z_QUARTER_COST)))
 
 
 class Table(NamedTuple):

@@ -97,7 +97,7 @@ class VisualClient:
         self.close()
 
     def pose(self, scene: Scene, state: SimulationState, env: int) -> None:
-        """Move robot, objects and markers to their poses in an environment."""
+        """Move the bodies of the layer to their poses in an environment."""
         if self._layer != "markers":
             positions = state.joint_position[env].tolist()
             self._set_joints(scene.robot, scene.joints, positions)
