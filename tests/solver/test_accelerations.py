@@ -79,14 +79,6 @@ def test_forces_on_links_and_torques_of_joints(frame):
     assert assert_same(scene(fill), STEPS).bodies == STEPS
 
 
-def test_substeps():
-    def fill(world):
-        stand(world)
-        world.client.setPhysicsEngineParameter(numSubSteps=4)
-
-    assert assert_same(scene(fill), STEPS).bodies == 4 * STEPS
-
-
 def test_sixteen_bodies_of_a_world_are_accelerated_here():
     def fill(world):
         world.ground()

@@ -345,17 +345,6 @@ def test_rigid_bodies_are_left_to_bullet():
     assert_same(scene(fill), 150, leaves_groups=True)
 
 
-@pytest.mark.parametrize("joint", range(3))
-def test_joint_feedback(joint):
-    def fill(world):
-        world.ground()
-        chain = world.chain(4, (0, 0, 0.4))
-        world.client.enableJointForceTorqueSensor(chain, joint)
-        world.box(0.3, (0.05, 0, 0.05))
-
-    assert_same(scene(fill), 150)
-
-
 def test_solver_analytics():
     def fill(world):
         pile(world)

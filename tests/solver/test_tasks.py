@@ -8,8 +8,6 @@ import torch
 import torch_panda
 from tests.ids import PHYSICS_IDS
 from tests.solver.solvers import assert_same, needs_packed, solver
-from torch_panda.bullet import PhysicsClient
-from torch_panda.bullet.solver.gate import load_library
 from torch_panda.experts import make_expert
 
 pytestmark = needs_packed
@@ -89,42 +87,6 @@ def test_objects_in_the_hand(env_id):
 def test_randomized_physics(seed):
     build = environment("PandaPush-v1", seed=seed, randomize=RANDOMIZATION)
     assert_same(build, 60)
-
-
-def test_threads():
-    """Many clients in two threads: the same bits with either solver."""
-
-    def rollout(name):
-        library = load_library()
-        library.enable(name == "packed")
-        try:
-            with torch_panda.make(
-                "PandaStack-v3", num_envs=8, num_threads=2, seed=4
-            ) as env:
-                torch.manual_seed(0)
-                env.rollout(40, break_when_any_done=False)
-                return env.get_state()
-        finally:
-            library.enable(True)
-
-    expected, state = rollout("bullet"), rollout("packed")
-    assert (state == expected).all()
-
-
-def test_clients_created_and_closed_beside_others():
-    build = environment("PandaPush-v1", num_envs=1)
-    step, state = build()
-    expected = [(step(k), state())[1] for k in range(30)]
-    step, state = build()
-    others = []
-    for k in range(30):
-        step(k)
-        assert state() == expected[k]
-        others.append(PhysicsClient())
-        if k % 3 == 2:
-            others.pop(k % len(others)).close()
-    for other in others:
-        other.close()
 
 
 @pytest.mark.slow
