@@ -1,8 +1,5 @@
 """A user's task with all hooks and a drawer, written with public names only."""
 
-import pickle
-from dataclasses import dataclass
-
 import gymnasium
 import pytest
 import torch
@@ -189,30 +186,6 @@ def test_a_moved_drawer_changes_the_picture():
         push_forward(env)
         assert (env.render(size=64) != before).any()
         assert "object" in env.segmentation_ids
-
-
-@dataclass(kw_only=True)
-class Higher(Reach):
-    """A task with an argument of its own, as a dataclass."""
-
-    lowest: float = 0.1
-
-    def sample_goal(self, rng):
-        x, y, z = super().sample_goal(rng)
-        return x, y, max(z, self.lowest)
-
-
-def test_a_task_as_a_dataclass():
-    torch_panda.register(
-        "Higher-v0", robot=lambda: Panda(block_gripper=True), task=Higher
-    )
-    options = {"lowest": 0.2}
-    with torch_panda.make("Higher-v0", num_envs=8, seed=0, task_options=options) as env:
-        goals = env.reset()["desired_goal"]
-        assert goals[:, 2].min() == pytest.approx(0.2)
-        copy = pickle.loads(pickle.dumps(env))
-        assert copy.task.lowest == 0.2
-        copy.close()
 
 
 class Buffered(Reach):

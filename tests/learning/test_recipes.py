@@ -42,9 +42,6 @@ def test_the_sample_efficient_recipe_changes_the_tuned_recipe():
 def test_every_task_has_a_recipe():
     for env_id in torch_panda.ENV_IDS:
         assert find_recipe(env_id)
-    push = RECIPES[torch_panda.Push]
-    assert find_recipe("PandaPush-v1") == find_recipe("PandaPushDense-v3") == push
-    assert find_recipe("PandaPickAndPlace-v1") != push
     changes = CHANGES_IF_SUCCESS_ENDS[torch_panda.Slide]
     slide = RECIPES[torch_panda.Slide]
     assert find_recipe("PandaSlide-v3") == {**slide, **changes} != slide
@@ -78,12 +75,6 @@ def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(tmp_path, c
     train.main(replace(default, **small, out=tmp_path / "run"))
     message = "PushBall-v0 has no recipe: training as in the panda-gym paper"
     assert message in capsys.readouterr().out
-
-
-def test_the_paper_has_no_recipes():
-    with pytest.raises(ValueError, match="unknown environment id 'PandaFly-v1'"):
-        find_recipe("PandaFly-v1")
-    assert default_args("paper", "PandaPush-v1") == Args(env_id="PandaPush-v1")
 
 
 @pytest.mark.parametrize(("ratio", "steps"), [(0.0, 100), (0.5, 50)])
