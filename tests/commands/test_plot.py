@@ -1,7 +1,6 @@
 """The plotting example: what it draws, and what it cannot."""
 
 import csv
-import itertools
 import json
 from pathlib import Path
 
@@ -98,26 +97,6 @@ def test_a_panel_has_four_lines_that_can_be_told_apart(tmp_path, figures):
     assert len(set(looks.values())) == len(looks) == 9
 
 
-def test_a_way_keeps_its_colour_and_an_algorithm_its_marker(tmp_path, figures):
-    for task, algo, her in itertools.product(
-        ("Push", "Slide"), ("ddpg", "sac", "td3"), ("relabel", "none")
-    ):
-        args = Args(env_id=f"Panda{task}-v1", algo=algo, her=her)
-        write_run(tmp_path / f"{task}-{algo}-{her}", args)
-    plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
-    lines = [line for axes in figures[0].axes for line in axes.lines]
-    assert len(lines) == 12
-    looks = {"paper": set(), "paper, no her": set()}
-    markers = {"DDPG": set(), "SAC": set(), "TD3": set()}
-    for line in lines:
-        algo, way = line.get_label().removesuffix(" (1 seed)").split(", ", 1)
-        looks[way].add((line.get_color(), line.get_linestyle()))
-        markers[algo].add(line.get_marker())
-    for values in (looks, markers):
-        assert all(len(some) == 1 for some in values.values())
-        assert len(set.union(*values.values())) == len(values)
-
-
 def test_algorithms_share_a_panel_where_they_fit(tmp_path, figures):
     for env_id, algo in (("PandaPush-v1", "sac"), ("PandaPush-v1", "td3")):
         for her in ("relabel", "none"):
@@ -155,19 +134,6 @@ def test_a_label_in_the_options_names_the_line(tmp_path, figures):
         "DDPG, paper, gamma 0.9, noise eps 0.1 (1 seed)",
         "DDPG, strong (2 seeds)",
     ]
-
-
-def test_the_ways_of_a_panel_have_different_colours():
-    panels = [["a"], ["b", "c"], ["d", "e", "f", "g"], ["h"], ["i", "a", "b", "j"]]
-    looks = plots.choose_looks([[("DDPG", way) for way in ways] for ways in panels])
-    for ways in panels:
-        assert len({looks["DDPG", way]["color"] for way in ways}) == len(ways)
-
-
-def test_presets_have_the_same_looks_in_every_figure():
-    alone = plots.choose_looks([[("DDPG", "tuned")], [("DDPG", "paper")]])
-    later = plots.choose_looks([[("DDPG", "no her"), ("DDPG", "paper")], [*alone]])
-    assert {line: later[line] for line in alone} == alone
 
 
 def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):

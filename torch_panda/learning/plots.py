@@ -11,10 +11,11 @@ that have the same name form one line.
 """
 
 import csv
+import itertools
 import json
 import textwrap
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,8 +34,6 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#00
 DASHES = ("-", "--", ":", "-.")
 # Markers of the algorithms in alphabetical order. The first algorithm has none.
 MARKERS = ("", "s", "^", "D", "v", "P", "X", "*")
-# These get the first colours and dashes, so that they look the same in all figures.
-PRESETS = ("tuned", "paper")
 
 Curves = dict[str, list[Curve]]
 """The curves of all seeds, by the label of the way to train."""
@@ -79,7 +78,12 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
         ValueError: The ending of its name is not a format.
     """
     panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
-    looks = choose_looks([list(lines) for _, lines in panels])
+    lines = [line for _, panel in panels for line in panel]
+    # The first 28 ways to train differ in dashes or colour.
+    looks = itertools.cycle(itertools.product(DASHES, COLORS))
+    ways = dict(zip(dict.fromkeys(way for _, way in lines), looks, strict=False))
+    names = sorted({algo for algo, _ in lines})
+    markers = dict(zip(names, itertools.cycle(MARKERS), strict=False))
     width = min(COLUMNS, len(panels))
     height = -(-len(panels) // width)
     # Legends are below the panels.
@@ -87,8 +91,8 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     grid = figure.subplots(height, width, squeeze=False)
     for axes in grid.flat[len(panels) :]:
         axes.remove()
-    for axes, (title, lines) in zip(grid.flat, panels, strict=False):
-        draw_panel(axes, lines, metric, looks)
+    for axes, (title, panel) in zip(grid.flat, panels, strict=False):
+        draw_panel(axes, panel, metric, ways, markers)
         # `read_runs` gives offline runs panels of their own.
         kind = "gradient" if OFFLINE in title else "environment"
         _label(axes, title, metric, f"{kind} steps")
@@ -122,57 +126,43 @@ def split(task: str, algorithms: dict[str, Curves]) -> list[tuple[str, Panel]]:
     ]
 
 
-def choose_looks(panels: list[list[Line]]) -> dict[Line, dict[str, str]]:
-    """Colour, dashes and marker of each line, the same in all panels.
-
-    Colour and dashes depend on the way to train, and the marker on the algorithm. The
-    first 28 ways differ in colour or dashes. The ways of one panel have different
-    colours, unless two of them already have the same colour from other panels.
-    """
-    unused = [(color, dashes) for dashes in DASHES for color in COLORS]
-    chosen: dict[str, tuple[str, str]] = {}
-    all_ways = {way for lines in panels for _, way in lines}
-    first = [way for way in PRESETS if way in all_ways]
-    for ways in [first, *([way for _, way in lines] for lines in panels)]:
-        for way in ways:
-            if way not in chosen:
-                taken = {chosen[other][0] for other in ways if other in chosen}
-                free = [look for look in unused if look[0] not in taken]
-                chosen[way] = (free or unused or [(COLORS[0], DASHES[0])])[0]
-                unused = [look for look in unused if look != chosen[way]]
-    algorithms = sorted({algo for lines in panels for algo, _ in lines})
-    return {
-        (algo, way): {
-            "color": chosen[way][0],
-            "linestyle": chosen[way][1],
-            "marker": MARKERS[algorithms.index(algo) % len(MARKERS)],
-        }
-        for lines in panels
-        for algo, way in lines
-    }
-
-
 def draw_panel(
     axes: Axes,
-    lines: Panel,
+    panel: Panel,
     metric: Metric,
-    looks: dict[Line, dict[str, str]],
+    ways: dict[str, tuple[str, str]],
+    markers: dict[str, str],
 ) -> None:
-    """Draw lines with a band over their seeds."""
-    for line, curves in lines.items():
+    """Draw lines with a band over their seeds.
+
+    Args:
+        axes: Where to draw.
+        panel: Curves of each line.
+        metric: Column of the curves to draw.
+        ways: Dashes and colour of each way to train.
+        markers: Marker of each algorithm.
+    """
+    for (algo, way), curves in panel.items():
         # Unfinished runs are shorter, so draw only the steps that all seeds have.
         points = [{row["step"]: row[metric] for row in curve} for curve in curves]
         steps = sorted(set.intersection(*map(set, points)))
         values = np.array([[curve[step] for step in steps] for curve in points])
         low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
         seeds = f"{len(curves)} seed{'s' if len(curves) > 1 else ''}"
-        label = textwrap.fill(f"{', '.join(line)} ({seeds})", LABEL_WIDTH)
-        look: dict[str, Any] = dict(looks[line])
-        if len(steps) == 1:
-            look["marker"] = look["marker"] or "o"
-        # markevery=0.1 draws a marker at most every tenth of the panel's diagonal.
-        axes.plot(steps, median, label=label, markersize=4, markevery=0.1, **look)
-        axes.fill_between(steps, low, high, color=look["color"], alpha=0.2, lw=0)
+        label = textwrap.fill(f"{algo}, {way} ({seeds})", LABEL_WIDTH)
+        dashes, color = ways[way]
+        axes.plot(
+            steps,
+            median,
+            dashes,
+            color=color,
+            # A line of one point needs a marker to be seen.
+            marker=markers[algo] or ("o" if len(steps) == 1 else ""),
+            markersize=4,
+            markevery=0.1,  # at most one marker in a tenth of the panel's diagonal
+            label=label,
+        )
+        axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
