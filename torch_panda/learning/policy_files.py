@@ -98,18 +98,11 @@ class SavedPolicy:
         """
         if path.is_dir():
             path = path / "checkpoint.pt"
-        keys = ("env_id", "hyperparameters", "policy")
-        content = files.read(
-            path, "a policy", keys, finite=keys[1:], map_location="cpu"
-        )
+        finite = ("hyperparameters", "policy")
+        keys = ("env_id", ("spaces", "geometry"), *finite)
+        content = files.read(path, "a policy", keys, finite=finite, map_location="cpu")
         hp = _read_hyperparameters(path, content["hyperparameters"])
-        try:
-            spaces = Spaces.from_dict(content["spaces"])
-        except (KeyError, TypeError):
-            raise ValueError(
-                f"{path} was saved by an older version of torch_panda, which did not "
-                "store the sizes of the spaces: train the policy again"
-            ) from None
+        spaces = Spaces.from_dict(content["spaces"])
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
     def make_agent(self, env: RobotTaskEnv | None = None) -> AnyAgent:
