@@ -34,10 +34,10 @@ def test_what_is_saved_is_the_action_without_noise(tmp_path):
 
 def test_numbers_of_the_task_can_be_others(tmp_path, capsys):
     args = record_demos.Args("PandaReach-v1", 4, num_envs=4, out=tmp_path / "demos.pt")
-    for threshold, success in ((0.5, "4/4"), (1e-9, "0/4")):
+    for threshold, success in ((0.5, "100.0%"), (1e-9, "  0.0%")):
         args.task_options = {"distance_threshold": threshold}
         record_demos.main(args)
-        assert f"at the end {success}" in capsys.readouterr().out
+        assert f"success at the end   {success}" in capsys.readouterr().out
     args.task_options = {"threshold": 1.0}
     with pytest.raises(SystemExit, match=r"accepted are .*distance_threshold"):
         record_demos.main(args)

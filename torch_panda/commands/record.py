@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 import tyro
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
@@ -21,6 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torch_panda
+from torch_panda.commands.evaluate import print_share
 from torch_panda.datasets.formats import Writer, load_format
 from torch_panda.datasets.generation import (
     Kind,
@@ -33,7 +35,6 @@ from torch_panda.datasets.generation import (
 from torch_panda.datasets.parts import Parts
 from torch_panda.datasets.recording import TensorWriter, add_noise, play
 from torch_panda.experts import make_expert
-from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.files import prepare, save
 from torch_panda.learning.limits import Finite, Positive, Seed, Weight, check_limits
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
@@ -81,22 +82,6 @@ class Args:
     100,000"""
     resume: bool = False
     """continue to generate data after an interruption"""
-
-
-def print_success(env_id: str, success: list[Tensor]) -> None:
-    """Print how many episodes succeeded, with 95 % intervals.
-
-    ``success`` has the success of each episode after each step, (steps, 1).
-    """
-    for when, count in (
-        ("at the end", sum(bool(flags[-1]) for flags in success)),
-        ("at any time", sum(bool(flags.any()) for flags in success)),
-    ):
-        low, high = wilson_interval(count, len(success))
-        print(
-            f"{env_id}: success {when} {count}/{len(success)} = "
-            f"{count / len(success):.1%} (95 % interval {low:.1%} to {high:.1%})"
-        )
 
 
 def open_writer(args: Args, out: Path, env: torch_panda.RobotTaskEnv) -> Writer:
@@ -203,7 +188,9 @@ def record_demonstrations(args: Args) -> None:
                     writer.add(episode, args.seed + index)
                     steps += len(episode)
             bar.update(len(new))
-    print_success(args.env_id, success)
+    print(f"{args.env_id}, {episodes} episodes")
+    print_share("success at the end", torch.stack([flags[-1] for flags in success]))
+    print_share("success at any time", torch.stack([x.any() for x in success]))
     if writer is not None:
         print(f"{steps} transitions in {writer.close()}")
 
