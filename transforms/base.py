@@ -371,7 +371,11 @@ class BufferTransform(envs.Transform):
         )
 
     def set_container(self, container: envs.Transform | envs.EnvBase) -> None:
-        """Joins the transforms of a buffer, and refuses to join an environment's."""
+        """Attaches this transform to a buffer. It cannot belong to an environment.
+
+        Raises:
+            ValueError: The container belongs to an environment.
+        """
         # Only the transforms of an environment have a parent.
         if isinstance(container, envs.EnvBase) or container.parent is not None:
             raise ValueError(ENVIRONMENT_ERROR)

@@ -184,11 +184,11 @@ class DataCheck:
     def _check_affine(self, rows: TensorDictBase) -> bool:
         """Refuses entries that are affine functions of achieved and desired goal.
 
-        An affine function has 2 * goal_dim + 1 coefficients per column. The check waits
-        until there are more distinct desired goals than coefficients. Until an object
-        moves, all rows of an episode have the same two goals and give only one
-        equation. With too few equations, an affine function also fits columns that do
-        not depend on the goals.
+        An affine function has 2 * goal_dim + 1 coefficients per column. With too few
+        equations, it also fits columns that do not depend on the goals. All rows of an
+        episode in which no object has moved yet agree in their achieved and in their
+        desired goal, so together they give one equation. Therefore the check waits
+        until there are more distinct desired goals than coefficients.
 
         Then the check refuses a column if an affine function fits it, with three
         exceptions:

@@ -71,11 +71,12 @@ class SampleTimeTransform(BufferTransform):
         return batch.squeeze(-1) if is_one_item else batch
 
     def _count_stored(self, buffer: ReplayBuffer | None) -> int:
-        """Returns how many of the remembered transitions the buffer holds."""
-        # An ensemble does not say from which of its buffers it samples. So, as
-        # without a buffer, take the newest `capacity` transitions as stored.
+        """Returns how many transitions the buffer holds."""
         if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):
             return len(buffer.storage)
+        # Without a buffer, take the newest `capacity` transitions as stored. Do the
+        # same for an ensemble, because it does not say from which of its buffers it
+        # samples.
         count = self._memory.count
         return min(count, self.capacity or count)
 

@@ -5,8 +5,9 @@ python -m torch_panda record --format minari --out panda/push-expert-v0
 python -m torch_panda record --format lerobot --out push_lerobot
 python -m torch_panda record --kind play --transitions 100000 --out push_play.pt
 
-The command prints the expert's success rate in demonstrations. For the other kinds,
-which are those of `torch_panda.datasets.generate`, it prints the hash of the data.
+By default, the command records demonstrations and prints the expert's success rate.
+With ``--kind``, one of the kinds of `torch_panda.datasets.generate`, it prints the hash
+of the data.
 """
 
 from collections.abc import Sequence

@@ -164,8 +164,8 @@ def batch_shape(
 def episode_seed(seed: int, number: int) -> int:
     """Seed of the environment for an episode of a data set.
 
-    ``env.set_env_seed(index, episode_seed(seed, number))`` and a reset start this
-    episode again.
+    To start this episode again, call ``env.set_env_seed(index, episode_seed(seed,
+    number))`` and then reset.
     """
     return _spawn(seed, number)[0]
 

@@ -35,9 +35,8 @@ LAG = 0.004
 CLEAR = 0.035  # height of the hand below which the fingers hold firmly [m]
 LIFTED = 0.075  # height of the hand during a swing [m]
 LOST = 0.025  # distance of the cube below the fingers at which it nearly falls [m]
-# Largest angle from the nearest straight orientation (edges parallel to the world's
-# axes), about any axis, at which a cube can swing without being straightened first
-# [rad].
+# A cube is straight if its edges are parallel to the world's axes. Up to this angle
+# from the nearest straight orientation [rad], it can swing without being straightened.
 TILT = 0.15
 TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
 # Rotation distances to the goal at which the task succeeds, and the hand stops.
@@ -46,10 +45,11 @@ SUCCESS, DONE = 0.2, 0.17
 Y_QUARTER_COST = 0.3  # for each quarter turn about y
 Z_QUARTER_COST = 0.15  # for each quarter turn about z
 SWING_COST = 0.1  # for a swing as the last move
-REMAINING_COST = 0.2  # times the distance to the goal after the plan
-MISS_COST = 6.0  # times the part of this distance above one of the next two limits
-GOOD_WITH_SWING = 0.15  # if a swing is the last move
-GOOD_WITHOUT_SWING = 0.13
+# Let d be the rotation distance to the goal after the plan. It costs
+# REMAINING_COST * d + MISS_COST * max(0, d - limit). The limit is GOOD_WITH_SWING if a
+# swing is the last move, and otherwise GOOD_WITHOUT_SWING.
+REMAINING_COST, MISS_COST = 0.2, 6.0
+GOOD_WITH_SWING, GOOD_WITHOUT_SWING = 0.15, 0.13
 # Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
 QUARTERS = torch.cartesian_prod(*[torch.tensor((0.0, 1.0, -1.0, 2.0))] * 2)
 TURNS = compose(
@@ -133,7 +133,7 @@ def descend(ee: Tensor, point: Tensor) -> Tensor:
     """
     offset = point - ee
     # The fingers pass the cube on both sides even if the hand is off by 3 cm along x.
-    # If it is off by more than 1 cm along y, a finger would hit the cube: stay above.
+    # If it is off by more than 1.6 cm along y, a finger would hit the cube: stay above.
     off = (offset[..., 1:2].abs() - 0.01).clamp(min=0.0)
     off = off + (offset[..., :1].abs() - 0.03).clamp(min=0.0)
     rise = offset[..., 2:] + (5 * (off - 0.006)).clamp(0.0, 0.06)
@@ -208,7 +208,8 @@ def swing(
         remaining: Rotation distance to the goal, (..., 1).
         last: Whether to hold the cube after the swing, and not set it down, (..., 1).
     """
-    height, rate, turning = ee[..., 2:] + offset[..., 2:], spin[..., 1:2], norm(spin)
+    cube_height = ee[..., 2:] + offset[..., 2:]
+    rate, turning = spin[..., 1:2], norm(spin)
     zero = torch.zeros_like(width)
     firmly = open_to(width, HOLD + (CATCH - HOLD) * (turning > 0.5))
     slipping = offset[..., 2:] < -LOST
@@ -225,8 +226,8 @@ def swing(
     set_down = (hangs | slipping) & (turning < 1) & (pitch.abs() > 0.5)
     set_down = set_down | ~last & (pitch.abs() < 0.4) & (turning < 3)
     set_down = set_down & ~((remaining < DONE) & (ee[..., 2:] > CLEAR))
-    release = torch.where(height < 0.026, 1.0, firmly)
-    down = torch.cat((zero, zero, GAIN * (0.019 - height), release), -1)
+    release = torch.where(cube_height < 0.026, 1.0, firmly)
+    down = torch.cat((zero, zero, GAIN * (0.019 - cube_height), release), -1)
     return torch.where(set_down, down, lift)
 
 
@@ -255,8 +256,9 @@ def act(
     needs_nothing = ~needs_swing & (plan.z_quarters == 0) & comes_to_rest
     needs_nothing = needs_nothing | (remaining < DONE) & (turning < 0.5) & on_table
 
-    # Fingers that close on the centre straighten the cube. A straight cube is grasped
-    # aside from its centre. A spinning cube is caught when it is nearly straight.
+    # Fingers that close on the centre straighten the cube. A straight cube that has to
+    # swing is grasped beside its centre. A spinning cube is caught when it is nearly
+    # straight.
     now = straighten(cube)
     tilt = 2 * dot(cube, now).abs().clamp(max=1.0).double().acos().to(cube)
     slow, straight = spin_z.abs() < 1.5, tilt < TILT
@@ -275,7 +277,7 @@ def act(
     action = torch.where(needs_nothing, rise, action)
 
     # On the table, squeeze a crooked cube at its centre. Then open the fingers to grasp
-    # it aside from its centre.
+    # it beside its centre.
     just_grasped = on_table & (offset[..., 2:].abs() < 0.012)
     centred = offset[..., :1].abs() < 0.008
     crooked = just_grasped & ~straight & centred

@@ -1,4 +1,4 @@
-"""State of a run, from which it resumes bit for bit, and locks of folders."""
+"""Locks of run folders, and the saved state from which a run resumes bit for bit."""
 
 import json
 import os

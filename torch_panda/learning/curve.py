@@ -54,7 +54,7 @@ class Curve:
         self.env = make(env_id, num_envs=NUM_ENVS, device=device)
 
     def begin(self, checkpoint: Checkpoint) -> None:
-        """Evaluate the policy of a new run. A resumed run has this row already.
+        """Evaluate the policy of a new run.
 
         Raises:
             OSError: A file cannot be written.
@@ -72,7 +72,7 @@ class Curve:
 
         Args:
             progress: Progress of the run. The row is added to its attribute ``curve``.
-            losses: Mean losses since the last evaluation, which are further columns.
+            losses: Mean losses, which are further columns.
 
         Raises:
             OSError: A file cannot be written.

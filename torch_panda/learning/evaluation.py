@@ -113,8 +113,8 @@ def evaluate(
     check_positive(episodes=episodes, num_envs=num_envs)
     if not callable(policy):
         raise TypeError(
-            f"policy must be a TensorDictModule, got {policy!r}: load_policy reads one "
-            "from a file"
+            f"policy must be a module or a function, got {policy!r}: load_policy reads "
+            "one from a file"
         )
     if tasks not in get_args(Tasks):
         raise ValueError(f'tasks must be "random" or "fixed", got {tasks!r}')
@@ -179,7 +179,12 @@ def evaluate_fixed_starts(
 
 
 def _replace_first_actions(policy: Policy, actions: Tensor) -> Policy:
-    """Return a policy whose first actions are (num_envs, steps, action size)."""
+    """Return a policy that takes the given actions first, and then its own.
+
+    Args:
+        policy: The policy.
+        actions: The first actions, (num_envs, steps, action size).
+    """
     remaining = list(actions.unbind(1))
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:

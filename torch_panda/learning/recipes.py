@@ -127,7 +127,7 @@ CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
 }
 # The changes that "sample-efficient" makes to the recipe of any task. Push has less
 # success after 20,000 steps if one of the first three is left out. The fourth keeps the
-# learning rate constant where a recipe anneals it, as that of PickAndPlace does.
+# learning rate constant even if the task's recipe anneals it.
 SAMPLE_EFFICIENT: dict[str, Any] = {
     "exploration": "points",
     "updates_per_step": 2.0,
@@ -167,8 +167,8 @@ def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
         preset: "tuned", or "sample-efficient".
 
     Returns:
-        The options that differ from their defaults, by name. For a user's own task,
-        "tuned" changes no option, and "sample-efficient" changes `SAMPLE_EFFICIENT`.
+        The options that the recipe sets, by name. For a user's own task, "tuned" sets
+        none, and "sample-efficient" sets those in `SAMPLE_EFFICIENT`.
 
     Raises:
         ValueError: The id is unknown.

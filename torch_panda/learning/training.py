@@ -86,7 +86,8 @@ class Run:
             num_envs=args.num_envs,
             # The constructor of the collector calls the exploration once, before the
             # first `reseed`. With exploration "points", this call may draw a point near
-            # an object, which depends on the first observation and so on this seed.
+            # an object. The point depends on the first observation, and therefore on
+            # this seed.
             seed=args.seed,
             device=args.device,
             randomize=randomize,

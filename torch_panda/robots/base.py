@@ -286,9 +286,9 @@ class Robot(Configured):
     ) -> None:
         """Set the motors of the robot in one client.
 
-        The thread that steps the client calls this method. A subclass overrides it for
-        a control that `MotorControl` cannot express. Python threads then step the
-        clients.
+        A subclass overrides this method for a control that `MotorControl` cannot
+        express. Python threads then step the clients, and each calls the method for the
+        client that it steps.
 
         Args:
             client: The client.

@@ -90,10 +90,11 @@ class ObjectState(NamedTuple):
 class Task(Configured, ABC):
     """A task: scene, goals, observation, success and reward.
 
-    One object describes the task for all environments of a simulation. The methods
-    whose names start with ``sample_`` draw for one episode of one environment, from a
-    random generator of that episode. All other methods are batched over the
-    environments. Lengths are in metres, and positions are in the world frame.
+    One object describes the task for all environments of a simulation. `build` and
+    `randomize` get the client of one environment. The methods whose names start with
+    ``sample_`` draw for one episode of one environment, from a random generator of that
+    episode. All other methods are batched over the environments. Lengths are in metres,
+    and positions are in the world frame.
 
     A subclass sets ``goal_dim`` and ``observation_dim``. It also sets
     ``max_episode_steps`` if an episode does not have 50 steps. The arguments of the
@@ -119,7 +120,7 @@ class Task(Configured, ABC):
     """Where the observation holds the achieved goal; None if it does not.
 
     `RobotTaskEnv.goal_indices` needs it, and so does the environment's option
-    ``goal="observation"``, which makes full observations the goals. A subclass that
+    ``goal="observation"``, with which a goal is a full observation. A subclass that
     overrides `observation` or `achieved_goal` must declare it again."""
 
     observation_layout: ClassVar[tuple[Quantity, ...] | None] = None

@@ -50,8 +50,8 @@ class OfflineHyperparameters:
     learning_rate: Ratio = 3e-4
     """learning rate of Adam"""
     tau: Ratio = 0.005
-    """fraction of the way to the trained networks that target networks move in each
-    step (not the tau of expectiles)"""
+    """in each step, target networks move this fraction of the way to the trained
+    networks (not the tau of expectiles)"""
     hidden_size: Positive = 256
     """units of each of the three hidden layers, with GELU and LayerNorm"""
     batch_size: Positive = 256

@@ -95,8 +95,9 @@ class HIQL(OfflineAgent):
 
         The three losses are those of the high-level policy, the low-level policy and
         the values of waypoints. The waypoint of the low level does not lie beyond the
-        end of the episode. The waypoint of the high level does not lie beyond its goal,
-        which is drawn again, because its row must be known.
+        end of the episode. The waypoint of the high level does not lie beyond the goal
+        of the policy loss. The batch does not say in which row that goal was achieved,
+        so this method draws a new goal.
         """
         t = batch["index"].cpu()
         last = data.last[t].cpu()
