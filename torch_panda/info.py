@@ -68,12 +68,6 @@ def environments() -> list[str]:
     return lines
 
 
-def renderers() -> list[str]:
-    """Renderers of the installed pybullet, a line for each."""
-    egl = "installed" if find_spec("eglRenderer") else "not installed"
-    return ["tiny (TinyRenderer, on the CPU): installed", f"egl (OpenGL): {egl}"]
-
-
 def extras() -> list[str]:
     """Purpose of each extra, and whether it is installed, a line for each."""
     lines = []
@@ -121,7 +115,6 @@ def describe() -> str:
         "threads": [f"{threads}, and at most one per environment"],
         "stepping": [stepping()],
         "solver": [str(solver.activate())],
-        "renderers": renderers(),
         "extras": extras(),
         "missing": missing(),
         "environments": environments(),
