@@ -8,13 +8,8 @@ one replay buffer for all workers, takes gradient steps, and sends the new weigh
 to that worker. The other workers continue meanwhile, and batches arrive in varying
 order. So two runs with the same seed differ.
 
-Without `--address` the workers run on this machine. To start a cluster of machines that
-all have torch_panda and the same version of Ray:
-
-    ray get-auth-token --generate      # once; then copy ~/.ray/auth_token to all
-    export RAY_AUTH_MODE=token         # on all machines
-    ray start --head                   # on the first machine, which runs this command
-    ray start --address=FIRST:6379     # on the other machines
+Without `--address` the workers run on this machine. The guide learning/README.md says
+how to start a cluster of machines.
 """
 
 import logging
