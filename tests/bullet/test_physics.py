@@ -72,9 +72,7 @@ def test_every_parameter_reaches_bullet(change):
     ("arguments", "message"),
     [
         ({"timestep": 0.0}, "timestep must be positive"),
-        ({"timestep": float("nan")}, "timestep must be positive"),
         ({"n_substeps": 0}, "n_substeps must be at least 1, got 0"),
-        ({"solver_iterations": -1}, "solver_iterations must be at least 1, got -1"),
         (
             {"residual_threshold": -1.0},
             "residual_threshold must be finite and at least 0",
@@ -82,7 +80,6 @@ def test_every_parameter_reaches_bullet(change):
         ({"position_gain": 0.0}, r"position_gain must lie in \(0, 1\], got 0.0"),
         ({"position_gain": 1.5}, r"position_gain must lie in \(0, 1\], got 1.5"),
         ({"gravity": float("inf")}, "gravity must be finite"),
-        ({"ik_iterations": 0}, "ik_iterations must be at least 1, got 0"),
         ({"ik_damping": 0.0}, "ik_damping must be positive and finite, got 0.0"),
     ],
 )

@@ -67,7 +67,6 @@ def test_links_and_joints_that_the_urdf_lacks_are_refused(options):
     "options",
     [
         {"num_arm_joints": 0},
-        {"num_arm_joints": -1},
         {"num_arm_joints": 8},
         {"base_position": (0.0, 0.0)},
         {"base_position": (0.0, 0.0, float("nan"))},

@@ -302,12 +302,9 @@ def test_bad_action_changes_nothing(env, action, error, message):
     ("arguments", "error"),
     [
         ({"num_envs": 0}, ValueError),
-        ({"num_envs": "a"}, TypeError),
         ({"num_envs": True}, TypeError),
-        ({"num_threads": -1}, ValueError),
         ({"num_threads": 2.5}, TypeError),
         ({"seed": -1}, ValueError),
-        ({"seed": 1.5}, TypeError),
         ({"render_size": 64}, ValueError),  # without pixels, nothing is rendered
         ({"camera": torch_panda.Camera()}, ValueError),
     ],
