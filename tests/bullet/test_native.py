@@ -15,7 +15,7 @@ from torch_panda.bullet import native
 FOLDER = Path(native.__file__).parent
 SOURCES = ("client.h", "client.c", "environment.c", "loop.c", "reset.c")
 # Hash of the C sources without comments and white space, by version.
-HASHES = {4: "660c5e2f85e047d4"}
+HASHES = {5: "8efe62b93ea404ba"}
 
 
 def hash_of_sources():

@@ -9,7 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { LOOP_VERSION = 4 }; /* native.py refuses a library of another version */
+enum { LOOP_VERSION = 5 }; /* native.py refuses a library of another version */
 
 typedef void *handle;          /* of a client, a command or a status */
 typedef const double *doubles; /* input */

@@ -31,7 +31,7 @@ from torch_panda.bullet.library import bind
 
 # Version of the C sources, as ``loop_version`` in client.h: the library must have been
 # compiled from sources of this version.
-VERSION = 4
+VERSION = 5
 
 # "native": threads of C. "ctypes": threads of Python that call Bullet through ctypes.
 LoopName = Literal["native", "ctypes"]
