@@ -87,3 +87,14 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(
     data = next(iter(run.collector))
     run.close()
     assert data.shape == (2, steps)
+
+
+@pytest.mark.parametrize("continues", [False, True])
+def test_training_episodes_can_go_on_after_success(continues, tmp_path):
+    args = Args(env_id="PandaReach-v3", num_envs=50, continue_after_success=continues)
+    run = Run(args, tmp_path)
+    after = next(iter(run.collector))["next"]
+    run.close()
+    assert after["success"].any()
+    assert after["terminated"].any() != continues
+    assert run.curve.env.terminate_on_success

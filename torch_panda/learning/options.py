@@ -58,6 +58,9 @@ class Args(Hyperparameters):
     """fraction of training episodes that start in the middle of the task: the hand is
     at an object or holds it, or the first cube of Stack is at its goal. If it is above
     0, all training episodes last at most 50 steps"""
+    continue_after_success: bool = False
+    """let training episodes last until their time limit, even if the id ends them at
+    success, as -v3 does. Evaluations still follow the id"""
     randomize: Factor = 1.0
     """largest factor f of domain randomization. For every training episode, the mass
     and friction of the objects and the friction of the table are drawn between 1 / f

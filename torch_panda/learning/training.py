@@ -15,6 +15,7 @@ import time
 from collections import defaultdict
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -81,6 +82,9 @@ class Run:
             randomize = Randomization(
                 object_mass=factors, object_friction=factors, table_friction=factors
             )
+        options: dict[str, Any] = {}
+        if args.continue_after_success:
+            options["terminate_on_success"] = False
         self.env = make(
             args.env_id,
             num_envs=args.num_envs,
@@ -91,6 +95,7 @@ class Run:
             seed=args.seed,
             device=args.device,
             randomize=randomize,
+            **options,
         )
         self.agent = make_agent(self.env, args)
         steps = self.env.max_episode_steps
