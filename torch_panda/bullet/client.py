@@ -623,7 +623,8 @@ class PhysicsClient:
 
         Args:
             body_a: Only contacts of this body, with the two bodies swapped where
-                necessary, so that this body is a. None means all contacts, unswapped.
+                necessary, so that this one is ``body_a``. None means all contacts,
+                unswapped.
             body_b: Only contacts whose body b is this one (after swapping). None means
                 any body b.
         """

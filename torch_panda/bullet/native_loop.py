@@ -65,7 +65,7 @@ class NativeLoop:
         # Outcome of each client's last step or reset. The field `expected` is 0 if
         # nothing failed, DIVERGED if the state is not finite, and CLIENT_CLOSED if the
         # client is closed. Otherwise a command failed, and `expected` is the status
-        # code of its success.
+        # code with which it would have succeeded.
         self._failures = (native.Failure * n)()
         # A ctypes struct keeps alive the objects that it points to. It has only the
         # addresses of tensors, so `self._state` keeps the tensors alive.

@@ -64,8 +64,8 @@ class Episodes:
         simulation: The Bullet clients and their state.
         renderer: Draws the environments.
         seeds: Seeds of the episodes.
-        entries: Shape and dtype of each observed key beside ``observation`` and the
-            goals.
+        entries: Shape and dtype of the keys that sensors, task and randomization add to
+            the observations.
         goal_indices: Column of ``observation`` of each number of the task's achieved
             goal, or None; see `RobotTaskEnv.goal_indices`.
         goal_dim: Size of ``achieved_goal`` and ``desired_goal``.

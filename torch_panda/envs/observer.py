@@ -29,8 +29,7 @@ class EpisodeObserver:
         TypeError: A function of the robot or the task does not return a tensor.
 
     Attributes:
-        entries: Shape and dtype of each observed key beside ``observation`` and the
-            goals.
+        entries: Shape and dtype of the keys that sensors, task and randomization add.
     """
 
     def __init__(
@@ -69,9 +68,8 @@ class EpisodeObserver:
         extra = ExtraObserver(task, simulation)
         self._extra_keys = tuple(extra.entries)
         observers: list[Observer] = [*self._attached_sensors, extra]
-        # Keys that sensors and tasks may not observe, because a reset would mistake
-        # observations with these keys for a state. The sensor "joint_state" may use two
-        # of them; see `is_state`.
+        # Keys of states, which sensors and tasks may not observe. Only the sensor
+        # "joint_state" may use two of them; see `is_state`.
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
         if any(isinstance(sensor, JointState) for sensor in sensors):
             reserved -= {"joint_position", "joint_velocity"}

@@ -172,8 +172,8 @@ class PhysicsFactors:
                 self._gravity = (index, physics.gravity)
                 continue
             target = targets[name]
-            # Value to use instead of 0: 1, so that the drawn number becomes the value,
-            # or 0, which leaves the link out.
+            # A nominal value of 0 is replaced by 1 if the drawn number should become
+            # the value itself. Otherwise it stays 0, and the link is left out.
             zero_substitute = 1.0 if name in _ABSOLUTE_AT_ZERO else 0.0
             for body, link in target.links:
                 if value := target.nominal_value(body, link) or zero_substitute:

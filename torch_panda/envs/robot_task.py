@@ -355,8 +355,9 @@ class RobotTaskEnv(EnvBase):
     def set_env_seed(self, env: int, seed: int) -> None:
         """Seed one environment.
 
-        From its next reset, it plays the episodes that environment 0 plays with
-        ``seed``. Gymnasium, for example, seeds each environment separately.
+        From its next reset, it plays the episodes of environment 0 of a `RobotTaskEnv`
+        that was made with ``seed``. Gymnasium, for example, seeds each environment
+        separately.
 
         Raises:
             ValueError: The index is out of range, or the seed is negative.

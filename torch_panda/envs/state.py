@@ -172,10 +172,10 @@ def read_state(
         Entries of shape (len(envs), ...), in the dtypes of ``present``.
 
     Raises:
-        ValueError: An entry has a wrong shape, or a number that is not finite or above
-            1e6 in magnitude; an object's quaternion is not a unit quaternion; an exact
-            state lacks entries; or there is no state. A ``step_count`` alone is not a
-            state, because torchrl's `StepCounter` writes it too.
+        ValueError: An entry has a wrong shape, or a number that is infinite, NaN or
+            above 1e6 in magnitude; an object's quaternion is not a unit quaternion; an
+            exact state lacks entries; or there is no state. A ``step_count`` alone is
+            not a state, because torchrl's `StepCounter` writes it too.
     """
     if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
         accepted = [key for key in present if key != "step_count"]

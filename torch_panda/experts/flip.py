@@ -41,13 +41,13 @@ TILT = 0.15
 TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
 # Rotation distances to the goal at which the task succeeds, and the hand stops.
 SUCCESS, DONE = 0.2, 0.17
-# A plan costs the sum of these, and 1 more if it does not end in success.
+# The cost of a plan is the sum of the next three costs, of 1 if the plan does not end
+# in success, and of REMAINING_COST * d + MISS_COST * max(0, d - limit). Here d is the
+# rotation distance to the goal after the plan. The limit is GOOD_WITH_SWING if a swing
+# is the last move, and otherwise GOOD_WITHOUT_SWING.
 Y_QUARTER_COST = 0.3  # for each quarter turn about y
 Z_QUARTER_COST = 0.15  # for each quarter turn about z
 SWING_COST = 0.1  # for a swing as the last move
-# Let d be the rotation distance to the goal after the plan. It costs
-# REMAINING_COST * d + MISS_COST * max(0, d - limit). The limit is GOOD_WITH_SWING if a
-# swing is the last move, and otherwise GOOD_WITHOUT_SWING.
 REMAINING_COST, MISS_COST = 0.2, 6.0
 GOOD_WITH_SWING, GOOD_WITHOUT_SWING = 0.15, 0.13
 # Quarter turns about y and then z: numbers (16, 2), quaternions (16, 4), and costs.
@@ -126,7 +126,9 @@ def make_plan(cube: Tensor, spin: Tensor, goal: Tensor, table: Table) -> Plan:
 
 
 def descend(ee: Tensor, point: Tensor) -> Tensor:
-    """Descend to a point, with room for open fingers on both sides of a cube.
+    """Descend to a point at a cube.
+
+    Stay above the cube until the open fingers pass it on both sides.
 
     Returns:
         The action of the arm, (..., 3).

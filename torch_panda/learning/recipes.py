@@ -89,8 +89,9 @@ RECIPES: dict[type[Task], dict[str, Any]] = {
         "eval_interval": 20_000,
     },
     # For training with demonstrations: without them no training has solved the task. A
-    # tenth of a millimetre separates a firm grasp from one in which the cube swings, so
-    # with ``fine_fingers`` the networks output the cube root of the fingers' action.
+    # tenth of a millimetre separates a firm grasp from one that lets the object swing.
+    # With ``fine_fingers``, an action of the fingers is the third power of the
+    # network's output, so small finger movements are more precise.
     Flip: {
         **OBJECT,
         "relative_inputs": "fine",
@@ -147,10 +148,11 @@ SAMPLE_EFFICIENT_CHANGES: dict[type[Task], dict[str, Any]] = {
     },
 }
 # Changes to SAMPLE_EFFICIENT_CHANGES for ids in which success ends an episode, such as
-# -v3. If success also ended the training episodes of Push, the policy would rarely see
-# the states behind a goal that it just missed, and would not turn back. A small penalty
-# on actions makes it faster. In PickAndPlace-v3, fingers and cube have less friction,
-# and random grasps rarely hold the cube.
+# -v3. If training episodes of Push ended at success too, the cube would rarely be
+# beyond its goal in training. A policy that misses a goal by a few millimetres would
+# then not turn back. A small penalty on actions makes the policy faster. In
+# PickAndPlace-v3, fingers and cube have less friction, and random grasps rarely hold
+# the cube.
 SAMPLE_EFFICIENT_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
     Push: {
         "continue_after_success": True,
