@@ -21,7 +21,8 @@ class HindsightAugment(BufferTransform):
     trajectory id.
 
     Args:
-        reward_fn: See `BufferTransform`. It is called once per `extend`.
+        reward_fn: See `BufferTransform`. `extend` calls it at most once to
+            relabel. The checks of the first batches call it too.
         k: Number of relabelled copies of each transition.
         **options: Arguments of `BufferTransform`, with strategies that stay within one
             episode.
@@ -59,8 +60,9 @@ class HindsightAugment(BufferTransform):
         ndim = 1 if buffer is None else buffer.storage.ndim
         if ndim > 1 or samples_slices(buffer):
             raise RuntimeError(
-                "HindsightAugment stores single rows: use a storage of ndim=1, and for "
-                'sampled slices HindsightRelabel(unit="slice")'
+                "HindsightAugment stores single rows: it needs a storage of ndim=1 and "
+                "a sampler that does not sample slices; for slices use "
+                'HindsightRelabel(unit="slice")'
             )
         mask = self._find_mask(tensordict)
         batch = tensordict if mask is None else tensordict[mask]
@@ -83,7 +85,8 @@ class HindsightAugment(BufferTransform):
 
         The transitions of unfinished episodes are kept for a later call.
         """
-        # Number of transitions from the oldest one that is held back to the newest.
+        # Number of transitions since the oldest one that is still held back, including
+        # it.
         num_remembered = 0
         if self._unfinished:
             oldest = int(self._unfinished[0].get(SERIAL_KEY).min())

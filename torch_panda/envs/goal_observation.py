@@ -84,8 +84,9 @@ class GoalObserver:
     In such a state the objects are at their goals and at rest. The hand is in its
     neutral pose, or at the goal if the goal is a position of the hand.
 
-    `update` writes these states into the tensors of the simulation, observes them, and
-    restores the tensors. It does not change Bullet's clients.
+    `update` writes the objects and the neutral pose into the tensors of the simulation,
+    observes them, restores the tensors, and inserts the goals. It does not change
+    Bullet's clients.
 
     Attributes:
         desired: Observations of the present episodes' goals, (n, observation_dim)
@@ -131,8 +132,8 @@ class GoalObserver:
         finally:
             simulation.state.rows.copy_(saved)
         desired = observation[envs].float()
-        # Insert the goal itself, because the observation may round it. A goal for the
-        # hand is missing from the observation, because the hand is in its neutral pose.
+        # Insert the goal itself. The observation may have rounded it. For goals of the
+        # hand (Reach), the observation still holds the neutral pose.
         desired[:, self._goal_indices] = goal[envs].float()
         self.desired[envs] = desired
 

@@ -122,8 +122,8 @@ class EpisodeStarts:
         if type(self._task).marker_pose is not Task.marker_pose:
             self._simulation.marker_pose[envs] = self.marker_pose(self.goal[envs], envs)
             return
-        # The poses of the default `Task.marker_pose`, from arrays in a fifth of the
-        # time.
+        # Write the poses of the default `Task.marker_pose` through arrays. This takes a
+        # fifth of its time.
         poses, goals = self._marker_poses, self._arrays["desired_goal"]
         for env in envs:
             poses[env, :, :3] = goals[env].reshape(-1, 3)

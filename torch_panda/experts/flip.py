@@ -41,10 +41,11 @@ TILT = 0.15
 TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
 # Rotation distances to the goal at which the task succeeds, and the hand stops.
 SUCCESS, DONE = 0.2, 0.17
-# The cost of a plan is the sum of the next three costs, of 1 if the plan does not end
-# in success, and of REMAINING_COST * d + MISS_COST * max(0, d - limit). Here d is the
-# rotation distance to the goal after the plan. The limit is GOOD_WITH_SWING if a swing
-# is the last move, and otherwise GOOD_WITHOUT_SWING.
+# The cost of a plan is a sum. Each quarter turn and a last swing add the three costs
+# below. A plan that does not end in success adds 1. All plans add REMAINING_COST * d +
+# MISS_COST * max(0, d - limit). Here d is the rotation distance to the goal after the
+# plan. The limit is GOOD_WITH_SWING if a swing is the last move, and otherwise
+# GOOD_WITHOUT_SWING.
 Y_QUARTER_COST = 0.3  # for each quarter turn about y
 Z_QUARTER_COST = 0.15  # for each quarter turn about z
 SWING_COST = 0.1  # for a swing as the last move
@@ -177,8 +178,13 @@ def grasp(
 ) -> Tensor:
     """Move the open fingers beside the cube's centre, and close them there.
 
-    They close at the distance ``aside`` from the centre along x [m], (..., 1), in the
-    environments where ``may_close``, (..., 1) bool, is true.
+    Args:
+        ee: Position of the end-effector, (..., 3).
+        width: Distance between the fingers, (..., 1).
+        position: Position of the cube, (..., 3).
+        velocity: Velocity of the cube, (..., 3).
+        aside: Offset of the grasp from the centre along x [m], (..., 1).
+        may_close: Whether the fingers may close, (..., 1) bool.
     """
     x, y, z = (position + 0.04 * velocity).split(1, -1)
     point = torch.cat((x + aside, y, z.clamp(0.02, 0.03)), -1)

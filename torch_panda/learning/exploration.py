@@ -16,7 +16,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-# Corners of the box of points: the middle of the table, world frame [m].
+# Two corners of the box from which points are drawn, in the world frame [m]. The box is
+# over the middle of the table.
 LOWEST_POINT, HIGHEST_POINT = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
 # Half of the points are near an object: at most OBJECT_DISTANCE from its centre along x
 # and along y, and up to the heights in OBJECT_HEIGHTS below and above its centre [m].
