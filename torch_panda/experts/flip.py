@@ -41,11 +41,11 @@ TILT = 0.15
 TAP_ASIDE = 0.025  # offset from the centre at which a finger knocks a corner [m]
 # Rotation distances to the goal at which the task succeeds, and the hand stops.
 SUCCESS, DONE = 0.2, 0.17
-# The cost of a plan is a sum. Each quarter turn and a last swing add the three costs
-# below. A plan that does not end in success adds 1. All plans add REMAINING_COST * d +
-# MISS_COST * max(0, d - limit). Here d is the rotation distance to the goal after the
-# plan. The limit is GOOD_WITH_SWING if a swing is the last move, and otherwise
-# GOOD_WITHOUT_SWING.
+# The cost of a plan is a sum. Each quarter turn and a last swing adds its own cost, see
+# the next three lines. A plan that does not end in success adds 1. All plans add
+# REMAINING_COST * d + MISS_COST * max(0, d - limit). Here d is the rotation distance to
+# the goal after the plan. The limit is GOOD_WITH_SWING if a swing is the last move, and
+# otherwise GOOD_WITHOUT_SWING.
 Y_QUARTER_COST = 0.3  # for each quarter turn about y
 Z_QUARTER_COST = 0.15  # for each quarter turn about z
 SWING_COST = 0.1  # for a swing as the last move
