@@ -21,8 +21,8 @@ class HindsightAugment(BufferTransform):
     trajectory id.
 
     Args:
-        reward_fn: See `BufferTransform`. Each call of `extend` calls it
-            at most once to relabel, and in the first batches also to check the data.
+        reward_fn: See `BufferTransform`. `extend` calls it at most once to
+            relabel. For the first batches, `extend` also calls it to check the data.
         k: Number of relabelled copies of each transition.
         **options: Arguments of `BufferTransform`, with strategies that stay within one
             episode.
@@ -85,8 +85,8 @@ class HindsightAugment(BufferTransform):
 
         The transitions of unfinished episodes are kept for a later call.
         """
-        # Number of transitions from the oldest one that is still held back (included)
-        # until now.
+        # Number of transitions since the oldest one that is still held back, including
+        # that one.
         num_remembered = 0
         if self._unfinished:
             oldest = int(self._unfinished[0].get(SERIAL_KEY).min())
