@@ -2,8 +2,8 @@
 
 The broad phase is the part of collision detection that finds pairs of links whose
 axis-aligned bounding boxes (AABBs) overlap. Bullet solves contacts in the order in
-which the broad phase found the pairs of links. Earlier steps and episodes affect this
-order, so two worlds with equal poses and velocities can step differently.
+which the broad phase found their pairs. This order depends on earlier steps and
+episodes. So two worlds with equal poses and velocities can step differently.
 
 The state of the broad phase consists of
 

@@ -42,9 +42,9 @@ from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
-# Limit on the steps that each environment takes in an iteration, in a run in which some
-# episodes start in the middle of the task. Those episodes need fewer steps. The limit
-# also cuts the other episodes, because all environments take the same number of steps.
+# With ``--start-at-object``, each environment takes at most this number of steps in an
+# iteration. Episodes that start in the middle of the task need no more. The limit also
+# cuts the other episodes, because all environments take the same number of steps.
 MAX_STEPS_FROM_MIDDLE = 50
 # Of the sequences in which the achieved goal does not change (see `buffers.has_moved`),
 # the replay buffer stores this fraction. A sequence is the steps of one environment in

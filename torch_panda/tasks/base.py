@@ -18,9 +18,9 @@ RewardType = Literal["sparse", "dense"]
 Quantity = Literal[
     "position", "velocity", "euler_angles", "quaternion", "angular_velocity", "number"
 ]
-"""What consecutive numbers of an observation mean. A "number" is a single one that does
-not change if the scene is rotated or mirrored. A quaternion (xyzw) has 4 numbers. The
-other quantities have 3, in the world frame."""
+"""Physical quantity that consecutive numbers of an observation describe. A "number" is
+one number, which does not change if the scene is rotated or mirrored. A quaternion
+(xyzw) has 4 numbers. The other quantities have 3, in the world frame."""
 OBJECT_LAYOUT: tuple[Quantity, ...] = (
     "position",
     "euler_angles",

@@ -223,8 +223,8 @@ int move_aabb(struct aabbs *aabbs, struct broad_phase *broad_phase, struct proxy
         set_limits(aabbs, index, &moved);
         broad_phase->needs_cleanup = 1;
         broad_phase->num_updates++;
-        /* Bullet counts known pairs as new. The moved object always has a bit of its own,
-           which is not a pair, so the loop counts one bit less than are set. */
+        /* Bullet counts known pairs as new. One bit of `overlaps` belongs to the moved
+           object itself. This bit is not a pair, so the loop counts the other bits. */
         while (overlaps &= overlaps - 1) broad_phase->num_new_pairs++;
     }
     broad_phase->num_calls++;
