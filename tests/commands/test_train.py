@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from tests.commands.runs import After, Kill, points, read_curve, weights
+from tests.devices import DEVICES
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import training
@@ -56,6 +57,7 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     "options",
     [
@@ -70,10 +72,10 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
     ],
     ids=lambda options: "-".join(map(str, options.values())),
 )
-def test_resumed_run_equals_uninterrupted_run(tmp_path, options):
+def test_resumed_run_equals_uninterrupted_run(tmp_path, options, device):
     """A stop after an iteration changes no bit of the result."""
     args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=300, **options)
-    args = replace(args, updates_per_step=0.1, eval_interval=100)
+    args = replace(args, updates_per_step=0.1, eval_interval=100, device=device)
     whole = Run(args, tmp_path)
     assert whole.train()
     whole.close()

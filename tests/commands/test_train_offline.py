@@ -8,6 +8,7 @@ import torch
 
 import torch_panda
 from tests.commands.runs import After, points, read_curve, weights
+from tests.devices import DEVICES
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -45,14 +46,15 @@ def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
         refine.main(refine.Args(policy=out, out=tmp_path / "refined"))
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("algo", ["hiql", "qrl"])  # the two with most state
-def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo):
-    args = make_args(tmp_path / "whole", algo)
+def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo, device):
+    args = make_args(tmp_path / "whole", algo, device=device)
     whole = train.make_run(args, args.out)
     assert whole.train()
     whole.close()
 
-    args = make_args(tmp_path / "stopped", algo)
+    args = make_args(tmp_path / "stopped", algo, device=device)
     stopped = train.make_run(args, args.out)
     assert not stopped.train(After(3))
     stopped.close()
@@ -66,9 +68,10 @@ def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo):
     assert [row["step"] for row in points(whole)] == [0, 4, 6]
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("algo", OFFLINE_AGENTS)
-def test_the_saved_policy_acts_as_the_agent(tmp_path, algo):
-    args = make_args(tmp_path, algo, total_steps=2)
+def test_the_saved_policy_acts_as_the_agent(tmp_path, algo, device):
+    args = make_args(tmp_path, algo, total_steps=2, device=device)
     run = train.make_run(args, args.out)
     run.train()
     run.close()
@@ -78,7 +81,7 @@ def test_the_saved_policy_acts_as_the_agent(tmp_path, algo):
     policy = torch_panda.load_policy(tmp_path)
     assert torch.equal(random_state, torch.get_rng_state())
     with torch.no_grad():
-        expected = run.agent.policy(td.clone())["action"]
+        expected = run.agent.policy.cpu()(td.clone())["action"]
     assert torch.equal(policy(td.clone())["action"], expected)
 
 

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase
 
 import torch_panda
+from tests.devices import on_gpu
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.solver import activate
 from torch_panda.envs import robot_task
@@ -369,7 +370,7 @@ def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):
             client.step(1)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@on_gpu
 def test_outputs_on_cuda():
     with torch_panda.make("PandaPush-v1", num_envs=2, device="cuda") as env:
         td = env.rollout(3)

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
+from tests.devices import DEVICES
 from tests.transforms.identifiable import (
     STORED_REWARD,
     Envs,
@@ -13,9 +14,11 @@ from tests.transforms.identifiable import (
 from torch_panda.transforms import HindsightAugment
 
 
-def make_buffer(capacity=10_000, buffer=TensorDictReplayBuffer, **options):
+def make_buffer(
+    capacity=10_000, buffer=TensorDictReplayBuffer, device="cpu", **options
+):
     return buffer(
-        storage=LazyTensorStorage(capacity),
+        storage=LazyTensorStorage(capacity, device=device),
         transform=HindsightAugment(reward_fn, **options),
         batch_size=64,
     )
@@ -46,6 +49,18 @@ def test_every_transition_of_ended_episodes_and_k_copies(layout, strategy, buffe
     assert sorted(achieved[~mask].tolist()) == sorted(ended)
     assert sorted(achieved[mask].tolist()) == sorted(ended * k)
     assert (stored["next", "reward"][~mask] == STORED_REWARD).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_storage_on_a_device(device):
+    rb = make_buffer(device=device, strategy="future")
+    envs = Envs(3, [5, 9])
+    for data_device in ("cpu", device):
+        rb.extend(envs.chunk(10).reshape(-1).to(data_device))
+    stored = rb.storage[:]
+    assert stored["desired_goal"].device.type == device
+    assert relabelled(stored).any()
+    check_batch(stored.cpu(), stored.cpu(), "future")
 
 
 def test_nothing_is_stored_until_an_episode_ends():

@@ -6,11 +6,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torchrl.data import (
     LazyMemmapStorage,
+    LazyTensorStorage,
     ReplayBuffer,
     SliceSampler,
     TensorDictReplayBuffer,
 )
 
+from tests.devices import DEVICES
 from tests.transforms.identifiable import (
     Envs,
     check_goals,
@@ -74,6 +76,18 @@ def test_storages_on_disk_and_prefetching(cls, prefetch, tmp_path):
         check_sample(rb.sample(), before)
     check_sample(rb[:], before)
     assert (rb.storage[:] == before).all(), "the storage was written into"
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_storage_on_a_device(device):
+    storage = LazyTensorStorage(60, device=device)
+    rb = buffer(GoalSampler(ALL, reward_fn), storage=storage)
+    envs = Envs(3, [5, 9])
+    for _ in range(3):
+        rb.extend(name_goals(envs.chunk(10)).reshape(-1))
+        batch = rb.sample()
+        assert batch["future_goal"].device.type == device
+        check_sample(batch.cpu(), rb.storage[:].cpu())
 
 
 def test_the_first_key_determines_reward_success_and_ends():
