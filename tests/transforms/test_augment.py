@@ -51,14 +51,15 @@ def test_every_transition_of_ended_episodes_and_k_copies(layout, strategy, buffe
     assert (stored["next", "reward"][~mask] == STORED_REWARD).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_storage_on_a_device(device):
-    rb = make_buffer(device=device, strategy="future")
+@pytest.mark.parametrize("data_device", DEVICES)
+@pytest.mark.parametrize("storage_device", DEVICES)
+def test_devices(data_device, storage_device):
+    rb = make_buffer(device=storage_device, strategy="future")
     envs = Envs(3, [5, 9])
-    for data_device in ("cpu", device):
+    for _ in range(2):
         rb.extend(envs.chunk(10).reshape(-1).to(data_device))
     stored = rb.storage[:]
-    assert stored["desired_goal"].device.type == device
+    assert stored["desired_goal"].device.type == storage_device
     assert relabelled(stored).any()
     check_batch(stored.cpu(), stored.cpu(), "future")
 

@@ -121,5 +121,5 @@ def select_sequences(data: TensorDictBase, keep_unmoved: float) -> TensorDictBas
     if keep_unmoved == 1:
         return data
     is_kept = torch.rand(len(data)) < keep_unmoved
-    rows = has_moved(data) | is_kept.to(data.device)
-    return data[rows]  # type: ignore[return-value]  # a TensorDict
+    moved = has_moved(data)
+    return data[moved | is_kept.to(moved.device)]  # type: ignore[return-value]  # a TensorDict

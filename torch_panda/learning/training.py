@@ -131,6 +131,9 @@ class Run:
             # mypy takes the members of this enum for strings.
             exploration_type=ExplorationType.RANDOM,  # type: ignore[arg-type]
             auto_register_policy_transforms=True,
+            # Without this, ids of trajectories stay on the CPU, and a resumed buffer on
+            # a GPU cannot store them.
+            storing_device=args.device,
         )
         self.curve = Curve(
             args.env_id,
