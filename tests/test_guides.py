@@ -9,7 +9,8 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "torch_panda", "torch_panda/tasks", "transforms", "examples")
 FOLDERS += ("torch_panda/policies", "examples/results", "torch_panda/gymnasium_envs")
 FOLDERS += ("torch_panda/learning", "torch_panda/datasets")
-GUIDES = [ROOT / folder / "README.md" for folder in FOLDERS]
+PAGES = [page for folder in FOLDERS for page in (ROOT / folder).glob("*.md")]
+GUIDES = sorted(str(page.relative_to(ROOT)) for page in PAGES)
 MAX_LINES = 250
 
 
@@ -35,8 +36,9 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= MAX_LINES
 
 
-@pytest.mark.parametrize("guide", GUIDES, ids=FOLDERS)
-def test_links_of_a_guide(guide):
+@pytest.mark.parametrize("name", GUIDES)
+def test_links_of_a_guide(name):
+    guide = ROOT / name
     links = re.findall(r"\]\(([^)#]+)\)", guide.read_text())
     files = [link for link in links if not link.startswith("http")]
     assert [link for link in files if not (guide.parent / link).exists()] == []

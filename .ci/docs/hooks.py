@@ -31,9 +31,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def guide_files() -> set[Path]:
-    """The README.md of every folder, and the files to which they link."""
+    """The Markdown files outside this folder, and the files to which they link."""
     listed = subprocess.run(
-        ["git", "ls-files", "README.md", "*/README.md"],
+        ["git", "ls-files", "*.md", ":!.ci"],
         cwd=ROOT,
         check=True,
         capture_output=True,
