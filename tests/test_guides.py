@@ -44,6 +44,21 @@ def test_links_of_a_guide(name):
     assert [link for link in files if not (guide.parent / link).exists()] == []
 
 
+def find_anchors(page):
+    """Anchors of the headings of a page, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    titles = re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_links_to_sections(name):
+    guide = ROOT / name
+    links = re.findall(r"\]\(((?:[^):#]+\.md)?)#([^)]+)\)", guide.read_text())
+    pages = [(guide.parent / page if page else guide, anchor) for page, anchor in links]
+    assert [link for link in pages if link[1] not in find_anchors(link[0])] == []
+
+
 def test_the_guides_own_task_is_the_script():
     guide = (ROOT / "torch_panda" / "README.md").read_text()
     section = guide.split("\n## Your own task\n")[1]
