@@ -1,4 +1,4 @@
-"""HindsightAugment: relabelled copies of the transitions that a buffer stores."""
+"""HindsightAugment: stores each episode together with relabelled copies of it."""
 
 from typing import Any
 
@@ -16,16 +16,18 @@ class HindsightAugment(BufferTransform):
     """Stores k relabelled copies of every transition when its episode ends.
 
     This is algorithm 1 of the HER paper (Andrychowicz et al. 2017, arXiv 1707.01495).
-    The transform holds back the transitions of an episode until the episode ends. Then
-    `extend` stores them and k copies of each, in one dimension, under the same
-    trajectory id.
+    The transform holds back the transitions of an episode until the episode ends. The
+    `extend` that brings the last transition then stores the whole episode, and k copies
+    of each transition with hindsight goals. A copy keeps the trajectory id of its
+    transition. The stored rows have one dimension, whatever the shape of the data.
 
     Args:
-        reward_fn: See `BufferTransform`. `extend` calls it at most once to
-            relabel. For the first batches, `extend` also calls it to check the data.
+        reward_fn: See `BufferTransform`. Each `extend` computes the rewards of all
+            copies in one call. The first batches cause further calls, which check the
+            stored rewards.
         k: Number of relabelled copies of each transition.
-        **options: Arguments of `BufferTransform`, with strategies that stay within one
-            episode.
+        **options: Other arguments of `BufferTransform`. The strategies "random" and
+            "desired" are refused, because they take goals from other episodes.
 
     Raises:
         TypeError: An argument is unknown.
@@ -50,7 +52,11 @@ class HindsightAugment(BufferTransform):
     def _inv_call(  # type: ignore[override]  # buffers accept None
         self, tensordict: TensorDictBase
     ) -> TensorDictBase | None:
-        """Holds back new transitions, and returns the rows of all ended episodes."""
+        """Holds back new transitions, and returns the rows to store.
+
+        The rows are all transitions of the episodes that have ended, and then their
+        copies. If no episode has ended, the result is None.
+        """
         buffer, method = find_buffer()
         if method == "add" or not tensordict.ndim:
             raise ValueError(
@@ -81,18 +87,19 @@ class HindsightAugment(BufferTransform):
         return TensorDict.cat([ended, copies]).exclude(SERIAL_KEY)
 
     def _take_ended(self, batch: TensorDictBase) -> TensorDictBase | None:
-        """Adds a batch, and returns the transitions of all ended episodes, if any.
+        """Adds a batch, and returns the transitions of all ended episodes.
 
-        The transitions of unfinished episodes are kept for a later call.
+        They are in order of time. If no episode has ended, the result is None. The
+        transitions of unfinished episodes stay in `_unfinished` for a later call.
         """
-        # Number of transitions since the oldest one that is still held back, including
-        # that one.
+        # The memory must keep the goals of the oldest transition that is still held
+        # back, and of all later ones.
         num_remembered = 0
         if self._unfinished:
             oldest = int(self._unfinished[0].get(SERIAL_KEY).min())
             num_remembered = self._memory.count - oldest
         batch = self._remember(batch, num_remembered)
-        # A copy, because the caller may change its batch before the episode ends.
+        # Copy the batch, because the caller may change it before the episode ends.
         self._unfinished.append(batch.reshape(-1).to_tensordict())
         serials = [rows.get(SERIAL_KEY).numpy(force=True) for rows in self._unfinished]
         is_unfinished = torch.from_numpy(self._memory.is_open(np.concatenate(serials)))
@@ -101,7 +108,7 @@ class HindsightAugment(BufferTransform):
         transitions = TensorDict.cat(self._unfinished)
         self._unfinished = [transitions[is_unfinished]] if is_unfinished.any() else []
         ended = transitions[~is_unfinished]
-        return ended[ended.get(SERIAL_KEY).argsort()]  # in order of time
+        return ended[ended.get(SERIAL_KEY).argsort()]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns sampled transitions unchanged."""
