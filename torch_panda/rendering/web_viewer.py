@@ -58,7 +58,10 @@ class WebViewer:
             ``achieved_goal`` and ``desired_goal`` (num_envs, goal_dim).
         max_episode_steps: Maximum of the slider.
         title: Title of the page.
-        camera, host, port, allowed_hosts: See `RobotTaskEnv.open_viewer`.
+        camera: See `RobotTaskEnv.open_viewer`, as for the following arguments.
+        host: Address of the server.
+        port: Port of the server.
+        allowed_hosts: Names under which browsers may reach the server.
     """
 
     def __init__(
