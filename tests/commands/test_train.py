@@ -68,7 +68,7 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
         {"preset": "tuned", "relative_inputs": "fine", "augmentation": "mirror-shift"},
         {"start_at_object": 0.5, "target_interval": 3, "network": "layer-norm"},
         {"desired_ratio": 0.5, "anneal_lr": True},
-        {"exploration": "points"},
+        {"exploration": "points", "ema_rate": 0.1},
     ],
     ids=lambda options: "-".join(map(str, options.values())),
 )

@@ -232,6 +232,23 @@ def test_target_networks_move_at_intervals(env, algo):
     assert moves == [False, False, True] * 2
 
 
+def actor_weights(policy):
+    """A copy of the weights of the actor in `policy` or `explore`."""
+    return [x.detach().clone() for x in policy.module[1].parameters()]
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_the_policy_averages_the_weights_of_the_actor(env, algo):
+    agent = make(env, algo, ema_rate=0.25)
+    average = actor_weights(agent.policy)
+    for step in (agent.update, agent.update, agent.imitate):
+        step(make_transitions(env, 16))
+        trained = actor_weights(agent.explore)
+        average = [a.lerp(b, 0.25) for a, b in zip(average, trained, strict=True)]
+        torch.testing.assert_close(actor_weights(agent.policy), average)
+        assert not torch.equal(trained[0], average[0])
+
+
 def test_td3_moves_its_actor_at_every_second_step(env):
     agent = make(env, "td3")
     keys = [agent.update(make_transitions(env, 16)).keys() for _ in range(4)]

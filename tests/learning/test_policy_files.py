@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
+from tests.learning.transitions import make_transitions
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
 from torch_panda.learning.policy_files import SavedPolicy, save_policy
 from torch_panda.learning.spaces import read_spaces
@@ -27,6 +28,7 @@ def save(env, path, **options):
     torch.manual_seed(0)
     agent = make_agent(env, Hyperparameters(**options))
     agent.normalizer.update(*(torch.randn(50, n) for n in agent.spaces.sizes[:2]))
+    agent.update(make_transitions(env, 16))
     save_policy(path, agent, "PandaPickAndPlace-v1")
     return agent
 
@@ -41,8 +43,12 @@ def inputs(spaces, *batch_size):
 @pytest.mark.parametrize("algo", AGENTS)
 @pytest.mark.parametrize(
     "options",
-    [{}, {"relative_inputs": "fine", "fine_fingers": True, "network": "layer-norm"}],
-    ids=["paper", "tuned"],
+    [
+        {},
+        {"relative_inputs": "fine", "fine_fingers": True, "network": "layer-norm"},
+        {"ema_rate": 0.1},
+    ],
+    ids=["paper", "tuned", "averaged"],
 )
 def test_a_loaded_policy_acts_as_the_saved_agent(env, tmp_path, algo, options):
     agent = save(env, tmp_path / "checkpoint.pt", algo=algo, **options)
@@ -113,6 +119,7 @@ import sys
 for name in ("tyro", "matplotlib", "imageio", "viser", "minari"):
     sys.modules[name] = None  # importing it raises
 import torch_panda
+from tests.learning.transitions import make_transitions
 policy = torch_panda.load_policy("PandaReach-v1")
 print(torch_panda.evaluate(policy, "PandaReach-v1", episodes=4).success_rate)
 """

@@ -34,6 +34,11 @@ class Hyperparameters:
     """gradient steps between two updates of the target networks"""
     action_l2: Weight = 1.0
     """DDPG, TD3: weight of the mean squared action in the actor's loss"""
+    ema_rate: Ratio = 0.0
+    """rate of an exponential moving average (EMA) of the actor's weights. In each
+    gradient step the average moves this fraction of the way to the actor. The average
+    is evaluated and saved as the policy, and the actor itself explores. 0 evaluates
+    and saves the actor"""
     noise_eps: Weight = 0.2
     """DDPG, TD3: standard deviation of the Gaussian noise on actions"""
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)

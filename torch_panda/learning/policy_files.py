@@ -179,6 +179,8 @@ def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
     # `agent.hp` may be the options of a run. Leave out the fields that are not
     # hyperparameters.
     hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}
+    # The file holds the averaged weights alone, so a loaded agent has no average.
+    hp.pop("ema_rate", None)
     content = {
         "env_id": env_id,
         "hyperparameters": hp,

@@ -143,6 +143,8 @@ SAMPLE_EFFICIENT_CHANGES: dict[type[Task], dict[str, Any]] = {
     PickAndPlace: {
         "start_at_object": 0.0,
         "random_eps": (0.0, 0.5),
+        "action_l2": 0.1,
+        "ema_rate": 0.003,
         "total_steps": 40_000,
         "eval_interval": 5_000,
     },
@@ -162,6 +164,7 @@ SAMPLE_EFFICIENT_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
     },
     PickAndPlace: {
         "start_at_object": 0.5,
+        "action_l2": 1.0,
         "total_steps": 60_000,
         "eval_interval": 10_000,
     },

@@ -1,5 +1,6 @@
 """Base class of the agents: the parts that DDPG, TD3, SAC and TQC share."""
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -37,8 +38,9 @@ class Agent(nn.Module, ABC):
         gamma: Discount factor.
         min_return: Lower bound of the discounted return; None for dense rewards.
         policy: Module from ``observation`` and ``desired_goal`` to ``action``, which is
-            deterministic under ``ExplorationType.DETERMINISTIC``.
-        explore: The same module with the exploration noise of the algorithm.
+            deterministic under ``ExplorationType.DETERMINISTIC``. With `ema_rate`, it
+            has the averaged weights.
+        explore: The trained policy with the exploration noise of the algorithm.
         optimizer: Optimizer of all trained parameters.
         updates: Number of gradient steps so far, without imitation.
 
@@ -77,9 +79,14 @@ class Agent(nn.Module, ABC):
         to_env_action: list[TensorDictModuleBase] = []
         if self.hp.fine_fingers:
             to_env_action = [TensorDictModule(from_fine, ["action"], ["action"])]
+        evaluated = actor
+        if self.hp.ema_rate:
+            evaluated = copy.deepcopy(actor).requires_grad_(False)
+        self._actor_weights: list[Tensor] = [*actor.parameters()]
+        self._averaged_weights: list[Tensor] = [*evaluated.parameters()]
         # The overloads of TensorDictSequential lack modules as arguments.
         self.policy = TensorDictSequential(  # type: ignore[call-overload]
-            normalize, actor, *to_env_action
+            normalize, evaluated, *to_env_action
         )
         self.explore = TensorDictSequential(  # type: ignore[call-overload]
             normalize, actor, *noise, *to_env_action
@@ -125,6 +132,7 @@ class Agent(nn.Module, ABC):
         self.optimizer.zero_grad()
         losses = self.backward(state, next_state, rows, num_demos)
         self.optimizer.step()
+        self._move_average()
         self.updates += 1
         if self.updates % self.hp.target_interval == 0:
             self.move_targets()
@@ -168,15 +176,23 @@ class Agent(nn.Module, ABC):
         # `_prepare` has converted the demonstrated actions to those of the networks. So
         # compare them with the output of the actor, before it is converted for the
         # environment.
-        normalize, actor = self.policy.module[:2]  # type: ignore[index]  # a ModuleList
+        normalize, actor = self.explore.module[:2]  # type: ignore[index]  # a ModuleList
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = normalize(demos.empty().update(inputs))
             loss = nn.functional.l1_loss(actor(td)["action"], rows.action)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
+        self._move_average()
         self.move_targets()
         return loss.detach()
+
+    @torch.no_grad()
+    def _move_average(self) -> None:
+        """Move the averaged weights, if there are any, towards the actor's weights."""
+        rate = self.hp.ema_rate
+        if rate:
+            torch._foreach_lerp_(self._averaged_weights, self._actor_weights, rate)
 
     def _prepare(self, rows: Transitions) -> Transitions:
         """Augment a batch, penalise failures, and convert actions for the networks."""
