@@ -45,7 +45,7 @@ class HindsightAugment(BufferTransform):
                 "HindsightAugment sees one episode at a time and cannot draw "
                 f"{self.strategy!r} goals: use HindsightRelabel"
             )
-        self.k = k
+        self.k = int(k)
         # Batches of unfinished episodes. The first one has the oldest transition.
         self._unfinished: list[TensorDictBase] = []
 

@@ -73,6 +73,12 @@ def test_nothing_is_stored_until_an_episode_ends():
     assert len(rb) == 2 * 6 * 2
 
 
+def test_k_may_be_a_float_that_is_whole():
+    rb, envs = make_buffer(k=2.0), Envs(2, [6])
+    rb.extend(envs.chunk(6))
+    assert len(rb) == 2 * 6 * 3
+
+
 def test_what_is_held_back_takes_the_room_of_open_episodes():
     rb, envs = make_buffer(k=1), Envs(4, [30])
     for _ in range(200):
