@@ -29,9 +29,9 @@ class Args(Hyperparameters):
 
     preset: Preset = "paper"
     """defaults of the other options: those of the panda-gym paper ("paper"), the task's
-    recipe for the least wall-clock time ("tuned"), or its recipe for the fewest
-    environment steps ("sample-efficient"). With the last two, the replay buffer stores
-    only a random tenth of the rollouts in which the achieved goal does not change"""
+    recipe ("tuned"), or its recipe for fewer environment steps ("sample-efficient").
+    With the last two, the replay buffer stores only a random tenth of the rollouts in
+    which the achieved goal does not change"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"

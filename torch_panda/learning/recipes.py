@@ -1,7 +1,7 @@
 """Recipes: the options of the presets of ``train`` for each task.
 
-``--preset tuned`` learns a task in the least wall-clock time. ``--preset
-sample-efficient`` learns it in the fewest environment steps, with more gradient steps.
+``--preset tuned`` is the recipe of a task. ``--preset sample-efficient`` learns the
+task in fewer environment steps, with more gradient steps per environment step.
 
 An option that is not in a recipe keeps its default, the value of the preset "paper".
 An option on the command line overrides the recipe.
