@@ -59,7 +59,7 @@ def test_links_to_sections(name):
     assert [link for link in pages if link[1] not in find_anchors(link[0])] == []
 
 
-def find_tables(page):
+def count_cells(page):
     """Number of cells of each row, one list for each table of a page."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     tables = re.findall(r"(?:^\|.*\n?)+", text, re.MULTILINE)
@@ -71,8 +71,8 @@ def find_tables(page):
 
 @pytest.mark.parametrize("name", GUIDES)
 def test_rows_of_a_table_have_as_many_cells_as_its_header(name):
-    tables = find_tables(ROOT / name)
-    assert [cells for cells in tables if len(set(cells)) > 1] == []
+    tables = count_cells(ROOT / name)
+    assert [rows for rows in tables if len(set(rows)) > 1] == []
 
 
 def test_the_guides_own_task_is_the_script():
