@@ -42,7 +42,7 @@ class Agent(nn.Module, ABC):
             has the averaged weights.
         explore: The trained policy with the exploration noise of the algorithm.
         optimizer: Optimizer of all trained parameters.
-        updates: Number of gradient steps so far, without imitation.
+        updates: Number of calls of `update` so far. Calls of `imitate` do not count.
 
     Raises:
         ValueError: The hyperparameters do not fit the spaces.
