@@ -26,7 +26,7 @@ class Configured:
     def __repr__(self) -> str:
         shown = [
             f"{name}={vars(self)[attribute]!r}"
-            for name in _argument_names(type(self))
+            for name in argument_names(type(self))
             for attribute in (name, f"_{name}")
             if attribute in vars(self)
         ]
@@ -54,9 +54,14 @@ def check_call(
     Raises:
         TypeError: A name is not accepted.
     """
-    parameters = inspect.signature(function).parameters
+    # Before Python 3.11, the signature of a class was that of `Configured.__new__`, if
+    # the class inherited its `__init__`.
+    called = function
+    if isinstance(function, type):
+        called = function.__init__  # type: ignore[misc]  # of this very class
+    parameters = inspect.signature(called).parameters
     if not _has_options(parameters):
-        check_names(owner, names, parameters)
+        check_names(owner, names, [name for name in parameters if name != "self"])
 
 
 def check_names(
@@ -91,7 +96,7 @@ def check_names(
         )
 
 
-def _argument_names(owner: type) -> list[str]:
+def argument_names(owner: type) -> list[str]:
     """Names of the arguments of a class.
 
     A class with ``**options`` passes them to its base class, whose names are included.

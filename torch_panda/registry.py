@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import gymnasium
 import torch
 
-from torch_panda.arguments import check_call, check_names, load_class
+from torch_panda.arguments import argument_names, check_call, check_names, load_class
 from torch_panda.bullet.shapes import BLUE
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
@@ -412,7 +412,7 @@ def _check_options(registration: Registration, options: Options) -> None:
         ("task_options", registration.make_task()),
         ("robot_options", registration.make_robot()),
     ):
-        for name in inspect.signature(type(example)).parameters.keys() & set(unknown):
+        for name in {*argument_names(type(example))} & {*unknown}:
             advice[name] = f"use {argument}={{{name!r}: {options[name]!r}}}"
     dense_id = "Dense-".join(registration.env_id.rsplit("-", 1))
     if "reward_type" in advice and dense_id in ENV_IDS:

@@ -46,7 +46,7 @@ class OfflineHyperparameters:
     algo: str = ""
     """algorithm"""
     discount: Discount = 0.99
-    """discount factor of values and in the strategy "geometric\""""
+    """discount factor of the values, also used by the goal strategy "geometric" """
     learning_rate: Ratio = 3e-4
     """learning rate of Adam"""
     tau: Ratio = 0.005
@@ -57,9 +57,9 @@ class OfflineHyperparameters:
     batch_size: Positive = 256
     """transitions per gradient step"""
     actor_goal: Literal["future", "geometric"] = "future"
-    """goals of policies, achieved later in the episode: all equally likely, as in
-    OGBench ("future"), or k steps later with a probability in proportion to discount**k
-    ("geometric")"""
+    """how to draw the goals of the policy among those achieved later in the episode.
+    "future", as in OGBench: all are equally likely. "geometric": the goal achieved k
+    steps later has a probability in proportion to discount**k"""
     relative_inputs: RelativeInputs = "fine"
     """additional inputs of the networks. "coarse" adds the offsets from the hand to
     objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
