@@ -118,7 +118,8 @@ class OfflineAgent(nn.Module, ABC):
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
         hp: Hyperparameters.
-        normalizer: Standardises observations and goals.
+        normalizer: Standardises observations and goals, and appends the offsets of
+            `relative_inputs`.
         policy: Module from ``observation`` and ``desired_goal`` to ``action`` in
             [-1, 1], deterministic.
         optimizer: Optimizer of all networks that learn.
@@ -289,11 +290,12 @@ def ensemble_loss(q: Tensor, v: Tensor, v_target: Tensor, expectile: float) -> T
     """Expectile regression of the two values of an `Ensemble`, a scalar.
 
     HIQL's paper (2307.11949, eq. 4) has one value function. Here there are two, as in
-    OGBench, and each regresses to its own target. The sign of their common advantage
-    sets the weight of both squared errors.
+    OGBench, and each regresses to its own target. Both squared errors have the weight
+    of `expectile_loss` for one advantage: the smaller of the two targets minus the mean
+    of the two ``v_target``.
 
     Args:
-        q: Targets r + discount * V(s', g) of the target networks, (2, n).
+        q: Targets r + discount * mask * V(s', g) of the target networks, (2, n).
         v: Values V(s, g), (2, n).
         v_target: Values V(s, g) of the target networks, (2, n).
         expectile: See `expectile_loss`.
