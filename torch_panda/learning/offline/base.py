@@ -3,7 +3,7 @@
 `fit` computes the mean and deviation of the data, `update` takes one gradient step on a
 batch of `OfflineData`, and `policy` acts. Agents differ in their `losses`, and in the
 `goal_strategies` with which `torch_panda.transforms.GoalSampler` draws their goals. The
-docstring of each loss cites the equation or section of the paper.
+docstrings of the losses cite the papers.
 
 In the papers a goal is a state g. Here a goal is the part of a state that the task
 cares about, such as the position of a cube, because the policy gets ``desired_goal``.
@@ -290,9 +290,8 @@ def ensemble_loss(q: Tensor, v: Tensor, v_target: Tensor, expectile: float) -> T
     """Expectile regression of the two values of an `Ensemble`, a scalar.
 
     HIQL's paper (2307.11949, eq. 4) has one value function. Here there are two, as in
-    OGBench, and each regresses to its own target. Both squared errors have the weight
-    of `expectile_loss` for one advantage: the smaller of the two targets minus the mean
-    of the two ``v_target``.
+    OGBench, and each regresses to its own target. Both squared errors have the same
+    weight. Its advantage is the smaller target minus the mean of the two ``v_target``.
 
     Args:
         q: Targets r + discount * mask * V(s', g) of the target networks, (2, n).
