@@ -44,10 +44,15 @@ def test_links_of_a_guide(name):
     assert [link for link in files if not (guide.parent / link).exists()] == []
 
 
+def read_without_code(page):
+    """The text of a page, without its code blocks."""
+    pattern = r"^```.*?^```"
+    return re.sub(pattern, "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
 def find_anchors(page):
     """Anchors of the headings of a page, as GitHub makes them."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
-    titles = re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    titles = re.findall(r"^#+ (.*)", read_without_code(page), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
 
 
@@ -61,8 +66,7 @@ def test_links_to_sections(name):
 
 def count_cells(page):
     """Number of cells of each row, one list for each table of a page."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
-    tables = re.findall(r"(?:^\|.*\n?)+", text, re.MULTILINE)
+    tables = re.findall(r"(?:^\|.*\n?)+", read_without_code(page), re.MULTILINE)
     return [
         [len(re.findall(r"(?<!\\)\|", row)) - 1 for row in table.splitlines()]
         for table in tables

@@ -119,7 +119,6 @@ import sys
 for name in ("tyro", "matplotlib", "imageio", "viser", "minari"):
     sys.modules[name] = None  # importing it raises
 import torch_panda
-from tests.learning.transitions import make_transitions
 policy = torch_panda.load_policy("PandaReach-v1")
 print(torch_panda.evaluate(policy, "PandaReach-v1", episodes=4).success_rate)
 """
