@@ -1,9 +1,10 @@
 """Restores Bullet's broad phase to its state after the scene was built.
 
 The broad phase is the part of collision detection that finds pairs of links whose
-axis-aligned bounding boxes (AABBs) overlap. Bullet solves contacts in the order in
-which the broad phase found their pairs. This order depends on earlier steps and
-episodes. So two worlds with equal poses and velocities can step differently.
+axis-aligned bounding boxes (AABBs) overlap. If the broad phase finds one pair
+before another, Bullet also solves its contacts first. Earlier steps and episodes
+influence which pair is found first. So two worlds with equal poses and velocities can
+step differently.
 
 The state of the broad phase consists of
 

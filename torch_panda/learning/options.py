@@ -30,8 +30,8 @@ class Args(Hyperparameters):
     preset: Preset = "paper"
     """defaults of the other options: those of the panda-gym paper ("paper"), the task's
     recipe ("tuned"), or its recipe for fewer environment steps ("sample-efficient").
-    With the last two, the replay buffer stores only a random tenth of the rollouts in
-    which the achieved goal does not change"""
+    With the last two, the replay buffer drops a random 90 % of the rollouts whose
+    achieved goal does not change"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
