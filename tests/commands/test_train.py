@@ -64,6 +64,7 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
         {"algo": "td3"},
         {"algo": "sac"},
         {"algo": "tqc"},
+        {"algo": "crl", "her": "geometric"},
         {"her": "none", "random_eps": (0.1, 0.9)},
         {"preset": "tuned", "relative_inputs": "fine", "augmentation": "mirror-shift"},
         {"start_at_object": 0.5, "target_interval": 3, "network": "layer-norm"},

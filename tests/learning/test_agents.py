@@ -13,12 +13,13 @@ from torchrl.objectives import DDPGLoss, TD3Loss
 
 import torch_panda
 from tests.learning.transitions import make_transitions
-from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
+from torch_panda.learning.agents import AGENTS, CRL, Hyperparameters, make_agent
 from torch_panda.learning.agents.base import TAU
 from torch_panda.learning.agents.ddpg import SATURATION_L2
 from torch_panda.learning.agents.td3 import NOISE_CLIP, POLICY_NOISE
 
 ALGOS = list(AGENTS)
+WITH_TARGETS = [algo for algo in ALGOS if algo != "crl"]  # with target networks
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +35,8 @@ def make(env, algo, **options):
 
 def critics_of(agent):
     """The parameters of the critics, and of their target networks."""
+    if isinstance(agent, CRL):
+        return [*agent.phi.parameters(), *agent.psi.parameters()], []
     if hasattr(agent, "critics"):
         return list(agent.critics.parameters()), list(agent.target_critics.parameters())
     keys = agent.loss.qvalue_network_params.keys(True, True)
@@ -201,17 +204,12 @@ def test_a_gradient_step_trains_all_networks(env, algo, network, size, is_normal
     agent = make(env, algo, network=network)
     before = {key: x.clone() for key, x in agent.named_parameters()}
     trained = {key for key, x in agent.named_parameters() if x.requires_grad}
-    online, target = critics_of(agent)
-    before_target = [x.clone() for x in target]
     losses = agent.update(make_transitions(env, 64))
     assert losses.keys() == {"critic_loss", "actor_loss"}
     assert not any(x.requires_grad for x in losses.values())
     after = dict(agent.named_parameters())
     same = {key for key in trained if torch.equal(before[key], after[key])}
     assert not {key for key in same if "alpha" not in key}
-    online, target = critics_of(agent)
-    moved = [a.lerp(b, TAU) for a, b in zip(before_target, online, strict=True)]
-    torch.testing.assert_close([x.data for x in target], [x.data for x in moved])
     norms = [m for m in agent.modules() if isinstance(m, nn.LayerNorm)]
     assert bool(norms) == is_normalized
     hidden = [x for m in agent.modules() if isinstance(m, MLP) for x in list(m)[:-1]]
@@ -219,7 +217,17 @@ def test_a_gradient_step_trains_all_networks(env, algo, network, size, is_normal
     assert sizes == {size}
 
 
-@pytest.mark.parametrize("algo", ALGOS)
+@pytest.mark.parametrize("algo", WITH_TARGETS)
+def test_target_networks_follow_the_trained_networks(env, algo):
+    agent = make(env, algo)
+    before = [x.clone() for x in critics_of(agent)[1]]
+    agent.update(make_transitions(env, 64))
+    online, target = critics_of(agent)
+    moved = [a.lerp(b, TAU) for a, b in zip(before, online, strict=True)]
+    torch.testing.assert_close([x.data for x in target], [x.data for x in moved])
+
+
+@pytest.mark.parametrize("algo", WITH_TARGETS)
 def test_target_networks_move_at_intervals(env, algo):
     agent = make(env, algo, target_interval=3)
     before = critics_of(agent)[1][0].clone()

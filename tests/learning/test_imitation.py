@@ -6,7 +6,7 @@ import torch
 import torch_panda
 from tests.learning.test_agents import critics_of
 from tests.learning.transitions import make_transitions
-from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
 from torch_panda.learning.agents.ddpg import BC_WEIGHT
 
 
@@ -37,7 +37,7 @@ def test_imitates_what_the_critic_prefers(env, algo):
     torch.testing.assert_close(losses["actor_loss"] - plain["actor_loss"], expected)
 
 
-@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac", "tqc"])
+@pytest.mark.parametrize("algo", AGENTS)
 def test_policy_comes_closer_to_demonstrations(env, algo):
     torch.manual_seed(0)
     agent = make_agent(env, Hyperparameters(algo=algo))

@@ -106,7 +106,13 @@ class Learner:
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
         self.agent = make_agent(self.env, args)
         capacity = args.total_steps + args.batch_frames
-        self.buffer = make_buffer(self.env, capacity, seed=args.seed)
+        self.buffer = make_buffer(
+            self.env,
+            capacity,
+            her="geometric" if args.algo == "crl" else "relabel",
+            discount=self.agent.gamma,
+            seed=args.seed,
+        )
         self.progress = Progress()
         self.curve = Curve(args.env_id, self.agent, out, device="cpu")
         self.collector = make_collector(args, self.agent.explore)

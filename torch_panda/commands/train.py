@@ -1,4 +1,4 @@
-"""Train DDPG, TD3, SAC or TQC with hindsight experience replay on any task.
+"""Train DDPG, TD3, SAC, TQC or CRL with hindsight experience replay on any task.
 
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
@@ -22,6 +22,7 @@ from tqdm import tqdm
 import torch_panda
 from torch_panda.datasets import generate, read_demos, sha256
 from torch_panda.learning import files
+from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.checkpoint import (
     StopSignal,
@@ -73,11 +74,11 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
         offline_args = tyro.cli(cls, prog=f"{PROG} --offline", args=arguments)
         import_modules(read_modules(offline_args.imports))
         return offline_args
-    if mode.algo in OFFLINE_AGENTS:
+    if mode.algo in OFFLINE_AGENTS and mode.algo not in AGENTS:
         raise ValueError(f"{mode.algo} learns offline: add --offline")
     first = tyro.cli(Args, prog=PROG, args=arguments)
     import_modules(read_modules(first.imports))
-    default = default_args(first.preset, first.env_id)
+    default = default_args(first.preset, first.env_id, first.algo)
     return tyro.cli(Args, prog=PROG, args=arguments, default=default)
 
 
@@ -147,7 +148,7 @@ def main(args: Args | OfflineArgs) -> None:
             preset, default = {"preset": "offline"}, type(args)(env_id=args.env_id)
         else:
             check(args)
-            preset, default = {}, default_args(args.preset, args.env_id)
+            preset, default = {}, default_args(args.preset, args.env_id, args.algo)
         check_folder(out, resume=args.resume)
         run = make_run(args, out)
         is_tuned = isinstance(args, Args) and args.preset == "tuned"

@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.transforms import HindsightRelabel
 
-Hindsight = Literal["relabel", "parts", "none"]
+Hindsight = Literal["relabel", "parts", "geometric", "none"]
 
 # Both numbers are from the panda-gym paper (arXiv 2106.13687).
 K = 4  # hindsight goals per original goal; the HER paper's k
@@ -42,6 +42,7 @@ def make_buffer(
     *,
     her: Hindsight = "relabel",
     desired_ratio: float = 0.0,
+    discount: float = 0.99,
     seed: int | None = None,
 ) -> TensorDictReplayBuffer:
     """Make a replay buffer with hindsight, on the device of the environment.
@@ -51,15 +52,19 @@ def make_buffer(
         capacity: Number of transitions, at most `BUFFER_SIZE`.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
-            the goal is relabelled. "none" keeps the original goals.
+            the goal is relabelled. "geometric" gives every sampled transition the goal
+            achieved k steps later in its episode, with a probability in proportion to
+            discount**k. "none" keeps the original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of random
             transitions. The rest are goals achieved later in the same episode.
+        discount: Discount of "geometric".
         seed: Seed of the choice of goals.
 
     Raises:
         ValueError: ``her`` does not fit the task.
     """
-    weights = {"future": 1 - desired_ratio, "desired": desired_ratio}
+    later = "geometric" if her == "geometric" else "future"
+    weights = {later: 1 - desired_ratio, "desired": desired_ratio}
     strategy = {name: weight for name, weight in weights.items() if weight}
     # `success_fn` is None below, because success is not stored (see `STORED_KEYS`).
     transform = None
@@ -73,8 +78,9 @@ def make_buffer(
         transform = HindsightRelabel.from_env(
             env,
             success_fn=None,
-            her_ratio=K / (K + 1),
+            her_ratio=1.0 if her == "geometric" else K / (K + 1),
             strategy=strategy,
+            discount=discount,
             goal_parts=(POSITION_SIZE,) * num_objects if her == "parts" else None,
             seed=seed,
         )

@@ -8,7 +8,7 @@ from typing import Literal
 
 from torch_panda.learning.limits import Discount, Positive, Ratio, Weight
 
-Algo = Literal["ddpg", "td3", "sac", "tqc"]
+Algo = Literal["ddpg", "td3", "sac", "tqc", "crl"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 Exploration = Literal["actions", "points"]
 Network = Literal["paper", "layer-norm", "wide"]

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from torch_panda.checks import check_device
 from torch_panda.learning.agents import Hyperparameters
 from torch_panda.learning.buffers import Hindsight
+from torch_panda.learning.hyperparameters import Algo
 from torch_panda.learning.limits import (
     Count,
     Factor,
@@ -37,7 +38,9 @@ class Args(Hyperparameters):
     her: Hindsight = "relabel"
     """hindsight goals, four for each original goal: relabel transitions when they are
     sampled ("relabel"), or the same with a separate draw for each object's part of the
-    goal ("parts"). "none" uses no hindsight"""
+    goal ("parts"). "geometric", the default of CRL, relabels every transition with the
+    goal achieved k steps later, with a probability in proportion to gamma**k. "none"
+    uses no hindsight"""
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of random transitions. The
     rest are goals achieved later in the same episode"""
@@ -89,6 +92,11 @@ class Args(Hyperparameters):
     Weights & Biases (project "torch_panda"); curve.csv is always written"""
 
 
+# CRL needs these goals: the critic's positive goals are achieved k steps later in the
+# same episode, with a probability in proportion to gamma**k.
+CRL_OPTIONS: dict[str, Any] = {"her": "geometric", "desired_ratio": 0.0}
+
+
 def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
     """Check that DDPG and TD3 explore, which they do only by noise.
 
@@ -96,10 +104,28 @@ def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
         ValueError: The exploration noise is 0 in all environments.
     """
     explores = hp.noise_eps or any(hp.random_eps[:num_envs])
-    if hp.algo in ("ddpg", "td3") and not explores:
+    if hp.algo in ("ddpg", "td3", "crl") and not explores:
         raise ValueError(
             f"algo {hp.algo} explores by noise_eps and random_eps: one of them must "
             "be above 0"
+        )
+
+
+def check_crl(args: Args) -> None:
+    """Check that every goal of a batch is achieved later in the same episode.
+
+    Raises:
+        ValueError: An option gives transitions other goals.
+    """
+    if args.her != "geometric" or args.desired_ratio:
+        raise ValueError(
+            "algo crl learns only from goals achieved later in the same episode: pass "
+            "--her geometric --desired-ratio 0"
+        )
+    if args.demos is not None:
+        raise ValueError(
+            "algo crl cannot use demonstrations, whose goals are not drawn as those of "
+            "--her geometric: drop --demos, or choose another --algo"
         )
 
 
@@ -111,6 +137,8 @@ def check(args: Args) -> None:
     """
     check_limits(args)
     check_exploration(args, args.num_envs)
+    if args.algo == "crl":
+        check_crl(args)
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demonstrations: pass --demos")
     if not args.total_steps and not args.pretrain_updates:
@@ -119,8 +147,9 @@ def check(args: Args) -> None:
     check_logger(args.logger)
 
 
-def default_args(preset: Preset, env_id: str) -> Args:
-    """Return the default options of a preset for the task of an id."""
-    if preset == "paper":
-        return Args(env_id=env_id)
-    return Args(preset=preset, env_id=env_id, **find_recipe(env_id, preset))
+def default_args(preset: Preset, env_id: str, algo: Algo = "ddpg") -> Args:
+    """Return the default options of a preset for the task of an id and an algorithm."""
+    recipe = {} if preset == "paper" else find_recipe(env_id, preset)
+    if algo == "crl":
+        recipe = {**recipe, **CRL_OPTIONS}
+    return Args(preset=preset, env_id=env_id, algo=algo, **recipe)

@@ -153,7 +153,8 @@ def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> AnyHyperpara
     """
     offline_agent = OFFLINE_AGENTS.get(values.get("algo", ""))
     cls: type[AnyHyperparameters] = Hyperparameters
-    if offline_agent is not None:
+    # CRL learns online and offline. Only online agents have an option `gamma`.
+    if offline_agent is not None and "gamma" not in values:
         cls = offline_agent.Hyperparameters
     accepted = {field.name for field in fields(cls)}
     if unknown := values.keys() - accepted:

@@ -108,6 +108,7 @@ class Run:
             args.total_steps + steps_per_iteration,
             her=args.her,
             desired_ratio=args.desired_ratio,
+            discount=self.agent.gamma,
             seed=args.seed,
         )
         self.num_demos = 0  # demonstrated transitions in each batch

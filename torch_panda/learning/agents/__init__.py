@@ -1,9 +1,10 @@
-"""Agents for goal-conditioned tasks: DDPG, TD3, SAC and TQC."""
+"""Agents for goal-conditioned tasks: DDPG, TD3, SAC, TQC and CRL."""
 
 import torch
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.crl import CRL
 from torch_panda.learning.agents.ddpg import DDPG
 from torch_panda.learning.agents.sac import SAC
 from torch_panda.learning.agents.td3 import TD3
@@ -11,9 +12,15 @@ from torch_panda.learning.agents.tqc import TQC
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.spaces import read_spaces
 
-AGENTS: dict[str, type[Agent]] = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC}
+AGENTS: dict[str, type[Agent]] = {
+    "ddpg": DDPG,
+    "td3": TD3,
+    "sac": SAC,
+    "tqc": TQC,
+    "crl": CRL,
+}
 
-__all__ = ["AGENTS", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
+__all__ = ["AGENTS", "CRL", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
 
 
 def make_agent(env: RobotTaskEnv, hp: Hyperparameters) -> Agent:

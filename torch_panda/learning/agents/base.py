@@ -1,4 +1,4 @@
-"""Base class of the agents: the parts that DDPG, TD3, SAC and TQC share."""
+"""Base class of the agents: the parts that all of them share."""
 
 import copy
 import math
@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
 from torch_panda.learning.augmentation import augment
 from torch_panda.learning.exploration import RandomPointModule
@@ -27,8 +28,9 @@ class Agent(nn.Module, ABC):
     """A policy with its exploration and its learning algorithm.
 
     The constructor of a subclass makes the networks and then calls `assemble`. A
-    subclass also defines `backward` and `move_targets`. The input of the networks is
-    the "state": the tensor that the normaliser computes from observations and goals.
+    subclass also defines `backward`, and `move_targets` if it has target networks. The
+    input of the networks is the "state": the tensor that the normaliser computes from
+    observations and goals.
 
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
@@ -93,6 +95,20 @@ class Agent(nn.Module, ABC):
         )
         self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
+    def action_noise(self) -> list[TensorDictModuleBase]:
+        """Make the exploration of a deterministic actor: noise and random actions."""
+        hp, num_envs = self.hp, self.spaces.num_envs
+        action_spec = self.spaces.action_spec(num_envs)
+        noise = AdditiveGaussianModule(
+            action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
+        )
+        if hp.exploration == "points":
+            return [noise, self.random_points()]
+        random_action = EGreedyModule(action_spec)
+        # A probability for each environment, (num_envs,).
+        random_action.eps = torch.linspace(*hp.random_eps, num_envs)
+        return [noise, random_action]
+
     def random_points(self) -> RandomPointModule:
         """Make the module of the exploration "points"."""
         spaces = self.spaces
@@ -154,9 +170,8 @@ class Agent(nn.Module, ABC):
             The losses by name, scalars.
         """
 
-    @abstractmethod
     def move_targets(self) -> None:
-        """Move the target networks towards the online networks, by the fraction TAU."""
+        """Move the target networks, if any, to the online networks, by the part TAU."""
 
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """Take one gradient step of the policy towards demonstrated actions.

@@ -7,9 +7,8 @@ sixth longer.
 import copy
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
 from torch_panda.learning.agents.base import TAU, Agent
 from torch_panda.learning.hyperparameters import Hyperparameters
@@ -44,18 +43,6 @@ class DDPG(Agent):
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-
-        action_spec = spaces.action_spec(spaces.num_envs)
-        noise = AdditiveGaussianModule(
-            action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
-        )
-        random_action: TensorDictModuleBase
-        if hp.exploration == "points":
-            random_action = self.random_points()
-        else:
-            random_action = EGreedyModule(action_spec)
-            # A probability for each environment, (num_envs,).
-            random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
         self.actor_parameters = list(self.actor.parameters())
         # Parameters of the trained networks and, in the same order, of their targets.
         self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
@@ -65,7 +52,7 @@ class DDPG(Agent):
         ]
         self.assemble(
             TensorDictModule(self.actor, ["normalized"], ["action"]),
-            [noise, random_action],
+            self.action_noise(),
             trained=self.online,
         )
 
@@ -106,8 +93,7 @@ class DDPG(Agent):
         before_tanh = self.actor[0](state)
         action = before_tanh.tanh()
         value = self.critics[0](state, action)
-        penalty = self.hp.action_l2 * action.square().mean()
-        penalty = penalty + SATURATION_L2 * before_tanh.square().mean()
+        penalty = action_penalty(before_tanh, self.hp.action_l2)
         actor_loss = penalty - value.mean()
         if num_demos:
             # Imitate only demonstrated actions that the critic prefers (the Q filter).
@@ -124,3 +110,14 @@ class DDPG(Agent):
         """Move the target networks towards the online networks, by the fraction TAU."""
         with torch.no_grad():
             torch._foreach_lerp_(self.target, self.online, TAU)
+
+
+def action_penalty(before_tanh: Tensor, action_l2: float) -> Tensor:
+    """Penalty on large actions in an actor's loss, a scalar.
+
+    Args:
+        before_tanh: Inputs of the actor's tanh, (n, action size).
+        action_l2: Weight of the mean squared action.
+    """
+    penalty = action_l2 * before_tanh.tanh().square().mean()
+    return penalty + SATURATION_L2 * before_tanh.square().mean()
