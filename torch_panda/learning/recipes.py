@@ -148,6 +148,14 @@ SAMPLE_EFFICIENT_CHANGES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 40_000,
         "eval_interval": 5_000,
     },
+    # Tried with demonstrations and without special starts: `--demos FILE
+    # --start-at-object 0`.
+    Stack: {
+        "action_l2": 0.1,
+        "ema_rate": 0.003,
+        "total_steps": 100_000,
+        "eval_interval": 5_000,
+    },
 }
 # Changes to SAMPLE_EFFICIENT_CHANGES for ids in which success ends an episode, such as
 # -v3. If training episodes of Push ended at success too, the cube would rarely be
