@@ -19,7 +19,7 @@ from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import training
 from torch_panda.learning.agents.base import LEARNING_RATE
-from torch_panda.learning.options import Args, default_args
+from torch_panda.learning.options import Args, check, default_args
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -216,6 +216,16 @@ def test_command_line_overrules_the_recipe():
     assert parse([]) == Args()
 
 
+@pytest.mark.parametrize("preset", ["paper", "tuned", "sample-efficient"])
+@pytest.mark.parametrize("env_id", ["PandaSlide-v1", "PandaStack-v1"])
+def test_crl_draws_geometric_goals_in_every_preset(preset, env_id):
+    args = parse(["--algo", "crl", "--preset", preset, "--env-id", env_id])
+    recipe = default_args(preset, env_id)
+    assert args == replace(recipe, algo="crl", her="geometric", desired_ratio=0.0)
+    check(args)
+    assert parse(["--algo", "crl", "--her", "relabel"]).her == "relabel"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -228,6 +238,11 @@ def test_command_line_overrules_the_recipe():
         ),
         ({"pretrain_updates": 9}, "pretrain_updates needs demonstrations: pass"),
         ({"noise_eps": 0.0, "random_eps": (0.0, 0.0)}, "algo ddpg explores by"),
+        ({"algo": "crl"}, "--her geometric --desired-ratio 0"),
+        (
+            {"algo": "crl", "her": "geometric", "demos": Path("nofile.pt")},
+            "algo crl cannot use demonstrations",
+        ),
         ({"her": "parts"}, "--her parts needs goals of several objects"),
         ({"start_at_object": 0.5}, "start_at_object needs end-effector control"),
         ({"out": Path("/dev/null")}, "out must be a folder, got the file /dev/null"),

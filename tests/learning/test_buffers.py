@@ -58,6 +58,28 @@ def test_desired_goals_of_others(stack):
     torch.testing.assert_close(batch["next", "reward"], reward)
 
 
+def test_geometric_goals():
+    """Every goal is achieved k steps later, with probability in proportion to 0.9^k."""
+    with torch_panda.make("PandaReach-v1", num_envs=4, seed=0) as env:
+        data = play_randomly(env)
+        buffer = make_buffer(env, 1000, her="geometric", discount=0.9, seed=0)
+    buffer.extend(select_sequences(data, 1.0).reshape(-1))
+    batch = buffer.sample(4000)
+    achieved = data["next", "achieved_goal"].flatten(0, 1)
+    is_goal = (batch["desired_goal"][:, None] == achieved).all(-1)
+    assert (is_goal.sum(1) == 1).all()
+    k = is_goal.long().argmax(1) - batch["index"]
+    steps_left = data.shape[1] - batch["index"] % data.shape[1]
+    assert ((k >= 0) & (k < steps_left)).all()
+    later = torch.arange(data.shape[1])
+    weights = torch.where(later < steps_left[:, None], 0.9**later, 0.0)
+    expected = (weights / weights.sum(1, keepdim=True)).sum(0)
+    drawn = torch.bincount(k, minlength=len(later))
+    torch.testing.assert_close(
+        drawn.cumsum(0) / 4000, expected.cumsum(0) / 4000, atol=0.03, rtol=0.0
+    )
+
+
 def test_parts_need_several_objects():
     with (
         torch_panda.make("PandaPush-v1", num_envs=1) as env,

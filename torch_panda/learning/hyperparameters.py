@@ -23,7 +23,7 @@ class Hyperparameters:
     """algorithm"""
     double_q: bool = True
     """learn two critics, and use the smaller value (TD3, SAC) or the lower quantiles
-    (TQC) as target. DDPG always has one critic"""
+    (TQC) as target. DDPG and CRL always have one critic"""
     gamma: Discount | None = None
     """discount factor; None means 1 - 1 / (steps of an episode), as in OpenAI
     Baselines"""
@@ -31,23 +31,23 @@ class Hyperparameters:
     """hidden layers of actors and critics: three of 256 units ("paper"), the same with
     LayerNorm ("layer-norm"), or three of 448 units with LayerNorm ("wide")"""
     target_interval: Positive = 1
-    """gradient steps between two updates of the target networks"""
+    """gradient steps between two updates of the target networks, which CRL lacks"""
     action_l2: Weight = 1.0
-    """DDPG, TD3: weight of the mean squared action in the actor's loss"""
+    """DDPG, TD3, CRL: weight of the mean squared action in the actor's loss"""
     ema_rate: Ratio = 0.0
     """rate of an exponential moving average (EMA) of the actor's weights. In each
     gradient step the average moves this fraction of the way to the actor. The average
     is evaluated and saved as the policy, and the actor itself explores. 0 evaluates
     and saves the actor"""
     noise_eps: Weight = 0.2
-    """DDPG, TD3: standard deviation of the Gaussian noise on actions"""
+    """DDPG, TD3, CRL: standard deviation of the Gaussian noise on actions"""
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)
     """fraction of exploring steps in the first and in the last of the parallel
     environments. The fractions of the other environments are evenly spaced between
     them. SAC and TQC use this option only with exploration "points" """
     exploration: Exploration = "actions"
-    """how to explore. "actions" takes random actions with DDPG and TD3. With SAC and
-    TQC it has no effect, because their policies are random. "points" moves the hand
+    """how to explore. "actions" takes random actions with DDPG, TD3 and CRL. With SAC
+    and TQC it has no effect, because their policies are random. "points" moves the hand
     towards random points, or under joint control the joints towards random
     positions"""
     relative_inputs: RelativeInputs = "none"

@@ -98,7 +98,7 @@ CRL_OPTIONS: dict[str, Any] = {"her": "geometric", "desired_ratio": 0.0}
 
 
 def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
-    """Check that DDPG and TD3 explore, which they do only by noise.
+    """Check that DDPG, TD3 and CRL explore, which they do only by noise.
 
     Raises:
         ValueError: The exploration noise is 0 in all environments.

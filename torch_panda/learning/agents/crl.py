@@ -56,6 +56,9 @@ class CRL(Agent):
 
         See `Agent.backward`. Rewards and next states are not used.
         """
+        # The augmentation "mirror-shift" shifts every row by an offset of its own. This
+        # makes some rows easy to tell apart. But it changes p(g) for all actions alike,
+        # so the best action stays the same.
         s = state[:, self.normalizer.state_columns]
         phi, psi = self.phi(s, rows.action), self.psi(self.normalizer.goal(rows.goal))
         critic_loss = contrastive_loss(-distances(phi, psi))
