@@ -71,11 +71,8 @@ class CRL(Agent):
         state = self.normalizer(rows.observation, rows.goal[other])
         before_tanh = self.actor[0](state)
         f = -(self.phi(s, before_tanh.tanh()) - psi.detach()[other]).norm(dim=-1)
-        # A detour of one step lowers f by about 1 - gamma, and a return of -1 per step
-        # by at most 1. So `action_l2` has about the same effect as with DDPG.
-        value = f / (1 - self.gamma)
         penalty = action_penalty(before_tanh, self.hp.action_l2)
-        actor_loss = penalty - value.mean()
+        actor_loss = penalty - f.mean()
         # Compute gradients for the actor only. The critic keeps the gradients of its
         # own loss.
         actor_loss.backward(inputs=self.actor_parameters)
