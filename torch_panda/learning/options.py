@@ -36,11 +36,11 @@ class Args(Hyperparameters):
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     her: Hindsight = "relabel"
-    """hindsight goals, four for each original goal: relabel transitions when they are
-    sampled ("relabel"), or the same with a separate draw for each object's part of the
-    goal ("parts"). "geometric", the default of CRL, relabels every transition with the
-    goal achieved k steps later, with a probability in proportion to gamma**k. "none"
-    uses no hindsight"""
+    """hindsight goals. "relabel" relabels four of five transitions when they are
+    sampled. "parts" does the same with a separate draw for each object's part of the
+    goal. "geometric", the default of CRL, relabels every transition with the goal
+    achieved k steps later, with a probability in proportion to gamma**k. "none" uses no
+    hindsight"""
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of random transitions. The
     rest are goals achieved later in the same episode"""
@@ -98,7 +98,7 @@ CRL_OPTIONS: dict[str, Any] = {"her": "geometric", "desired_ratio": 0.0}
 
 
 def check_exploration(hp: Hyperparameters, num_envs: int) -> None:
-    """Check that DDPG, TD3 and CRL explore, which they do only by noise.
+    """Check that DDPG, TD3 and CRL explore, by noise or by random actions.
 
     Raises:
         ValueError: The exploration noise is 0 in all environments.

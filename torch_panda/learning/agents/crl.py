@@ -56,16 +56,17 @@ class CRL(Agent):
 
         See `Agent.backward`. Rewards and next states are not used.
         """
-        # The augmentation "mirror-shift" shifts every row by an offset of its own. This
-        # makes some rows easy to tell apart. But it changes p(g) for all actions alike,
-        # so the best action stays the same.
+        # The augmentation "mirror-shift" shifts half of the rows, each by an offset of
+        # its own. The critic can tell a shifted goal from the others by its place. This
+        # changes p(g), but for all actions alike, so the best action stays the same.
         s = state[:, self.normalizer.state_columns]
         phi, psi = self.phi(s, rows.action), self.psi(self.normalizer.goal(rows.goal))
         critic_loss = contrastive_loss(-distances(phi, psi))
         critic_loss.backward()
 
         # Half of the actor's goals belong to other rows, as in the published code of
-        # arXiv 2206.07568. Otherwise most of them would be achieved already.
+        # arXiv 2206.07568. The cube rarely moves, so most rows' own goals are achieved
+        # before the step.
         other = torch.arange(len(s), device=s.device)
         other[::2] = other[::2].roll(1)
         state = self.normalizer(rows.observation, rows.goal[other])
