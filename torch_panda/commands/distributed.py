@@ -42,7 +42,7 @@ from torch_panda.learning.checkpoint import (
 )
 from torch_panda.learning.curve import Curve, draw_seed
 from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
-from torch_panda.learning.options import check_exploration
+from torch_panda.learning.options import CRL_OPTIONS, check_exploration
 from torch_panda.learning.user_modules import (
     Imports,
     UserModule,
@@ -106,12 +106,13 @@ class Learner:
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
         self.agent = make_agent(self.env, args)
         capacity = args.total_steps + args.batch_frames
+        goal_options = CRL_OPTIONS if args.algo == "crl" else {}
         self.buffer = make_buffer(
             self.env,
             capacity,
-            her="geometric" if args.algo == "crl" else "relabel",
             discount=self.agent.gamma,
             seed=args.seed,
+            **goal_options,
         )
         self.progress = Progress()
         self.curve = Curve(args.env_id, self.agent, out, device="cpu")

@@ -1,15 +1,17 @@
 """Contrastive reinforcement learning (CRL), which needs no rewards.
 
-The critic f(s, a, g) = -|phi(s, a) - psi(g)| learns which goal g was achieved after
-which transition (arXiv 2206.07568). In every batch, the goal of a transition is
-achieved k steps later with a probability in proportion to gamma**k; see `make_buffer`
-with her="geometric". At its optimum, f is log(p(g | s, a) / p(g)) plus a constant. Here
-p(g | s, a) is the discounted probability of reaching g after (s, a), and p(g) is the
-frequency of g in the batches. So f ranks actions as Q does, and the actor ascends f.
+The critic f(s, a, g) = -|phi(s, a) - psi(g)| learns which goals g an episode achieves
+after an action a in a state s (arXiv 2206.07568). Every sampled transition gets a goal
+that its episode achieved k steps later, where k is drawn with a probability in
+proportion to gamma**k (see `make_buffer` with her="geometric"). At its optimum, f is
+log(p(g | s, a) / p(g)) plus a constant. Here p(g | s, a) is the discounted probability
+of reaching g after (s, a), and p(g) is the frequency of g in the batches. So f ranks
+actions as Q does, and the actor ascends f.
 
 The distance in f and the loss of the critic are those of JaxGCRL (arXiv 2408.11052).
-With the inner product and the binary loss of the first paper, as in
-`torch_panda.learning.offline.crl`, Reach takes several times as many steps.
+The first paper, and `torch_panda.learning.offline.crl`, have an inner product and a
+binary loss. With these, Reach had 39 % success after 3,200 steps instead of 100 % (one
+seed each).
 """
 
 import torch
@@ -71,8 +73,9 @@ class CRL(Agent):
         other[::2] = other[::2].roll(1)
         state = self.normalizer(rows.observation, rows.goal[other])
         before_tanh = self.actor[0](state)
-        f = -(self.phi(s, before_tanh.tanh()) - psi.detach()[other]).norm(dim=-1)
-        penalty = action_penalty(before_tanh, self.hp.action_l2)
+        action = before_tanh.tanh()
+        f = -(self.phi(s, action) - psi.detach()[other]).norm(dim=-1)
+        penalty = action_penalty(before_tanh, action, self.hp.action_l2)
         actor_loss = penalty - f.mean()
         # Compute gradients for the actor only. The critic keeps the gradients of its
         # own loss.

@@ -93,7 +93,7 @@ class DDPG(Agent):
         before_tanh = self.actor[0](state)
         action = before_tanh.tanh()
         value = self.critics[0](state, action)
-        penalty = action_penalty(before_tanh, self.hp.action_l2)
+        penalty = action_penalty(before_tanh, action, self.hp.action_l2)
         actor_loss = penalty - value.mean()
         if num_demos:
             # Imitate only demonstrated actions that the critic prefers (the Q filter).
@@ -112,12 +112,13 @@ class DDPG(Agent):
             torch._foreach_lerp_(self.target, self.online, TAU)
 
 
-def action_penalty(before_tanh: Tensor, action_l2: float) -> Tensor:
+def action_penalty(before_tanh: Tensor, action: Tensor, action_l2: float) -> Tensor:
     """Penalty on large actions in an actor's loss, a scalar.
 
     Args:
         before_tanh: Inputs of the actor's tanh, (n, action size).
+        action: Its outputs, (n, action size).
         action_l2: Weight of the mean squared action.
     """
-    penalty = action_l2 * before_tanh.tanh().square().mean()
+    penalty = action_l2 * action.square().mean()
     return penalty + SATURATION_L2 * before_tanh.square().mean()
