@@ -171,7 +171,7 @@ class Agent(nn.Module, ABC):
         """
 
     def move_targets(self) -> None:
-        """Move the target networks, if any, to the online networks, by the part TAU."""
+        """Move the target networks, if there are any, towards their networks."""
 
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """Take one gradient step of the policy towards demonstrated actions.
