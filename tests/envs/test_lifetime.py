@@ -9,6 +9,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
+from torchrl.envs import EnvCreator
 
 import torch_panda
 
@@ -138,6 +139,16 @@ def test_a_resumed_collector_goes_on():
     assert torch.equal(goals(expected), goals(actual))
     first.shutdown()
     second.shutdown()
+
+
+def test_environments_of_an_env_creator_have_their_own_seeds():
+    creator = EnvCreator(make)
+    with creator() as first, creator() as second:
+        goals = [env.reset()["desired_goal"] for env in (first, second)]
+        assert not torch.equal(*goals)
+    seeded = EnvCreator(make, create_env_kwargs={"seed": 3})
+    with seeded() as env, make(seed=3) as same:
+        assert (env.reset() == same.reset()).all()
 
 
 def test_a_state_dict_of_other_environments():

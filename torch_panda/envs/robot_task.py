@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, EnvCreator
 from torchrl.envs.common import _cache_value
 from torchrl.envs.utils import _update_during_reset
 from torchrl.modules import RandomPolicy
@@ -39,6 +40,8 @@ if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.window import Window
 
 _CPU = torch.device("cpu")
+# torchrl's function that makes an environment and loads a state_dict into it.
+_CREATE_CODE = EnvCreator.__call__.__code__
 
 
 class RobotTaskEnv(EnvBase):
@@ -411,10 +414,14 @@ class RobotTaskEnv(EnvBase):
         Collectors of torchrl pass an empty one, because their ``state_dict`` does not
         include that of the environment.
 
+        torchrl's `EnvCreator` loads the ``state_dict`` of its first environment into
+        all others, and `ParallelEnv` wraps every lambda in an `EnvCreator`. This method
+        ignores such a call, because all workers would play the same episodes.
+
         Raises:
             ValueError: The ``state_dict`` holds a different number of environments.
         """
-        if not state_dict:
+        if not state_dict or sys._getframe(1).f_code is _CREATE_CODE:
             return None
         return super().load_state_dict(state_dict, *args, **kwargs)
 
