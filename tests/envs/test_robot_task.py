@@ -142,6 +142,24 @@ def test_partial_reset_leaves_the_others_alone(env):
         assert env.get_state()["step_count"].flatten().tolist() == [30, 19, 30]
 
 
+def test_a_partial_reset_returns_the_entries_of_all_environments(env):
+    env.reset()
+    state = env.get_state()
+    td = env.reset()
+    td = env.step(td.set("action", torch.ones(3, 3)))["next"]
+    mask = torch.tensor([[True], [False], [False]])
+    from_state = env.reset(state.clone().set("_reset", mask), set_state=True)
+    anew = env.reset(TensorDict({"_reset": mask}, [3]))
+    for start in (from_state, anew):
+        assert "_reset" not in set(start.keys())
+        for key in ("observation", "achieved_goal", "desired_goal"):
+            assert torch.equal(start[key][1:], td[key][1:])
+            assert start[key].dtype == env.observation_spec[key].dtype
+    goal = env.get_state()["desired_goal"].float()
+    assert torch.equal(anew["desired_goal"], goal)
+    assert torch.equal(from_state["desired_goal"][0], state["desired_goal"][0].float())
+
+
 def test_partial_step_leaves_the_others_alone(env):
     td = env.reset()
     before = env.get_state()

@@ -274,12 +274,14 @@ class RobotTaskEnv(EnvBase):
         # Such a reset does not start from a state.
         if set_state is None and not kwargs.get("select_reset_only", False):
             set_state = is_state(tensordict, self.episodes.entries)
-        if set_state and tensordict is not None:
-            # torchrl writes the observed float32 goal into this tensordict. Copy it, so
-            # that the state of the caller keeps its float64 goal.
-            tensordict = tensordict.copy()
-        start = super().reset(tensordict, set_state=set_state, **kwargs)
-        return start.exclude(*EXACT_KEYS) if set_state else start
+        if not set_state or tensordict is None or kwargs.get("select_reset_only"):
+            return super().reset(tensordict, set_state=set_state, **kwargs)
+        # torchrl's reset would keep the entries of this tensordict for environments
+        # that are not reset. But here they are those of a state, and its
+        # ``desired_goal`` is not the goal of these environments.
+        self._assert_tensordict_shape(tensordict)
+        start = self._reset(tensordict, set_state=True)
+        return tensordict.exclude("_reset", *EXACT_KEYS).update(start)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act for one step, as in torchrl.
@@ -599,12 +601,15 @@ class RobotTaskEnv(EnvBase):
     ) -> TensorDictBase:
         """Write the first observations into the caller's tensordict, as in torchrl.
 
-        torchrl's own method also adds missing ``done`` entries and checks that no
-        episode is done at its start. `_reset` always returns these entries, and they
-        are false. The extra work would take as long as the rest of the method.
+        torchrl's own method writes zeros for environments that are not reset, where the
+        tensordict lacks an entry. `_reset` returns the entries of all environments, so
+        write these.
         """
-        if tensordict is None or tensordict._get_str("done", None) is None:
-            return super()._reset_proc_data(tensordict, tensordict_reset)
+        if tensordict is None:
+            return tensordict_reset
+        for key, value in tensordict_reset.items():
+            if tensordict._get_str(key, None) is None:
+                tensordict.set(key, value)
         return _update_during_reset(tensordict_reset, tensordict, self.reset_keys)
 
     def _create_done_specs(self) -> None:
