@@ -1,5 +1,7 @@
 """After a reset that failed, its environments need another reset."""
 
+import sys
+
 import pytest
 import torch
 
@@ -55,6 +57,17 @@ def test_environments_recover_from_physics_that_cannot_be_varied():
         env.reset(env.rand_action().set("_reset", ~mask))
         exact = env.get_state(exact=True)
         env.reset(exact, set_state=True)
+
+
+class Exits(Push):
+    def randomize(self, client, bodies, rng):
+        sys.exit("no such mass")
+
+
+def test_a_hook_that_exits_raises_an_error():
+    message = "environment 0: SystemExit: no such mass"
+    with make(Exits()) as env, pytest.raises(WorkerError, match=message):
+        env.reset()
 
 
 class Driver(Panda):

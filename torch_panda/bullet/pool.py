@@ -16,7 +16,7 @@ class _Job:
         # Threads share this iterator without a lock: the GIL makes `next` on an
         # iterator over a sequence atomic.
         self.indices: Iterator[int] = iter(indices)
-        self.errors: list[tuple[int, Exception]] = []
+        self.errors: list[tuple[int, BaseException]] = []
         self._running = num_threads
         self._lock = threading.Lock()
         # Locked until all work is done; `wait` acquires it. A lock wakes a waiting
@@ -29,7 +29,8 @@ class _Job:
         for index in self.indices:
             try:
                 self.work(index)
-            except Exception as error:
+            # Also SystemExit: a thread that ended here would let `wait` wait forever.
+            except BaseException as error:
                 self.errors.append((index, error))
         with self._lock:
             self._running -= 1
@@ -74,7 +75,7 @@ class WorkerError(RuntimeError):
         error: The error that this work raised.
     """
 
-    def __init__(self, index: int, error: Exception) -> None:
+    def __init__(self, index: int, error: BaseException) -> None:
         super().__init__(f"environment {index}: {type(error).__name__}: {error}")
         self.index = index
 
