@@ -59,6 +59,22 @@ def test_environments_recover_from_physics_that_cannot_be_varied():
         env.reset(exact, set_state=True)
 
 
+def test_environments_recover_from_a_divergence_without_a_next_start():
+    task = FailsOnce()
+    task.fails = False
+    with make(task, on_divergence="reset") as env:
+        env.reset()
+        simulation = env.episodes.simulation
+        scene = simulation.scene
+        simulation.clients[0].set_joint(scene.robot, scene.joints[0], 0.0, 1e300)
+        task.fails = True
+        with pytest.raises(RuntimeError, match="no goal yet"):
+            env.step(env.rand_action())
+        with pytest.raises(BulletError, match=r"environments \[0\] .*reset first"):
+            env.step(env.rand_action())
+        assert env.rollout(3).shape == (3,)
+
+
 class Exits(Push):
     def randomize(self, client, bodies, rng):
         sys.exit("no such mass")

@@ -412,10 +412,13 @@ class Episodes:
 
     def _recover(self, envs: list[int]) -> None:
         """Start the next episode of environments whose physics diverged."""
+        # If anything below raises, these environments need a reset.
+        self._needs_reset.update(envs)
         for env in envs:
             self.simulation.rebuild(env)
             self._starts.draw(env)
         self._start_episodes(envs)
+        self._needs_reset.difference_update(envs)
         if self.on_divergence == "raise":
             raise BulletError(
                 f"the physics of environments {envs} diverged: their state was not "
