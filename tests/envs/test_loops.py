@@ -4,6 +4,7 @@ Further tests of both loops use the fixture ``loop``: parity with panda-gym, his
 divergence.
 """
 
+import dataclasses
 import multiprocessing
 import os
 import signal
@@ -262,6 +263,28 @@ def test_inverse_kinematics_without_an_arm(env):
     control = MotorControl((1.0,) * 9, ik_link=11, ik_orientation=(1.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="ik_link needs num_arm_joints"):
         env.episodes.simulation.step(control, np.zeros((N, 12)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("num_arm_joints", 12), ("num_arm_joints", -3), ("ik_link", -1)],
+)
+def test_a_control_whose_fields_are_out_of_range(env, field, value):
+    control = dataclasses.replace(env.robot.motor_control, **{field: value})
+    with pytest.raises(ValueError, match=f"{field} must be .* got {value}"):
+        env.episodes.simulation.step(control, np.zeros((N, control.setpoint_dim)))
+
+
+@pytest.mark.parametrize("envs", [[N], [-1], [0, 1, 0]])
+def test_clients_that_do_not_exist_or_are_named_twice(env, envs):
+    simulation, control = env.episodes.simulation, env.robot.motor_control
+    setpoint = np.zeros((N, control.setpoint_dim))
+    for call in (
+        lambda: simulation.step(control, setpoint, envs),
+        lambda: simulation.reset(envs),
+    ):
+        with pytest.raises(ValueError, match="different indices from 0 to 2, got"):
+            call()
 
 
 # ---- interrupts, processes, threads --------------------------------------------------

@@ -69,8 +69,9 @@ class MotorControl:
         """Make sure that this control fits the setpoints and joints of the robots.
 
         Raises:
-            ValueError: The number of forces or the shape of the setpoints is wrong, or
-                ``ik_link`` is used with velocities, with torques or without an arm.
+            ValueError: The number of forces or the shape of the setpoints is wrong,
+                ``num_arm_joints`` or ``ik_link`` is out of range, or ``ik_link`` is
+                used with velocities, with torques or without an arm.
         """
         if self.ik_link is not None and self.arm_mode != "position":
             raise ValueError(
@@ -86,6 +87,13 @@ class MotorControl:
                 f"a MotorControl needs a force for each of {num_joints} movable "
                 f"joints, got {len(self.forces)}"
             )
+        if not 0 <= self.num_arm_joints <= num_joints:
+            raise ValueError(
+                f"num_arm_joints must be from 0 to {num_joints}, the number of movable "
+                f"joints, got {self.num_arm_joints}"
+            )
+        if self.ik_link is not None and self.ik_link < 0:
+            raise ValueError(f"ik_link must be None or at least 0, got {self.ik_link}")
         if setpoint.shape != (num_envs, self.setpoint_dim):
             raise ValueError(
                 f"the setpoint must have shape {(num_envs, self.setpoint_dim)}, "

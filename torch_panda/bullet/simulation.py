@@ -65,6 +65,7 @@ class VectorSimulation:
         self._clients: list[PhysicsClient] = []
         self._broad_phases: list[BroadPhase] = []
         self._pool = WorkerPool(min(num_threads, num_envs))
+        self._indices = frozenset(range(num_envs))
         self._native: NativeLoop | None = None
         try:
             client = PhysicsClient(physics=physics)
@@ -150,8 +151,11 @@ class VectorSimulation:
         Raises:
             WorkerError: Bullet failed in one or more clients. The error names the first
                 of them. Every client that did not fail took the step.
-            ValueError: ``control`` does not fit the setpoints or the robot.
+            ValueError: ``control`` does not fit the setpoints or the robot, or
+                ``envs`` has an index twice or one that is out of range.
         """
+        if envs is not None:
+            self._check_indices(envs)
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
             control.check(setpoint, self.num_envs, len(self.scene.joints))
@@ -205,7 +209,9 @@ class VectorSimulation:
         Raises:
             WorkerError: Bullet or ``randomize`` failed in one or more clients. The
                 error names the first of them. Every client that did not fail was reset.
+            ValueError: ``envs`` has an index twice or one that is out of range.
         """
+        self._check_indices(envs)
         if self._native is not None and randomize is None:
             self._pool.wait()
             self._native.reset(envs)
@@ -262,6 +268,18 @@ class VectorSimulation:
                 f"later one"
             )
         return BroadPhase(client)
+
+    def _check_indices(self, envs: Sequence[int]) -> None:
+        """Refuse indices with which threads of C would crash the interpreter.
+
+        C code does not check that a client exists. If an index occurs twice, two
+        threads could use the same client.
+        """
+        if len(self._indices.intersection(envs)) != len(envs):
+            raise ValueError(
+                f"envs must be different indices from 0 to {self.num_envs - 1}, got "
+                f"{list(envs)}"
+            )
 
     def _check_joints(self) -> None:
         """Check that the scene lists as many joints as Bullet's robot has."""
