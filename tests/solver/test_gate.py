@@ -154,6 +154,16 @@ def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
     assert wrong in reason()
 
 
+def test_an_interrupted_self_test_puts_bullets_functions_back(closed, monkeypatch):
+    def interrupt(*args, **tables):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gate, "run_self_test", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        gate.activate()
+    assert gate.find_replacements(library.library_path())
+
+
 def test_library_of_other_sources(closed, monkeypatch):
     monkeypatch.setattr(native, "VERSION", 0)
     assert "but the sources of torch_panda have version 0" in reason()

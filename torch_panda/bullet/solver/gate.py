@@ -169,7 +169,7 @@ def open_gate() -> None:
     solver.install(replacements)
     try:
         run_self_test(solver, motor_table=tables[_MOTOR], limit_table=tables[_LIMIT])
-    except GateError:
+    except BaseException:  # also Ctrl-C: the next call checks all conditions again
         solver.uninstall()
         raise
     solver.enable(True)
