@@ -71,6 +71,12 @@ def test_platform(closed, monkeypatch, system, machine):
     assert f"this is {system} on {machine}" in reason()
 
 
+def test_an_empty_variable_counts_as_unset(closed, monkeypatch):
+    monkeypatch.setenv(SOLVER_VARIABLE, "")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert "needs x86-64 Linux" in reason()
+
+
 def test_version(closed, monkeypatch):
     monkeypatch.setattr(library, "SUPPORTED_VERSION", "3.2.6")
     assert reason() == "the packed solver needs pybullet 3.2.6, and 3.2.7 is installed"

@@ -133,7 +133,7 @@ _lock = threading.Lock()
 
 
 def _decide() -> SolverStatus:
-    choice = os.environ.get(SOLVER_VARIABLE)
+    choice = os.environ.get(SOLVER_VARIABLE) or None
     if choice not in (None, "packed", "bullet"):
         raise ValueError(
             f'{SOLVER_VARIABLE} must be "packed" or "bullet", got "{choice}"'
