@@ -99,6 +99,7 @@ def test_a_partial_reset_restores_only_its_own():
         (lambda s: s.exclude("joint_position"), r"needs all.*'joint_position'"),
         (lambda s: s.set("actions", s["actions"] * 9), r"actions of environment 0"),
         (lambda s: s.set("actions", s["actions"][..., :2]), "actions must have shape"),
+        (lambda s: s.set("actions", s["actions"][:, 0, 0]), "actions must have shape"),
         (lambda s: s.set("num_actions", s["num_actions"] + 1), "at most 3"),
         (
             lambda s: s.set("object_pose", s["object_pose"] + 1e-9),

@@ -1,5 +1,6 @@
 """Reads and checks the state from which a reset starts."""
 
+import math
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -202,7 +203,8 @@ def read_state(
             f"an exact state needs all its entries, but {sorted(missing)} are missing; "
             f"leave out {sorted(exact_keys)} to start from the other entries"
         )
-    n, length = len(next(iter(present.values()))), state[ACTIONS].shape[-2]
+    n = len(next(iter(present.values())))
+    length = math.prod(state[ACTIONS].shape[-2:-1])  # 1 if a dimension is missing
     values, origin = read(), read(START)
     like = torch.zeros(n, length, action_dim, dtype=torch.float32, device="cpu")
     actions = _read_entry(ACTIONS, state[ACTIONS], batch_shape, like, envs)
