@@ -1,9 +1,12 @@
 """Coarse meshes: fewer triangles, the same picture."""
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from torch_panda.bullet import PhysicsClient
-from torch_panda.bullet.urdf import find_urdf
+from torch_panda.bullet.urdf import find_urdf, parse_urdf
 from torch_panda.rendering import Camera
 from torch_panda.rendering.mesh_decimation import decimated_urdf
 from torch_panda.rendering.visual_client import VisualClient
@@ -37,8 +40,8 @@ def test_coarse_files_are_small_and_written_once():
     assert decimated_urdf(urdf, 0.013) == path
     faces = [
         line
-        for mesh in path.parent.glob("*.obj")
-        for line in mesh.read_text().splitlines()
+        for mesh in parse_urdf(path).iter("mesh")
+        for line in Path(mesh.get("filename")).read_text().splitlines()
         if line.startswith("f ")
     ]
     assert 1000 < len(faces) < 12_000
@@ -50,3 +53,43 @@ def test_other_robots_load():
         arm = physics.load_urdf("kuka_iiwa/model.urdf", fixed_base=True)
     with VisualClient(physics.blueprint, mesh_cell=0.02) as client:
         assert (client.draw(camera, segmentation=True).segmentation == arm).sum() > 50
+
+
+TRIANGLE = """# Caf\u00e9
+mtllib materials/paint.mtl
+v 0 0 0
+v {size} 0 0
+v 0 {size} 0
+vt 0 0
+f 1/1 2/1 3/1
+"""
+
+
+@pytest.fixture
+def two_parts(tmp_path):
+    """A URDF whose two meshes and their textures have equal names."""
+    links = ""
+    for size, part in enumerate(("left", "right"), start=1):
+        folder = tmp_path / part / "visual"
+        (folder / "materials" / "images").mkdir(parents=True)
+        mesh = TRIANGLE.format(size=size)
+        (folder / "part.obj").write_bytes(mesh.encode("latin-1"))
+        paint = "newmtl paint\nmap_Kd images/paint.png\n"
+        (folder / "materials" / "paint.mtl").write_text(paint)
+        (folder / "materials" / "images" / "paint.png").write_text(part)
+        links += f"""<link name="{part}"><visual><geometry>
+            <mesh filename="{part}/visual/part.obj"/></geometry></visual></link>"""
+    path = tmp_path / "robot.urdf"
+    path.write_text(f"<robot name='parts'>{links}</robot>")
+    return path
+
+
+def test_meshes_and_textures_of_equal_names_stay_apart(two_parts):
+    robot = parse_urdf(decimated_urdf(str(two_parts), 0.01))
+    found = []
+    for mesh in robot.iter("mesh"):
+        path = Path(mesh.get("filename"))
+        lines = path.read_text().splitlines()
+        size = max(float(line.split()[1]) for line in lines if line.startswith("v "))
+        found.append((size, (path.parent / "paint.png").read_text()))
+    assert found == [(1.0, "left"), (2.0, "right")]

@@ -36,7 +36,6 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
     Returns:
         Path of the new file.
     """
-    folder = make_scratch_folder()
     source = Path(urdf).absolute()
     robot = parse_urdf(source)
     for link in robot.iter("link"):
@@ -46,24 +45,24 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
             original = find_mesh(mesh.get("filename", ""), source)
             if original is not None and original.suffix == ".obj":
                 scale = np.array(mesh.get("scale", "1 1 1").split(), dtype=float)
-                original = _coarse_obj(original, folder, cell / scale)
+                original = _coarse_obj(original, cell / scale)
             if original is not None:
                 mesh.set("filename", str(original))
-    path = folder / source.name
+    path = make_scratch_folder() / source.name
     ElementTree.ElementTree(robot).write(path)
     return path
 
 
-def _coarse_obj(original: Path, folder: Path, cell: Floats) -> Path:
-    """Write the coarse version of an .obj file and its texture into a folder."""
+def _coarse_obj(original: Path, cell: Floats) -> Path:
+    """Write the coarse version of an .obj file and its texture into a new folder."""
     vertices, coordinates, corners = _read_obj(original)
     positions, texture, faces = merge_vertices(vertices, coordinates, corners, cell)
-    path = folder / f"{original.parent.name}_{original.name}"
+    path = make_scratch_folder() / original.name
     lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in positions]
     lines += [f"vt {u:.6f} {v:.6f}" for u, v in texture]
     image = _texture_of(original)
     if image is not None:
-        shutil.copy(image, folder)
+        shutil.copy(image, path.parent)
         material = path.with_suffix(".mtl")
         material.write_text(f"newmtl coarse\nmap_Kd {image.name}\n")
         lines = [f"mtllib {material.name}", *lines, "usemtl coarse"]
@@ -137,7 +136,7 @@ def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
     vertices: list[list[float]] = []
     coordinates = [[0.0, 0.0]]
     corners: list[list[tuple[int, int]]] = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text(errors="replace").splitlines():
         keyword, _, rest = line.partition(" ")
         if keyword == "v":
             vertices.append([float(x) for x in rest.split()[:3]])
@@ -159,17 +158,17 @@ def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
 def _texture_of(path: Path) -> Path | None:
     """The first texture in the materials of an .obj file, as Bullet uses only one."""
     for library in _values(path, "mtllib"):
-        materials = path.with_name(library)
+        materials = path.parent / library
         if materials.is_file():
-            for image in _values(materials, "map_Kd"):
-                if materials.with_name(image).is_file():
-                    return materials.with_name(image)
+            for name in _values(materials, "map_Kd"):
+                if (image := materials.parent / name).is_file():
+                    return image
     return None
 
 
 def _values(path: Path, key: str) -> Iterator[str]:
     """The last words of the lines of a text file that begin with ``key``."""
-    with path.open() as lines:
+    with path.open(errors="replace") as lines:
         for line in lines:
             if line.startswith(key + " "):
                 yield line.split()[-1]
