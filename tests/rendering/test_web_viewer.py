@@ -1,6 +1,7 @@
 """The viewer in the browser shows environments, and serves its own page only."""
 
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 
 import numpy as np
@@ -82,6 +83,7 @@ def test_pause_goes_back_and_on(env):
             viewer.update()
             shown.append(env.get_state()["object_pose"][:, 0, :3].clone())
             assert viewer._step.value == step
+        assert viewer._step.max == 3
         viewer._chosen.value = 1
         viewer._step.value = 2
         viewer._go_to(Click)
@@ -138,6 +140,13 @@ def test_wrong_calls_raise_clear_errors(env):
     with env.open_viewer(port=8765) as viewer:
         with pytest.raises(torch_panda.BulletError, match="never reset"):
             viewer.update()
+        env.reset()
+        with (
+            ThreadPoolExecutor(1) as thread,
+            env.episodes.exclusive(),
+            pytest.raises(torch_panda.BulletError, match="another thread"),
+        ):
+            thread.submit(viewer.update).result()
         assert viewer.url.startswith("http://127.0.0.1:87")
     env.close()
     with pytest.raises(torch_panda.BulletError, match="closed"):

@@ -535,7 +535,7 @@ class RobotTaskEnv(EnvBase):
             return WebViewer(
                 episodes.simulation,
                 episodes.progress,
-                max_episode_steps=episodes.max_episode_steps,
+                exclusive=episodes.exclusive,
                 title=type(episodes.task).__name__,
                 camera=camera or Camera(),
                 host=host,

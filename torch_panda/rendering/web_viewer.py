@@ -5,6 +5,7 @@ This module needs the extra ``viewer``.
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,7 +57,8 @@ class WebViewer:
         simulation: The simulation whose state is shown.
         observe: Function that returns ``step_count``, ``success`` (num_envs, 1),
             ``achieved_goal`` and ``desired_goal`` (num_envs, goal_dim).
-        max_episode_steps: Maximum of the slider.
+        exclusive: Function that returns a context manager in which no other thread can
+            use the simulation.
         title: Title of the page.
         camera: See `RobotTaskEnv.open_viewer`, as for the following arguments.
         host: Address of the server.
@@ -69,7 +71,7 @@ class WebViewer:
         simulation: VectorSimulation,
         observe: Callable[[], dict[str, Tensor]],
         *,
-        max_episode_steps: int,
+        exclusive: Callable[[], AbstractContextManager[None]],
         title: str,
         camera: Camera,
         host: str,
@@ -77,6 +79,7 @@ class WebViewer:
         allowed_hosts: Sequence[str],
     ) -> None:
         self._simulation, self._observe, self._title = simulation, observe, title
+        self._exclusive = exclusive
         self._episodes: list[list[Frame]] = [[] for _ in range(simulation.num_envs)]
         self._env = 0
         # Callbacks of the page's controls run in threads of viser.
@@ -97,7 +100,7 @@ class WebViewer:
             "environment", 0, max(simulation.num_envs - 1, 1), 1, 0,
             disabled=simulation.num_envs == 1,
         )  # fmt: skip
-        self._step = gui.add_slider("step", 0, max_episode_steps, 1, 0)
+        self._step = gui.add_slider("step", 0, 1, 1, 0)  # `update` raises the maximum
         self._pause = gui.add_checkbox("pause", False)
         self._contacts = gui.add_checkbox("contacts", True)
         self._chosen.on_update(self._choose)
@@ -121,17 +124,22 @@ class WebViewer:
         """Record the state of all environments; unless paused, show the chosen one.
 
         At step 0 of an environment, its recording starts again.
+
+        Raises:
+            BulletError: The environment is closed or needs a reset, or another thread
+                is using it.
         """
-        simulation, now = self._simulation, self._observe()
+        simulation = self._simulation
         envs = range(simulation.num_envs)
-        steps = now["step_count"].flatten().tolist()
         forces: list[npt.NDArray[np.float64]] = [np.zeros((0, 2, 3)) for _ in envs]
 
         def read_env_forces(env: int) -> None:
             forces[env] = read_forces(simulation.clients[env], simulation)
 
-        simulation.run(read_env_forces, [env for env in envs if steps[env] > 0])
-        with self._lock:
+        with self._exclusive(), self._lock:
+            now = self._observe()
+            steps = now["step_count"].flatten().tolist()
+            simulation.run(read_env_forces, [env for env in envs if steps[env] > 0])
             for env in envs:
                 if steps[env] == 0:
                     self._episodes[env].clear()
@@ -144,6 +152,8 @@ class WebViewer:
                         describe(steps[env], {key: x[env] for key, x in now.items()}),
                     )
                 )
+            longest = max(map(len, self._episodes)) - 1
+            self._step.max = max(self._step.max, longest)
             if not self.paused:
                 self._step.value = len(self._episodes[self._env]) - 1
                 self._draw()
