@@ -76,6 +76,23 @@ def test_falling_bodies_equal_those_of_pybullet(reference, shape):
         assert [c.distance for c in ours] == [c[8] for c in theirs]
 
 
+def test_ctrl_c_in_close_does_not_free_a_client_twice(monkeypatch):
+    freed = []
+
+    def disconnect_and_interrupt(handle, disconnect=capi.disconnect):
+        if not freed:
+            disconnect(handle)
+        freed.append(handle)
+        raise KeyboardInterrupt
+
+    client = PhysicsClient()
+    monkeypatch.setattr(capi, "disconnect", disconnect_and_interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        client.close()
+    client.close()
+    assert len(freed) == 1
+
+
 def test_a_closed_client_raises_and_may_be_closed_again():
     client = PhysicsClient()
     client.close()

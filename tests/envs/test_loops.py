@@ -214,6 +214,26 @@ def test_an_error_names_the_environment_and_the_others_go_on(env, broken):
     assert env.rollout(5).shape == (N, 5)
 
 
+@needs_native
+def test_after_ctrl_c_in_close_a_second_close_frees_the_rest(monkeypatch):
+    destroyed = []
+
+    def destroy_and_interrupt(loop, destroy=native.LIBRARY.destroy):
+        if not destroyed:
+            destroy(loop)
+        destroyed.append(loop)
+        raise KeyboardInterrupt
+
+    env = make()
+    env.reset()
+    monkeypatch.setattr(native.LIBRARY, "destroy", destroy_and_interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        env.close()
+    env.close()
+    assert len(destroyed) == 1
+    assert all(client.is_closed for client in env.episodes.simulation.clients)
+
+
 def test_a_closed_client(env):
     env.reset()
     env.episodes.simulation.clients[1].close()

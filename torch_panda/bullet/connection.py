@@ -74,9 +74,10 @@ class Connection:
 
     def close(self) -> None:
         """Free the client. Closing again does nothing."""
-        if self._handle is not None:
-            capi.disconnect(self._handle)
-            self._handle = None
+        # Ctrl-C raises after `disconnect` has freed the client, so forget it before.
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            capi.disconnect(handle)
 
 
 def connect() -> Connection:

@@ -137,10 +137,11 @@ class NativeLoop:
 
     def close(self) -> None:
         """End the threads. Closing again does nothing."""
+        # Ctrl-C raises after `destroy` has freed the loop, so forget it before.
+        loop, self._loop = self._loop, None
         # A forked child has no threads of the loop.
-        if self._loop is not None and self._process == os.getpid():
-            self._library.destroy(self._loop)
-        self._loop = None
+        if loop is not None and self._process == os.getpid():
+            self._library.destroy(loop)
 
     def _start(self) -> None:
         """Start the threads, unless this process has started them already."""

@@ -319,10 +319,9 @@ class Episodes:
     def close(self) -> None:
         """Free all clients and threads. Closing again does nothing."""
         with self._guard:
-            if not self.is_closed:
-                self.is_closed = True
-                self.renderer.close()
-                self.simulation.close()
+            self.is_closed = True
+            self.renderer.close()
+            self.simulation.close()
 
     # ---- parts of a step and of a reset --------------------------------------------
 
