@@ -31,10 +31,11 @@ from torch_panda.rotations import rotate_vector
 # tree of AABBs again, one by one [m]. It is so far from the scene that links still
 # waiting there do not affect where in the tree Bullet inserts a link of the scene.
 _FAR_AWAY = (0.0, 0.0, 10_000.0)
-# `restore` restores the number of detections modulo this cycle: its lowest 8 bits. A
-# detection reads one bit per level of the tree, and the trees of the shipped tasks have
-# up to 11 levels. 8 bits are a compromise: only the lowest 6 had an effect in 120
-# episodes, and each further bit would double the detections that a reset needs.
+# `restore` restores the number of detections modulo this cycle, that is, the lowest 8
+# bits of the number. A detection reads one bit per level of the tree, and the trees of
+# the shipped tasks have up to 11 levels. 8 bits are a compromise: only the lowest 6 had
+# an effect in 120 episodes, and each further bit would double the detections that a
+# reset needs.
 _DETECTION_CYCLE = 256
 
 _NO_CONTACTS = (0, 0)  # collision group and mask of a link that touches nothing

@@ -65,7 +65,7 @@ void environment_setpoints(const struct actuation *actuation, doubles state,
 enum { REACHED, MISSED, UNKNOWN };
 /* Compare the distance of two goals with the threshold. How torch rounds a distance
    depends on the processor. Return UNKNOWN if the distance is so close to the threshold
-   that this rounding could decide, and if it is huge or NaN. */
+   that this rounding could decide, or if the distance is huge or NaN. */
 static int compare(const struct observation *observed, const float *achieved_goal,
                    const float *desired_goal) {
     double sum = 0, threshold = observed->distance_threshold;

@@ -24,7 +24,7 @@ from torch_panda.rotations import dot
 from torch_panda.rotations import rotation_distance as distance
 
 # Distances between the fingers [m]: around the cube, closing on it, holding it firmly,
-# and at the beginning of slip.
+# and when the cube begins to slip.
 WIDE, CLOSE, HOLD, SLIP = 0.078, 0.02, 0.036, 0.0395
 CATCH = 0.034  # distance that stops a swing; a smaller one squeezes the cube out [m]
 LOOSEN, STAY = 0.0012, -0.001  # actions that loosen the grasp and keep it loose

@@ -26,7 +26,8 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     to_lower, to_upper = norm(ee - lower), norm(ee - upper)
     must_rise = (to_lower < 0.06) & (to_lower < to_upper) & ~upper_held
     must_rise = must_rise | placed & stacked & (ee[..., 2:] < 0.15)
-    # Rise with closed or wide open fingers: opening ones would lift the cube.
+    # Rise only when the fingers are closed or wide open, because fingers that are still
+    # opening would lift the cube.
     upwards = torch.where((width < 0.02) | (width > 0.06), 1.0, 0.0)
     rise = torch.cat((0 * ee[..., :2], upwards, 0.4 + 0 * width), -1)
     finish = torch.where(stacked, 0.0, carry(ee, width, upper, top, clearance=0.06))

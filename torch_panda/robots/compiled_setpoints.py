@@ -25,8 +25,7 @@ class CompiledSetpoints:
         arm, is_ee = robot.num_arm_joints, robot.control_type == "ee"
         # A setpoint has the position of the hand, or of the arm's joints (the first
         # columns of the state), displaced by the scaled action. The positions of the
-        # other joints follow: the neutral ones, or with a free gripper as the action
-        # says.
+        # other joints follow. They are neutral, unless the action moves the fingers.
         num_displaced = 3 if is_ee else arm
         resting = () if robot.has_free_gripper else robot.neutral_joint_position[arm:]
         self._actuation = native.Actuation(
@@ -84,8 +83,8 @@ class CompiledSetpoints:
 def has_compiled_width(robot: Robot) -> bool:
     """Whether C can compute the distance between the fingers of a free gripper."""
     gripper = robot.gripper
-    # The width is the sum of the positions of the fingers' joints. Only for two joints
-    # is torch's order of addition known, and C does not know followers.
+    # The width is a weighted sum of the positions of the fingers' joints. For more than
+    # two joints, the order in which torch adds is unknown. C code has no followers.
     return (
         type(gripper) is Gripper and gripper.num_joints == 2 and not gripper.followers
     )

@@ -21,7 +21,7 @@
  *
  * Bullet enlarges AABBs in the tree by a margin and by a predicted motion. Both are 0 in
  * pybullet. The sign of a zero may therefore differ from Bullet's. If a limit is NaN, or
- * if an AABB jumps to a place that it does not overlap, Bullet's function moves it.
+ * if the moved AABB does not overlap the old one, Bullet's function moves it.
  */
 #if defined(__x86_64__) && defined(__linux__)
 #include "solver.h"
@@ -46,7 +46,7 @@ static inline void save(struct aabb *aabb, struct limits a) {
     _mm_storeu_pd(&aabb->max.z, a.max_z);
 }
 
-/* Whether all numbers but the upper one of z are true. */
+/* Whether both numbers of xy and the lower number of z are true. */
 static inline int all(__m128d xy, __m128d z) {
     return _mm_movemask_pd(_mm_and_pd(xy, _mm_unpacklo_pd(z, z))) == 3;
 }
@@ -82,7 +82,7 @@ static inline struct limits merge_children(const struct node *node) {
     return merge(load(&node->children[0]->aabb), load(&node->children[1]->aabb));
 }
 
-/* Twice the centre of an AABB, minus that of another, without signs. */
+/* Twice the distances between the centres of two AABBs along each axis. */
 static inline void distances(struct limits a, struct limits b, __m128d *xy, __m128d *z) {
     const __m128d sign = _mm_set1_pd(-0.0);
     *xy = _mm_andnot_pd(sign, _mm_sub_pd(_mm_add_pd(a.min_xy, a.max_xy),
@@ -116,8 +116,8 @@ static inline void replace_child(struct aabb_tree *tree, struct node *parent,
         parent->children[parent->children[1] == old] = new;
 }
 
-/* Removes a leaf from the tree, changes its AABB, and inserts it again. The leaf is not
-   the only one. */
+/* Removes a leaf from the tree, changes its AABB, and inserts it again. The tree must
+   have another leaf. */
 static void move_leaf(struct aabb_tree *tree, struct node *leaf, struct limits aabb) {
     /* The parent of the leaf leaves the tree, too, and becomes its new parent. It must be
        this node again, because Bullet compares the addresses of nodes when it optimises
@@ -187,8 +187,8 @@ static int read_aabbs(struct aabbs *aabbs, const struct broad_phase *broad_phase
         set_limits(aabbs, i, &object->proxy->leaf->aabb);
         aabbs->pairs[i] = (uint64_t)1 << i;
     }
-    /* find_overlaps compares two objects at once. A last one alone gets a companion that
-       overlaps nothing. */
+    /* find_overlaps compares two objects at once. If the last object has no partner, it
+       gets one that overlaps nothing. */
     if (objects->size % 2) aabbs->limits[0][objects->size] = INFINITY;
     for (int i = 0; i < pairs->size; i++) {
         const struct overlapping_pair *pair =

@@ -19,11 +19,11 @@
  * Every number is the result of Bullet's operations in Bullet's order. The code is
  * faster because two numbers share a register. It leaves out three parts:
  *
- * 1. The inertia of the base and the force on it. The base is fixed, so that Bullet does
- *    not use them.
+ * 1. The inertia of the base and the force on it. The base is fixed, so Bullet does not
+ *    use them.
  * 2. The acceleration of a link if neither it nor a descendant has a joint. Bullet uses
  *    it only for sensors at joints, and can_accelerate refuses bodies with sensors.
- * 3. Additions of the velocity of a fixed joint, which is zero. The sign of a zero may
+ * 3. The addition of a fixed joint's velocity, which is zero. The sign of a zero may
  *    therefore differ from Bullet's, as in responses.c.
  *
  * If a result is not finite, the velocities stay as they are, and Bullet's function
@@ -280,7 +280,7 @@ static inline struct spatial_pair own_force(const struct link *link, pair dampin
                                           velocity.z * (pair){inertia.z, mass}};
     const struct spatial_pair damped =
         scale(momentum, damping + damping * safe_norm(velocity));
-    /* Bullet multiplies with the mass after the cross product. */
+    /* Bullet multiplies by the mass after the cross product. */
     const struct spatial_pair factors =
         join(part(momentum, ANGULAR), part(velocity, LINEAR));
     const struct spatial_pair turning =

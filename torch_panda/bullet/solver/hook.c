@@ -56,7 +56,7 @@ typedef void aabb_function(struct broad_phase *, struct proxy *, const struct ve
 
 /* Whether a thread runs Bullet's functions or the replacements. */
 enum mode {
-    FOLLOW, /* those that solver_enable chose for the process */
+    FOLLOW, /* the ones that solver_enable chose for the whole process */
     PROBE,  /* Bullet's, while the layout of Bullet's structs is checked */
     SOLVE,  /* the replacements */
     LEAVE,  /* Bullet's */
@@ -71,7 +71,7 @@ struct counts {
     int manifolds;        /* whose rows this solver created */
     int bullet_manifolds; /* whose rows Bullet created instead */
     int bodies;           /* that `accelerate` accelerated */
-    int bullet_bodies;    /* for which it needed Bullet's function */
+    int bullet_bodies;    /* that Bullet accelerated instead */
     int answers;          /* for inverse kinematics, by this solver */
     int bullet_answers;   /* for inverse kinematics, by Bullet */
     int aabbs;            /* that `move_aabb` moved */

@@ -164,7 +164,7 @@ static void compute_kinematics(struct kinematics *result, const struct chain *ch
 /* The rotation from a matrix to a quaternion, as an axis times an angle. */
 static struct vector3 orientation_error(const struct matrix3 *rotation,
                                         struct vector3 target) {
-    /* Bullet, too, converts to a quaternion, back to a matrix and to a quaternion. */
+    /* Like Bullet, convert to a quaternion, back to a matrix, and to a quaternion. */
     const struct vector3 once = get_rotation(rotation);
     const struct matrix3 again = rotation_matrix(&once);
     const struct vector3 p = target, q = get_rotation(&again);

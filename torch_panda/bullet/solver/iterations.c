@@ -468,7 +468,7 @@ int solve_group(struct solver *solver, struct collision_object **bodies, int num
         return 1;
     }
 
-    /* Room for the groups of most scenes. Larger groups allocate theirs. */
+    /* Large enough for the groups of most scenes. Larger groups use the heap. */
     char stack[49152] __attribute__((aligned(16)));
     struct memory memory = {stack, sizeof(stack), {NULL, NULL}, 0};
     const int size = solver->data.delta_velocities.size;

@@ -70,7 +70,7 @@ int create_limit_rows(struct responses **responses, struct limit *limit,
 int convert_manifold(struct responses **responses, struct solver *solver,
                      struct manifold *manifold, const struct solver_info *info);
 
-/* Whether Bullet would accelerate a body in this step, and `accelerate` can do it. */
+/* Whether Bullet would accelerate a body in this step and `accelerate` can replace it. */
 int can_accelerate(const struct multi_body *body);
 
 /*
@@ -97,7 +97,7 @@ struct aabbs {
     const struct world *world;
     int num_objects; /* 0 until the AABBs have been read */
     int num_pairs;
-    int num_moved, num_left; /* AABBs that this solver has moved, and Bullet */
+    int num_moved, num_left; /* AABBs that this solver moved, and those left to Bullet */
     _Alignas(16) double limits[6][MAX_OBJECTS]; /* minimum and maximum of x, y, z */
     uint64_t pairs[MAX_OBJECTS]; /* bit i: whether the pair with object i is known */
 };
@@ -142,11 +142,11 @@ struct expectation {
 /*
  * Compare the fields of Bullet's structs with the known numbers of the scene.
  *
- * probe_world does this before Bullet accelerates the bodies. probe_manifolds does it
- * before Bullet creates the rows of a group, probe_rows before it solves the group, and
- * probe_result after it. probe_command does it after Bullet has answered a command for the
- * inverse kinematics. Each function returns NULL, or the name of the first field that
- * does not have the expected number.
+ * probe_world does this before Bullet accelerates the bodies, and probe_manifolds before
+ * Bullet creates the rows of a group. probe_rows does it before Bullet solves the group,
+ * and probe_result after Bullet has solved it. probe_command does it after Bullet has
+ * answered a command for the inverse kinematics. Each function returns NULL, or the name
+ * of the first field that does not have the expected number.
  */
 const char *probe_world(const struct world *world, const struct solver_info *info,
                         const struct expectation *expected);

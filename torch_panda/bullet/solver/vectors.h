@@ -1,5 +1,5 @@
-/* Functions of vectors and rotations that several files share, in the order of Bullet's
-   operations. */
+/* Functions of vectors and rotations that several files share. They do Bullet's
+   operations in Bullet's order. */
 #ifndef TORCH_PANDA_VECTORS_H
 #define TORCH_PANDA_VECTORS_H
 
