@@ -1,4 +1,4 @@
-"""DDPG with hindsight in plain torchrl: Reach succeeds in 100 % after half a minute.
+"""DDPG with hindsight in plain torchrl: 100 % success at Reach after half a minute.
 
 python examples/first_steps.py
 """

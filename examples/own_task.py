@@ -2,8 +2,8 @@
 
     python examples/own_task.py
 
-The guide torch_panda/README.md explains each part. The registered id works everywhere
-where a shipped id does: in `make`, in Gymnasium and in the commands.
+The guide torch_panda/README.md explains each part. The registered id works wherever a
+shipped id does: in `make`, in Gymnasium and in the commands.
 """
 
 from collections.abc import Sequence

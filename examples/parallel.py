@@ -3,8 +3,8 @@
     python examples/parallel.py
 
 `torch_panda.make(id, num_envs=n)` already steps n simulations in parallel threads of
-one process, which is the fastest way on one machine. Processes pay where the policy or
-the transforms of the environment are slow Python code.
+one process, which is the fastest way on one machine. Several processes are faster only
+where the policy or the transforms of the environment are slow Python code.
 """
 
 import os
@@ -27,8 +27,7 @@ def make_env(seed: int) -> torch_panda.RobotTaskEnv:
     """The environments of one worker.
 
     An episode depends on (seed, environment, number of the episode) alone, so two
-    workers with one seed would run the same episodes twice: give each its own. The
-    workers share the cores, too.
+    workers with the same seed would run the same episodes. The workers share the cores.
     """
     threads = max(1, (os.cpu_count() or 1) // NUM_WORKERS)
     return torch_panda.make(

@@ -68,8 +68,8 @@ class BufferTransform(envs.Transform):
             shape [*environments, time].
         single_env: Whether data of one dimension and without ids are successive steps
             of one environment.
-        seed: Seed of a random generator of the transform's own; None means torch's
-            global generator.
+        seed: Seed of the transform's own random generator; None means torch's global
+            generator.
 
     Raises:
         TypeError: An argument is unknown.
