@@ -82,7 +82,7 @@ def main() -> float:
     relabel = HindsightRelabel(reward, terminated_fn=is_success, her_ratio=HER_RATIO)
     storage = LazyTensorStorage(100_000)
     buffer = TensorDictReplayBuffer(storage=storage, transform=relabel, batch_size=128)
-    for data in Collector(env, explore, **STEPS):
+    for data in Collector(env, explore, **STEPS, auto_register_policy_transforms=True):
         buffer.extend(data)
         for _ in range(UPDATES_PER_BATCH):
             optimizer.zero_grad()

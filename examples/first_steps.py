@@ -44,11 +44,11 @@ relabel = HindsightRelabel.from_env(env, her_ratio=0.8)
 storage = LazyTensorStorage(100_000)
 buffer = TensorDictReplayBuffer(storage=storage, transform=relabel, batch_size=256)
 explore = TensorDictSequential([actor, noise])
-for data in Collector(env, explore, frames_per_batch=400, total_frames=2_400):
+frames: dict = {"frames_per_batch": 400, "total_frames": 2_400}
+for data in Collector(env, explore, **frames, auto_register_policy_transforms=True):
     buffer.extend(data.reshape(-1))
     for _ in range(200):
-        batch = buffer.sample()
-        losses = loss(batch)
+        losses = loss(batch := buffer.sample())
         # Keeps actions small, because the tanh saturates at large ones.
         penalty = actor(batch.select(*inputs))["action"].square().mean()
         optimizer.zero_grad()

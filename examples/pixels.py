@@ -81,7 +81,7 @@ def main() -> tuple[float, float]:
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=64)
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.5, sigma_end=0.5)
     explore = TensorDictSequential([actor, noise])
-    for data in Collector(env, explore, **STEPS):
+    for data in Collector(env, explore, **STEPS, auto_register_policy_transforms=True):
         buffer.extend(data.reshape(-1))
         for _ in range(UPDATES_PER_BATCH):
             losses = loss(batch := buffer.sample())
