@@ -7,6 +7,7 @@ import torch
 
 from torch_panda.commands import plot
 from torch_panda.learning import curve
+from torch_panda.learning.exploration import WARM_UP
 
 ray = pytest.importorskip("ray")
 distributed = pytest.importorskip("torch_panda.commands.distributed")
@@ -108,6 +109,21 @@ def test_workers_fill_one_buffer(start, tmp_path):
 
 def same(weights, other):
     return all(torch.equal(value, other[key]) for key, value in weights.items())
+
+
+def test_new_weights_keep_the_state_of_exploration(start):
+    learner = start(
+        exploration="points",
+        num_workers=1,
+        steps_per_batch=20,
+        total_steps=160,
+        updates_per_step=0.0,
+    )
+    learner.train()
+    (state,) = learner.collector.state_dict()
+    # The constructor of the worker's collector takes one step, as in `train`.
+    steps = WARM_UP - int(state["policy_state_dict"]["module.3.warm_up_left"])
+    assert steps >= 160 // 4
 
 
 def test_a_dead_worker_is_an_error(start, tmp_path):

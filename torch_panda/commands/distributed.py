@@ -153,6 +153,9 @@ class Learner:
     def send_weights(self, worker: int) -> None:
         """Send a worker the weights and the normaliser for its next batch."""
         weights = TensorDict.from_module(self.agent.explore).data
+        # These two modules are the normaliser and the actor. The others hold the state
+        # of the worker's own exploration, such as the point to which its hand moves.
+        weights = weights.select(("module", "0"), ("module", "1"))
         # The worker waits until the learner has finished this batch, so this takes only
         # milliseconds.
         remote = self.collector.remote_collectors[worker]
