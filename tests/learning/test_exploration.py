@@ -172,3 +172,13 @@ def test_every_agent_explores_by_it(algo, env_id):
     assert any(key.endswith("steps_left") for key in agent.state_dict())
     assert not any("steps_left" in key for key in agent.policy.state_dict())
     assert rollout["action"].abs().max() <= 1.0
+
+
+@pytest.mark.parametrize("control_type", ["ee_pose", "joint_velocity", "joint_torque"])
+def test_points_need_a_control_type_that_moves_to_them(control_type):
+    options = {"control_type": control_type}
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=1, robot_options=options) as env,
+        pytest.raises(ValueError, match='exploration "points" needs the control type'),
+    ):
+        make_agent(env, Hyperparameters(exploration="points"))

@@ -52,6 +52,11 @@ class Spaces:
         """Sizes of observation, goal and action."""
         return self.observation_size, self.goal_size, self.action_size
 
+    @property
+    def num_arm_actions(self) -> int:
+        """Number of entries of an action that move the arm. They come first."""
+        return self.action_size - int(self.has_free_gripper)
+
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Make the object from the nested dict that `asdict` returned."""

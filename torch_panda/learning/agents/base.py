@@ -112,14 +112,13 @@ class Agent(nn.Module, ABC):
     def random_points(self) -> RandomPointModule:
         """Make the module of the exploration "points"."""
         spaces = self.spaces
-        gripper_size = int(spaces.has_free_gripper)
         geometry = spaces.geometry
         return RandomPointModule(
             torch.linspace(*self.hp.random_eps, spaces.num_envs),
             action_size=spaces.action_size,
             action_scale=spaces.action_scale,
             moves_joints=spaces.moves_joints,
-            num_arm_actions=spaces.action_size - gripper_size,
+            num_arm_actions=spaces.num_arm_actions,
             # The first position of an observation is the hand's.
             object_columns=() if geometry is None else geometry.positions[1:],
         )
@@ -255,12 +254,20 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
     """Check that hyperparameters fit an environment.
 
     Raises:
-        ValueError: A hyperparameter needs a gripper or a layout that the task lacks.
+        ValueError: A hyperparameter needs a gripper, a layout or a control type that
+            the environment lacks.
     """
     if hp.fine_fingers and not spaces.has_free_gripper:
         raise ValueError(
             "fine_fingers needs a task whose actions move the fingers, such as "
             "PickAndPlace, Stack or Flip: pass --no-fine-fingers"
+        )
+    # Under end-effector control, three entries of an action displace the hand.
+    follows_points = spaces.moves_joints or spaces.num_arm_actions == 3
+    if hp.exploration == "points" and not follows_points:
+        raise ValueError(
+            'exploration "points" needs the control type "ee" or "joints": for another '
+            "one pass --exploration actions"
         )
     uses_layout = (hp.relative_inputs, hp.augmentation) != ("none", "none")
     if uses_layout and spaces.geometry is None:
