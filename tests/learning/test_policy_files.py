@@ -148,6 +148,7 @@ def test_a_folder_without_a_policy(tmp_path):
     ("change", "message"),
     [
         ({"spaces": {"size": 3}}, "does not hold a policy, or is damaged"),
+        ({"spaces": {"geometry": None}}, "another version .*: .*observation_size"),
         ({"policy": {}}, "its weights do not fit its hyperparameters"),
         ({"hyperparameters": {"depth": 3}}, "another version .*: depth$"),
         ({"hyperparameters": {"algo": "ppo"}}, r"algo must be one of .*, got 'ppo'$"),

@@ -102,7 +102,13 @@ class SavedPolicy:
         keys = ("env_id", ("spaces", "geometry"), *finite)
         content = files.read(path, "a policy", keys, finite=finite, map_location="cpu")
         hp = _read_hyperparameters(path, content["hyperparameters"])
-        spaces = Spaces.from_dict(content["spaces"])
+        try:
+            spaces = Spaces.from_dict(content["spaces"])
+        except TypeError as error:
+            raise ValueError(
+                f"{path} was saved by another version of torch_panda, which describes "
+                f"environments by other entries: {error}"
+            ) from None
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
     def make_agent(self, env: RobotTaskEnv | None = None) -> AnyAgent:
