@@ -1,11 +1,13 @@
 """Minari data sets: others read them, and episodes start again."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
 import torch_panda
 from tests.datasets.recording import record
+from torch_panda.datasets import read_demos
 
 minari = pytest.importorskip(
     "minari", reason="needs the extra minari, which takes Python 3.11 or newer"
@@ -72,3 +74,26 @@ def test_bad_names_are_one_line(recorded):
     ):
         with pytest.raises(SystemExit, match=message):
             record("minari", name, "PandaReach-v1", 1)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of missing metadata
+def test_a_data_set_of_another_library_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episode = minari.data_collector.EpisodeBuffer(
+        id=0,
+        observations=np.zeros((3, 4)),
+        actions=np.zeros(2, int),
+        rewards=np.zeros(2),
+        terminations=np.zeros(2, bool),
+        truncations=np.ones(2, bool),
+    )
+    spec = gymnasium.spec("CartPole-v1")
+    minari.create_dataset_from_buffers(
+        "cart/pole-v0", [episode], env=spec, data_format="hdf5"
+    )
+    path = tmp_path / "cart" / "pole-v0"
+    with (
+        torch_panda.make("PandaReach-v1", num_envs=1) as env,
+        pytest.raises(ValueError, match=f"^{path} does not hold demonstrations: "),
+    ):
+        read_demos(path, env)

@@ -37,17 +37,18 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             "`python -m torch_panda record` wrote, or the folder of a data set "
             "(Minari's is ~/.minari/datasets/ followed by its id)"
         )
-    if (name := format_of(path)) is not None:
-        demos = load_format(name).read(path).select(*STORED_KEYS)
-    else:
-        content = files.read(path, "demonstrations", STORED_KEYS, finite=STORED_KEYS)
-        try:
+    try:
+        if (name := format_of(path)) is not None:
+            demos = load_format(name).read(path)
+        else:
+            keys = STORED_KEYS
+            content = files.read(path, "demonstrations", keys, finite=keys)
             # The batch shape is (n,), or [episodes, steps] for the data of `generate`.
-            shape = content["action"].shape[:-1]
-            demos = TensorDict(content, shape).select(*STORED_KEYS)
-        except (AttributeError, RuntimeError, TypeError) as error:
-            # The entries are not tensors, or their lengths differ.
-            raise ValueError(f"{path} does not hold demonstrations: {error}") from None
+            demos = TensorDict(content, content["action"].shape[:-1])
+        demos = demos.select(*STORED_KEYS)
+    except (AttributeError, LookupError, RuntimeError, TypeError) as error:
+        # Entries are missing or are not tensors, or their lengths differ.
+        raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
     demos = demos.reshape(-1)
