@@ -46,6 +46,14 @@ def test_numbers_of_the_task_can_be_others(tmp_path, capsys):
         record_demos.main(args)
 
 
+@pytest.mark.parametrize("format", ["minari", "lerobot"])
+def test_seeds_that_a_format_cannot_store_are_refused(tmp_path, format):
+    args = record_demos.Args("PandaReach-v1", 2, 2**63 - 1, format=format)
+    with pytest.raises(SystemExit, match=rf"must be below 2\*\*63, .* {2**63}$"):
+        record_demos.main(args)
+    record_demos.check(record_demos.Args("PandaReach-v1", 1, 2**63 - 1, format=format))
+
+
 def test_wilson_interval():
     # The textbook value for 8 of 10.
     low, high = wilson_interval(8, 10)

@@ -42,6 +42,7 @@ from torch_panda.learning.user_modules import Imports, import_modules, read_modu
 
 # Keys of pictures. The hash does not include them.
 PIXELS = ("pixels", ("next", "pixels"))
+EPISODES = 200  # default number of demonstrations
 
 
 @dataclass
@@ -122,6 +123,13 @@ def check(args: Args) -> None:
             "noise_eps does not work with the format minari, whose episodes hold "
             "the executed actions"
         )
+    last = args.seed + (args.episodes or EPISODES) - 1
+    if not is_generated and args.format != "tensors" and last >= 2**63:
+        raise ValueError(
+            f"the format {args.format} stores the seeds of its episodes, from seed to "
+            f"seed + episodes - 1, as 64-bit integers: they must be below 2**63, but "
+            f"the last one is {last}"
+        )
     if args.task_options and args.format != "tensors":
         raise ValueError(
             f"task_options do not work with the format {args.format}: its data sets "
@@ -162,7 +170,7 @@ def record_demonstrations(args: Args) -> None:
         OSError: The data cannot be written.
     """
     expert: TensorDictModuleBase = make_expert(args.env_id)
-    episodes = args.episodes or 200
+    episodes = args.episodes or EPISODES
     env = torch_panda.make(
         args.env_id,
         num_envs=min(args.num_envs, episodes),
