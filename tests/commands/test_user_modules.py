@@ -98,6 +98,16 @@ def test_an_error_inside_the_module_is_shown(folder):
         main(["evaluate", "run", "--import", "broken"])
 
 
+@pytest.mark.parametrize("command", ["evaluate", "plot", "refine", "train"])
+def test_ctrl_c_ends_a_command_without_a_traceback(folder, monkeypatch, command):
+    (folder / "interrupts.py").write_text("raise KeyboardInterrupt")
+    monkeypatch.delitem(sys.modules, "interrupts", raising=False)
+    arguments = {"refine": ["run", "--out", "refined"], "train": []}
+    options = arguments.get(command, ["run"])
+    with pytest.raises(SystemExit, match=r"^interrupted$"):
+        main([command, *options, "--import", "interrupts.py"])
+
+
 def test_a_missing_extra_is_one_error_with_its_command(monkeypatch):
     for name in [name for name in sys.modules if name.startswith("torch_panda.c")]:
         monkeypatch.delitem(sys.modules, name)

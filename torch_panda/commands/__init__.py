@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if explanation is None:
             raise
         raise SystemExit(explanation) from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted") from None
 
 
 def describe() -> str:

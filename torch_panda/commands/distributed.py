@@ -287,8 +287,6 @@ def main(args: Args) -> None:
         raise SystemExit(str(error)) from None
     except RayActorError as error:
         raise SystemExit(f"a worker died: {error}") from None
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted") from None
     finally:
         ray.shutdown()  # stops the workers, and a cluster that was started here
     progress = learner.progress

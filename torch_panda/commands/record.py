@@ -157,8 +157,6 @@ def main(args: Args) -> None:
             record_generated_data(args, args.kind)
     except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None
-    except KeyboardInterrupt:
-        raise SystemExit("stopped") from None
 
 
 def record_demonstrations(args: Args) -> None:

@@ -160,8 +160,6 @@ def main(args: Args | OfflineArgs) -> None:
             finished = run.train(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
-    except KeyboardInterrupt:  # before the first step
-        raise SystemExit("interrupted: start the run again") from None
     stop.release()
     run.close()
     if finished and args.video:

@@ -162,8 +162,6 @@ def main(args: Args) -> None:
                 print(f"wrote {args.out}")
     except (ValueError, OSError, ImportError, torch_panda.BulletError) as error:
         raise SystemExit(str(error)) from None
-    except KeyboardInterrupt:
-        raise SystemExit("stopped") from None
 
 
 def run(arguments: Sequence[str]) -> None:
