@@ -152,6 +152,17 @@ def test_other_options_and_other_runs_are_refused(tmp_path):
         train.main(replace(args, resume=True))
 
 
+def test_a_resumed_run_keeps_its_label(tmp_path):
+    args = Args(num_envs=2, total_steps=100, updates_per_step=0.0, video=False)
+    args.out = tmp_path
+    train.main(args)
+    file = tmp_path / "args.json"
+    options = {**json.loads(file.read_text()), "label": "no gradient steps"}
+    file.write_text(json.dumps(options))
+    train.main(replace(args, resume=True))
+    assert json.loads(file.read_text()) == options
+
+
 # 150 steps end within an iteration, which is finished.
 @pytest.mark.parametrize(("total_steps", "falling"), [(200, 20), (150, 15)])
 def test_learning_rate_falls_to_0(tmp_path, total_steps, falling):

@@ -210,7 +210,8 @@ def main(args: Args) -> None:
         more = {"algo": run.agent.hp.algo, "preset": "refined"}
         stop = StopSignal()
         with lock_folder(args.out):
-            write_options(args.out, args, default, **more)
+            if not args.resume:
+                write_options(args.out, args, default, **more)
             finished = run.run(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None

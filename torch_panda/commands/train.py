@@ -156,7 +156,8 @@ def main(args: Args | OfflineArgs) -> None:
             print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
         stop = StopSignal()
         with lock_folder(out):
-            write_options(out, args, default, **preset)
+            if not args.resume:
+                write_options(out, args, default, **preset)
             finished = run.train(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None
