@@ -81,8 +81,10 @@ def test_buffers_are_compared(capsys):
         (["--num-envs", "4", "0"], "num_envs must be positive, got "),
         (["--plot", "/dev/null/speed.png"], "File exists"),
         (["--plot", "speed.png", "--buffers"], "plot does not work with buffers"),
+        (["--plot", "speed.xyz"], "plot must end in one of .*, got 'speed.xyz'"),
     ],
 )
-def test_wrong_options_are_refused(options, message):
+def test_wrong_options_are_refused(monkeypatch, options, message):
+    monkeypatch.setattr(bench, "measure", pytest.fail)
     with pytest.raises(SystemExit, match=message):
         main(["bench", *options])

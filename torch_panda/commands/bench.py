@@ -574,6 +574,14 @@ def run(arguments: Sequence[str]) -> None:
                     "plot does not work with buffers: it draws the speeds of "
                     "environments"
                 )
+            from matplotlib.backend_bases import FigureCanvasBase
+
+            formats = FigureCanvasBase.get_supported_filetypes()
+            if (args.plot.suffix or ".png")[1:].lower() not in formats:
+                raise ValueError(
+                    f"plot must end in one of {', '.join(formats)}, got "
+                    f"{args.plot.name!r}"
+                )
             files.prepare(args.plot)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
