@@ -46,7 +46,8 @@ class SampleTimeTransform(BufferTransform):
             raise ValueError(f'unit must be "row" or "slice", got {unit!r}')
         if capacity is not None and (capacity < 1 or not float(capacity).is_integer()):
             raise ValueError(f"capacity must be a positive integer, got {capacity}")
-        self.unit, self.capacity = unit, capacity
+        self.unit = unit
+        self.capacity = None if capacity is None else int(capacity)
         self._is_first_sample = True
         # Number of transitions in the buffer before the last write, and number of
         # transitions of this write.

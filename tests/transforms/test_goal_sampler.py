@@ -140,8 +140,9 @@ def test_slices_share_goals():
         assert (slices[key] == expected).all()
 
 
-def test_rows_that_were_overwritten_get_their_own_goal():
-    transform = GoalSampler(ALL, reward_fn, capacity=20)
+@pytest.mark.parametrize("capacity", [20, 20.0])
+def test_rows_that_were_overwritten_get_their_own_goal(capacity):
+    transform = GoalSampler(ALL, reward_fn, capacity=capacity)
     data = transform._inv_call(name_goals(Envs(2, [10]).chunk(20)).reshape(-1))
     batch = transform.forward(data)
     old = data["hindsight_serial"] < 20
