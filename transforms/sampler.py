@@ -77,10 +77,10 @@ class GoalSampler(SampleTimeTransform):
             )
 
     @classmethod
-    def from_env(
+    def from_env(  # type: ignore[override]  # the strategies have no default
         cls,
         env: envs.EnvBase,
-        strategies: Mapping[Any, StrategyOption] | None = None,
+        strategies: Mapping[Any, StrategyOption],
         **options: Any,  # noqa: ANN401
     ) -> Self:
         """Makes the transform with the goal functions of an environment.

@@ -166,6 +166,11 @@ def test_bad_values_are_refused(strategies, options, message):
         GoalSampler(strategies, reward_fn, **options)
 
 
+def test_from_env_needs_strategies_too():
+    with pytest.raises(TypeError, match=r"missing .* argument: 'strategies'"):
+        GoalSampler.from_env(None)
+
+
 @pytest.mark.parametrize(
     ("option", "message"),
     [
