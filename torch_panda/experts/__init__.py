@@ -112,7 +112,8 @@ def find_expert(robot: Robot, task: Task) -> Act | None:
         return None
     if robot.has_free_gripper != expert.uses_fingers:
         return None
-    is_rough = getattr(task, "table_friction", 0.0) >= ROUGH_FRICTION
-    if is_rough and expert.act_on_rough_table is not None:
-        return expert.act_on_rough_table
+    if expert.act_on_rough_table is not None:
+        assert isinstance(task, Push | Flip)
+        if task.table_friction >= ROUGH_FRICTION:
+            return expert.act_on_rough_table
     return expert.act
