@@ -36,6 +36,7 @@ def test_video_shows_every_step(tmp_path, policy):
     [
         ({"policy": "nothing"}, "no policy 'nothing': pass the folder of a run"),
         ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
+        ({"human": True, "web": True}, "human and web .*: pass one of them"),
         ({"out": "watch.txt"}, "must end in .mp4 or .gif, got 'watch.txt'"),
         ({"env_id": "PandaPushJoints-v1"}, "no expert for 'PandaPushJoints-v1'"),
     ],

@@ -128,6 +128,10 @@ def main(args: Args) -> None:
     """Record a policy as a video, or show it."""
     try:
         check_limits(args)
+        if args.human and args.web:
+            raise ValueError(
+                "human and web show the episodes in different places: pass one of them"
+            )
         import_modules(read_modules(args.imports))
         torch.manual_seed(args.seed)
         trained = None
