@@ -12,7 +12,11 @@ NOISE_CLIP = 0.5  # limit at which this noise is clipped
 
 
 class TD3(DDPG):
-    """DDPG with two critics, noise on target actions, and fewer steps of the actor."""
+    """DDPG with two critics, noise on target actions, and fewer steps of the actor.
+
+    In the paper, the target networks move only together with the actor. Here they move
+    after every `target_interval` gradient steps, as in DDPG.
+    """
 
     actor_interval = 2
 

@@ -51,7 +51,7 @@ class OfflineHyperparameters:
     """learning rate of Adam"""
     tau: Ratio = 0.005
     """in each step, target networks move this fraction of the way to the trained
-    networks (not the tau of expectiles)"""
+    networks (not the tau of expectiles). GCBC, QRL and CRL have no target networks"""
     hidden_size: Positive = 256
     """units of each of the three hidden layers, with GELU and LayerNorm"""
     batch_size: Positive = 256
