@@ -132,8 +132,12 @@ class SavedPolicy:
                     "choose a task with the same spaces"
                 )
             spaces = replace(spaces, num_envs=env.batch_size.numel())
+        agent: AnyAgent
         with torch.device("cpu"):
-            agent = _make_agent(spaces, self.hp)
+            if isinstance(self.hp, Hyperparameters):
+                agent = AGENTS[self.hp.algo](spaces, self.hp)
+            else:
+                agent = OFFLINE_AGENTS[self.hp.algo](spaces, self.hp)
         try:
             agent.policy.load_state_dict(self.weights)
         except RuntimeError:
@@ -142,12 +146,6 @@ class SavedPolicy:
                 "not fit its hyperparameters"
             ) from None
         return agent
-
-
-def _make_agent(spaces: Spaces, hp: AnyHyperparameters) -> AnyAgent:
-    if isinstance(hp, Hyperparameters):
-        return AGENTS[hp.algo](spaces, hp)
-    return OFFLINE_AGENTS[hp.algo](spaces, hp)
 
 
 def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> AnyHyperparameters:
