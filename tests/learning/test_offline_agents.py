@@ -117,6 +117,14 @@ def test_the_action_is_clipped_and_deterministic(env):
         assert actions[0].abs().max() <= 1
 
 
+def test_the_data_of_the_caller_stay_as_they_are(env, transitions):
+    data = transitions.clone()
+    data["next", "reward"].fill_(-7.0)
+    before = data.clone()
+    OfflineData(data, env, make_agent(env, "gcbc").goal_strategies, discount=0.99)
+    assert (data == before).all()
+
+
 def test_rewards_are_those_of_the_value_goal(env, transitions):
     goals = make_agent(env, "gcivl").goal_strategies
     data = OfflineData(transitions.clone(), env, goals, discount=0.99)

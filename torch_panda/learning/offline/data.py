@@ -49,14 +49,12 @@ class OfflineData:
             return env.is_success(achieved_goal, desired_goal).float() - 1.0
 
         # Number the episodes 0, 1, ... in the order of the rows. Episode i then ends in
-        # row `ends.nonzero()[i]`. `exclude` returns a shallow copy, so the caller's
-        # data stay as they are.
+        # row `ends.nonzero()[i]`.
         ids = data["collector", "traj_ids"]
         ends = torch.ones_like(ids, dtype=torch.bool)
         ends[:-1] = ids[1:] != ids[:-1]
-        data = data.exclude(("collector", "traj_ids")).set(
-            ("collector", "traj_ids"), ends.cumsum(0) - ends.long()
-        )
+        data = data.copy()  # so that the caller's data stay as they are
+        data["collector", "traj_ids"] = ends.cumsum(0) - ends.long()
         self.last = ends.nonzero().squeeze(-1)[data["collector", "traj_ids"]]
         data["next", "done"] = ends.unsqueeze(-1)
         data["next", "terminated"] = torch.zeros_like(data["next", "done"])
