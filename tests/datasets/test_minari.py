@@ -1,5 +1,7 @@
 """Minari data sets: others read them, and episodes start again."""
 
+from unittest.mock import Mock
+
 import gymnasium
 import numpy as np
 import pytest
@@ -74,6 +76,16 @@ def test_bad_names_are_one_line(recorded):
     ):
         with pytest.raises(SystemExit, match=message):
             record("minari", name, "PandaReach-v1", 1)
+
+
+def test_ctrl_c_leaves_no_incomplete_data_set(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        interrupt = Mock(side_effect=KeyboardInterrupt)
+        patch.setattr("minari.utils.MinariDataset", interrupt)
+        record("minari", "panda/reach-v0", "PandaReach-v1", 1)
+    record("minari", "panda/reach-v0", "PandaReach-v1", 1)
+    assert len(minari.load_dataset("panda/reach-v0")) == 1
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of missing metadata

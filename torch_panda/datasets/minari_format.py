@@ -1,5 +1,6 @@
 """Minari's format (https://minari.farama.org): one folder holds all data sets by id."""
 
+import shutil
 import warnings
 from copy import deepcopy
 from importlib.metadata import version
@@ -67,7 +68,15 @@ class Writer:
         )
 
     def close(self) -> str:
-        """Write the data set."""
+        """Write the data set. An error or Ctrl-C leaves no incomplete data set."""
+        try:
+            self._write()
+        except BaseException:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise
+        return f"minari.load_dataset({self.dataset_id!r}), in {self.folder}"
+
+    def _write(self) -> None:
         with warnings.catch_warnings():
             # Minari warns of missing metadata (author, address, second environment),
             # and Gymnasium that -v1 is older than -v3.
@@ -84,7 +93,6 @@ class Writer:
                 requirements=[f"torch_panda=={version('torch_panda')}"],
                 data_format="hdf5",
             )
-        return f"minari.load_dataset({self.dataset_id!r}), in {self.folder}"
 
 
 def find_folder(out: Path) -> Path:
