@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs import EnvCreator
+from torchrl.envs import EnvCreator, ParallelEnv
 
 import torch_panda
 
@@ -146,6 +146,10 @@ def test_environments_of_an_env_creator_have_their_own_seeds():
     with creator() as first, creator() as second:
         goals = [env.reset()["desired_goal"] for env in (first, second)]
         assert not torch.equal(*goals)
+    workers = ParallelEnv(2, lambda: make())
+    goal = workers.reset()["desired_goal"]
+    workers.close()
+    assert not torch.equal(goal[0], goal[1])
     seeded = EnvCreator(make, create_env_kwargs={"seed": 3})
     with seeded() as env, make(seed=3) as same:
         assert (env.reset() == same.reset()).all()

@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-import sys
+import json
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, EnvCreator
+from torchrl.envs import EnvBase
 from torchrl.envs.common import _cache_value
 from torchrl.envs.utils import _update_during_reset
 from torchrl.modules import RandomPolicy
@@ -40,8 +40,6 @@ if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.window import Window
 
 _CPU = torch.device("cpu")
-# torchrl's function that makes an environment and loads a state_dict into it.
-_CREATE_CODE = EnvCreator.__call__.__code__
 
 
 class RobotTaskEnv(EnvBase):
@@ -397,13 +395,20 @@ class RobotTaskEnv(EnvBase):
         """
         return self._emit(self.episodes.get_state(exact=exact))
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Seeds and episode numbers, which ``state_dict`` holds."""
-        return self.episodes.seeds.state()
+    def get_extra_state(self) -> Tensor:
+        """Seeds and episode numbers for ``state_dict``, as JSON in a uint8 tensor.
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+        It is a tensor because torchrl's `EnvCreator` copies the ``state_dict`` of its
+        first environment into all others, but leaves out tensors. `ParallelEnv` wraps
+        every lambda in an `EnvCreator`, so with another type all its workers would play
+        the same episodes.
+        """
+        text = json.dumps(self.episodes.seeds.state())
+        return torch.tensor([*text.encode()], dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
         """Restore seeds and episode numbers. The next reset starts the next episode."""
-        self.episodes.seeds.load(state)
+        self.episodes.seeds.load(json.loads(bytes(state.tolist())))
 
     def load_state_dict(
         self,
@@ -414,16 +419,12 @@ class RobotTaskEnv(EnvBase):
         """Load a ``state_dict``. An empty one changes nothing.
 
         Collectors of torchrl pass an empty one, because their ``state_dict`` does not
-        include that of the environment.
-
-        torchrl's `EnvCreator` loads the ``state_dict`` of its first environment into
-        all others, and `ParallelEnv` wraps every lambda in an `EnvCreator`. This method
-        ignores such a call, because all workers would play the same episodes.
+        include that of the environment. So does `EnvCreator` (see `get_extra_state`).
 
         Raises:
             ValueError: The ``state_dict`` holds a different number of environments.
         """
-        if not state_dict or sys._getframe(1).f_code is _CREATE_CODE:
+        if not state_dict:
             return None
         return super().load_state_dict(state_dict, *args, **kwargs)
 

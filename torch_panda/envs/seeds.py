@@ -65,7 +65,7 @@ class EpisodeSeeds:
         return np.random.SeedSequence(episode, spawn_key=(1,))
 
     def state(self) -> dict[str, Any]:
-        """Seeds and episode numbers as plain numbers, for `load`."""
+        """Seeds and episode numbers as plain numbers and lists, for `load`."""
         return {
             "seed": self.seed,
             "streams": [list(stream) for stream in self._streams],
