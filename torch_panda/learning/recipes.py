@@ -122,7 +122,7 @@ CHANGES_IF_SUCCESS_ENDS: dict[type[Task], dict[str, Any]] = {
         "batch_size": 256,
         "target_interval": 1,
         "updates_per_step": 0.5,
-        "total_steps": 160_000,
+        "total_steps": 240_000,
         "eval_interval": 10_000,
     },
 }
