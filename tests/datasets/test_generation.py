@@ -46,6 +46,25 @@ def test_episodes_are_whole_and_never_end_early(kind, steps):
     )
 
 
+class LowReach(torch_panda.Reach):
+    """Reach that fails where the hand leaves the lower part of its workspace."""
+
+    def failure(self, simulation):
+        return simulation.ee_position[:, 2:] > 0.2
+
+
+def test_a_failure_does_not_end_an_episode():
+    torch_panda.register(
+        "LowReach-v0", robot=torch_panda.Panda, task=LowReach, max_episode_steps=50
+    )
+    data = generate("random", env_id="LowReach-v0")
+    assert (data["next", "observation"][..., 2] > 0.2).any()
+    after = data["next"]
+    assert not after["terminated"].any()
+    assert after["done"][:, -1].all()
+    assert not after["done"][:, :-1].any()
+
+
 def test_an_episode_depends_on_its_number_alone():
     few, many = generate("noisy", transitions=50), generate("noisy", transitions=250)
     assert datasets.sha256(few) == datasets.sha256(many[:1])

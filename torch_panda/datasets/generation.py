@@ -41,9 +41,9 @@ def generate(
 ) -> TensorDict:
     """Generate a data set of whole episodes.
 
-    All episodes have the same length: neither success nor failure ends them. Episode e
-    depends on (``seed``, e) alone, so ``num_envs`` and ``num_threads`` change only the
-    running time.
+    All episodes have the same length: neither success nor failure ends them, so
+    ``terminated`` is always false. Episode e depends on (``seed``, e) alone, so
+    ``num_envs`` and ``num_threads`` change only the running time.
 
     Args:
         env_id: Id of the task.
@@ -222,6 +222,9 @@ class _Batch:
         row = env.step(row)
         after: TensorDictBase = row["next"]  # type: ignore[assignment]
         self._observations = after.select(*self._keys)
+        # `Task.failure` terminates, but the episode goes on until its last step.
+        after["terminated"] = torch.zeros_like(after["terminated"])
+        after["done"] = after["truncated"].clone()
         if self._kind == "play":
             self._apply_pursued_goals(row)
             self._change_goals(row)
