@@ -102,6 +102,14 @@ def test_data_of_a_file(tmp_path):
         train.main(replace(args, resume=True))
 
 
+def test_generated_data_overwrite_no_file(tmp_path):
+    file = tmp_path / "data.pt"
+    file.write_text("precious")
+    with pytest.raises(SystemExit, match="generated data would overwrite"):
+        train.main(make_args(tmp_path))
+    assert file.read_text() == "precious"
+
+
 def test_the_options_are_those_of_the_algorithm():
     options = ["--algo", "hiql", "--subgoal-steps", "7", "--data", "play"]
     args = parse(["--offline", *options])

@@ -104,13 +104,19 @@ def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
     """Read the transitions (n,) to learn from, or generate them into the run's folder.
 
     Raises:
-        ValueError: The data do not exist or do not fit the task.
+        ValueError: The data do not exist or do not fit the task, or generated data
+            would overwrite a file.
         OSError: Generated data cannot be written.
     """
     path = Path(args.data)
     if args.data in KINDS:
         path = out / DATA_FILE
         if not args.resume:
+            if path.exists():
+                raise ValueError(
+                    f"generated data would overwrite {path}: learn from this file with "
+                    f"--data {path}, remove it, or choose another folder with --out"
+                )
             with lock_folder(out):
                 files.save(path, generate_data(args).to_dict())
     with torch_panda.make(args.env_id) as env:
