@@ -124,6 +124,18 @@ def test_other_status_codes_are_refused(monkeypatch):
         PhysicsClient()
 
 
+def test_a_client_that_cannot_be_set_up_is_freed(monkeypatch):
+    PhysicsClient().close()  # the first client also tests the packed solver
+    freed, disconnect = [], capi.disconnect
+    monkeypatch.setattr(
+        capi, "disconnect", lambda handle: freed.append(handle) or disconnect(handle)
+    )
+    monkeypatch.setattr(capi, "CMD_CLIENT_COMMAND_COMPLETED", 111)
+    with pytest.raises(BulletError, match="could not set parameters"):
+        PhysicsClient()
+    assert len(freed) == 1
+
+
 def test_masses_equal_those_of_pybullet(reference):
     with PhysicsClient() as client:
         panda = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)

@@ -95,15 +95,29 @@ class PhysicsClient:
         self._bodies: list[int] = []
         self._blueprint: list[Command] = []
         self._is_recording = True
-        # Check that Bullet's status codes are those of `capi`. New versions of Bullet
-        # insert codes in the middle of the list, which shifts all higher codes. One
-        # collision detection is enough as a check, because it has the highest code that
-        # torch_panda uses.
+        try:
+            self._check_status_codes()
+            self._set_physics(physics)
+        except BaseException:
+            self.close()
+            raise
+
+    def _check_status_codes(self) -> None:
+        """Check that Bullet's status codes are those of `capi`.
+
+        New versions of Bullet insert codes in the middle of the list, which shifts all
+        higher codes. One collision detection is enough as a check, because it has the
+        highest code that torch_panda uses.
+
+        Raises:
+            ImportError: The codes differ.
+        """
         try:
             self.detect_collisions()
         except BulletError as error:
-            self.close()
             raise library.wrong_pybullet(f"its status codes differ: {error}") from None
+
+    def _set_physics(self, physics: PhysicsParams) -> None:
         command = capi.physics_init(self.connection.handle)
         capi.physics_set_timestep(command, physics.timestep)
         capi.physics_set_gravity(command, 0.0, 0.0, physics.gravity)
