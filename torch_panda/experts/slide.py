@@ -8,11 +8,11 @@ from torch import Tensor
 
 from torch_panda.experts.moves import go_over, norm, unit
 from torch_panda.rotations import dot
+from torch_panda.tasks.slide import PUCK_RADIUS
 
-# How far the closed fingers extend from the end-effector along x and along y, and the
-# radius of the puck [m].
-FINGERS_X, FINGERS_Y, PUCK_RADIUS = 0.008, 0.0217, 0.029
-STRIKE_GAP = 0.014  # distance between fingers and puck before the strike [m]
+# How far the closed fingers extend from the end-effector along x and along y [m].
+FINGERS_X, FINGERS_Y = 0.008, 0.0217
+STRIKE_GAP = 0.013  # distance between fingers and puck before the strike [m]
 STRIKE_HEIGHT = 0.02  # height of the end-effector in the strike [m]
 # Two polynomials describe a strike. STRENGTH is the action that sends the puck to a
 # distance. DEVIATION is the angle between the strike and the puck's path [rad]. Their
