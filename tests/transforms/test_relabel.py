@@ -1,4 +1,5 @@
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -444,10 +445,40 @@ def test_padded_slices():
         assert (pieces == pieces[:, :1]).all()
 
 
-@pytest.mark.skipif(
-    prioritized.SumSegmentTreeFp32 is None,
-    reason="torchrl 0.14's compiled extension needs torch 2.14 or later",
-)
+class Tree:
+    """The interface of torchrl's compiled segment trees, without their speed."""
+
+    def __init__(self, capacity, empty, reduce):
+        self.values, self.reduce = torch.full((capacity,), empty), reduce
+
+    def __getitem__(self, index):
+        return self.values[index]
+
+    def __setitem__(self, index, values):
+        self.values[index] = values
+
+    def query(self, start, end):
+        return float(self.reduce(self.values[start:end]))
+
+    def scan_lower_bound(self, mass):
+        return torch.searchsorted(self.values.double().cumsum(0), torch.tensor(mass))
+
+
+@pytest.fixture
+def trees(monkeypatch):
+    """Replace torchrl's segment trees where its compiled extension does not load.
+
+    The extension of torchrl 0.14 needs torch 2.14 or later.
+    """
+    if prioritized.SumSegmentTreeFp32 is None:
+        trees = {"Sum": (0.0, torch.sum), "Min": (float("inf"), torch.min)}
+        for name, (empty, reduce) in trees.items():
+            tree = partial(Tree, empty=empty, reduce=reduce)
+            for suffix in ("Fp32", "Fp64"):
+                monkeypatch.setattr(prioritized, f"{name}SegmentTree{suffix}", tree)
+
+
+@pytest.mark.usefixtures("trees")
 def test_prioritized_sampler():
     def make(transform):
         return buffer(
