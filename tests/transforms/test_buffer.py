@@ -1,18 +1,12 @@
-"""A transform finds the buffer that calls it, and the chain that it belongs to."""
+"""A transform finds the buffer that calls it."""
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import (
-    LazyTensorStorage,
-    ReplayBuffer,
-    ReplayBufferEnsemble,
-    SliceSampler,
-    TensorDictReplayBuffer,
-)
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.envs import Compose, DoubleToFloat, Transform
 
-from torch_panda.transforms.buffer import find_buffer, get_chain, samples_slices
+from torch_panda.transforms.buffer import find_buffer
 
 
 class Recorder(Transform):
@@ -64,33 +58,3 @@ def test_replacing_rows_raises():
     rb = make(Recorder())
     with pytest.raises(RuntimeError, match=r"replacing.*use extend"):
         rb[2:4] = DATA[:2]
-
-
-def test_a_call_by_hand_has_no_buffer():
-    recorder = Recorder()
-    recorder.forward(DATA)
-    assert recorder.callers == [(None, "")]
-
-
-def test_an_ensemble_finds_the_member_that_samples():
-    recorders = [Recorder(), Recorder()]
-    members = [make(recorder) for recorder in recorders]
-    ReplayBufferEnsemble(*members, batch_size=8).sample()
-    for member, recorder in zip(members, recorders, strict=True):
-        buffer, _ = recorder.callers[-1]
-        assert buffer is member or isinstance(buffer, ReplayBufferEnsemble)
-
-
-def test_slices_are_recognised():
-    assert not samples_slices(None)
-    assert not samples_slices(make(Recorder()))
-    sampler = SliceSampler(num_slices=2, traj_key="x")
-    assert samples_slices(make(Recorder(), sampler=sampler))
-
-
-def test_the_chain_includes_nested_transforms_in_their_order():
-    recorder, before, after = Recorder(), DoubleToFloat(), DoubleToFloat()
-    make(Compose(before, Compose(recorder), after))
-    chain = [t for t in get_chain(recorder) if not isinstance(t, Compose)]
-    assert chain == [before, recorder, after]
-    assert get_chain(lonely := Recorder()) == [lonely]

@@ -70,12 +70,3 @@ def test_collectors_in_turn(hindsight):
         for data in collect(functools.partial(Collector, make), 3 * 5, 3 * 5 * 4):
             rb.extend(data.reshape(-1))
     check_batch(rb.sample(), rb.storage[:], "future")
-
-
-def test_augment_of_a_collectors_data():
-    rb = buffer(HindsightAugment(reward_fn, k=2), capacity=5000)
-    for data in collect(SINGLE, 3 * 5, 3 * 5 * 20):
-        rb.extend(data)
-    stored = rb.storage[:]
-    check_batch(stored, stored, "future")
-    assert 3 * (~relabelled(stored)).sum() == len(stored)

@@ -30,13 +30,6 @@ def test_lazy_stacks_are_augmented():
     assert torch.equal(stored["next", "success"], terminated_fn(achieved, goals))
 
 
-@BOTH
-def test_a_step_of_many_environments_is_not_one_item(hindsight):
-    rb = buffer(hindsight(reward_fn))
-    with pytest.raises((RuntimeError, ValueError), match="extend"):
-        rb.add(play().reshape(6, 10)[:, 0])
-
-
 def test_scaled_rewards_are_noticed_when_they_are_sampled():
     scaling = RewardScaling(0.0, 0.1, in_keys=[("next", "reward")])
     rb = buffer(Compose(scaling, HindsightRelabel(reward_fn)))
