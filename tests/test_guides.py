@@ -19,6 +19,7 @@ MAX_LINES = 250
     [
         "README.md",
         "torch_panda/README.md",
+        "transforms/README.md",
         "torch_panda/gymnasium_envs/README.md",
         "torch_panda/datasets/README.md",
     ],

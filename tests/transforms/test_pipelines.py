@@ -1,7 +1,6 @@
 """Pipelines as people build them: hindsight is right in them, or says why not."""
 
 import copy
-import functools
 import warnings
 
 import pytest
@@ -336,7 +335,7 @@ def test_multi_process_collector_with_the_buffer_is_refused(ndim):
     message = "multi-process collector" if ndim == 2 else "replay_buffer="
     with pytest.raises(RuntimeError, match=message):
         MultiSyncCollector(
-            [toy.make_first, functools.partial(toy.make_env, 2)],
+            [toy.make_first, toy.make_second],
             None,
             frames_per_batch=30,
             total_frames=60,

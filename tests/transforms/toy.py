@@ -1,5 +1,7 @@
 """A small batched environment whose goals say where they are from."""
 
+import functools
+
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
@@ -56,16 +58,9 @@ def make_env(worker: int = 0) -> ToyEnv:
     return ToyEnv(3, worker)
 
 
-def make_first() -> ToyEnv:
-    return ToyEnv(3, 1)
-
-
-def make_second() -> ToyEnv:
-    return ToyEnv(3, 2)
-
-
-def make_third() -> ToyEnv:
-    return ToyEnv(3, 3)
+make_first = functools.partial(make_env, 1)
+make_second = functools.partial(make_env, 2)
+make_third = functools.partial(make_env, 3)
 
 
 def make_parallel() -> ParallelEnv:
