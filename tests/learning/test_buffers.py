@@ -15,77 +15,32 @@ def stack():
         yield env
 
 
-def relabelled(batch, own):
-    """Whether the goal differs from the episode's original goal, by row and object."""
-    goal = batch["desired_goal"].unflatten(-1, (2, 3))
-    episode = batch["collector", "traj_ids"]
-    return (goal != own[episode].unflatten(-1, (2, 3))).any(-1)
+FUTURE = {"future": 1.0}
 
 
 @pytest.mark.parametrize(
-    ("her", "expected"),
+    ("options", "expected"),
     [
-        ("none", (0.0, 0.0, 0.0)),
-        ("relabel", (0.0, 0.0, 0.8)),
-        ("parts", (0.16, 0.16, 0.64)),
+        ({}, (FUTURE, 0.8, None)),
+        ({"desired_ratio": 0.5}, ({"future": 0.5, "desired": 0.5}, 0.8, None)),
+        ({"her": "parts"}, (FUTURE, 0.8, (3, 3))),
+        ({"her": "geometric"}, ({"geometric": 1.0}, 1.0, None)),
     ],
 )
-def test_kinds_of_hindsight(stack, her, expected):
-    """Fractions of rows: first object relabelled, second relabelled, both."""
-    data = play_randomly(stack)
-    own = data["desired_goal"][:, 0]
-    buffer = make_buffer(stack, 1000, her=her, seed=0)
-    buffer.extend(select_sequences(data, 1.0).reshape(-1))
-    first, second = relabelled(buffer.sample(4000), own).T
-    result = [first & ~second, second & ~first, first & second]
-    # Hindsight goals equal achieved goals, which never equal the original ones here.
-    result = [float(x.double().mean()) for x in result]
-    assert result == pytest.approx(expected, abs=0.03)
+def test_kinds_of_hindsight(stack, options, expected):
+    """The tests of the transforms show what its options do."""
+    buffer = make_buffer(stack, 1000, discount=0.9, **options)
+    [hindsight] = buffer._transform.transforms
+    assert (hindsight.strategy, hindsight.her_ratio, hindsight.goal_parts) == expected
+    assert hindsight.discount == 0.9
+    buffer.extend(select_sequences(play_randomly(stack), 1.0).reshape(-1))
+    batch = buffer.sample(256)
+    goals = batch["next", "achieved_goal"], batch["desired_goal"]
+    assert torch.equal(batch["next", "reward"], stack.compute_reward(*goals))
 
 
-def test_desired_goals_of_others(stack):
-    data = play_randomly(stack)
-    own = data["desired_goal"][:, 0]
-    buffer = make_buffer(stack, 1000, desired_ratio=0.5, seed=0)
-    buffer.extend(select_sequences(data, 1.0).reshape(-1))
-    batch = buffer.sample(4000)
-    goal, episode = batch["desired_goal"], batch["collector", "traj_ids"]
-    is_desired = (goal[:, None] == own).all(-1)
-    others = is_desired.any(1) & ~is_desired.gather(1, episode[:, None])[:, 0]
-    # A quarter of the drawn goals are those that the rows have already.
-    assert abs(others.double().mean() - 0.4 * 0.75) < 0.04
-    reward = stack.compute_reward(batch["next", "achieved_goal"], goal)
-    torch.testing.assert_close(batch["next", "reward"], reward)
-
-
-def test_geometric_goals():
-    """Every goal is achieved k steps later, with probability in proportion to 0.9^k."""
-    with torch_panda.make("PandaReach-v1", num_envs=4, seed=0) as env:
-        data = play_randomly(env)
-        buffer = make_buffer(env, 1000, her="geometric", discount=0.9, seed=0)
-    buffer.extend(select_sequences(data, 1.0).reshape(-1))
-    batch = buffer.sample(4000)
-    achieved = data["next", "achieved_goal"].flatten(0, 1)
-    is_goal = (batch["desired_goal"][:, None] == achieved).all(-1)
-    assert (is_goal.sum(1) == 1).all()
-    k = is_goal.long().argmax(1) - batch["index"]
-    steps_left = data.shape[1] - batch["index"] % data.shape[1]
-    assert ((k >= 0) & (k < steps_left)).all()
-    later = torch.arange(data.shape[1])
-    weights = torch.where(later < steps_left[:, None], 0.9**later, 0.0)
-    expected = (weights / weights.sum(1, keepdim=True)).sum(0)
-    drawn = torch.bincount(k, minlength=len(later))
-    torch.testing.assert_close(
-        drawn.cumsum(0) / 4000, expected.cumsum(0) / 4000, atol=0.03, rtol=0.0
-    )
-
-
-def test_parts_need_several_objects():
-    with (
-        torch_panda.make("PandaPush-v1", num_envs=1) as env,
-        pytest.raises(ValueError, match="goals of several objects"),
-    ):
-        make_buffer(env, 100, her="parts")
+def test_none_keeps_the_goals(stack):
+    assert len(make_buffer(stack, 1000, her="none")._transform.transforms) == 0
 
 
 def test_capacity(stack, monkeypatch):

@@ -96,14 +96,6 @@ def test_shipped_policies_have_the_spaces_of_their_environment(env_id):
         assert spaces == read_spaces(env)
 
 
-@pytest.mark.parametrize("num_envs", [None, 3])
-def test_a_loaded_policy_serves_rollouts(num_envs):
-    policy = torch_panda.load_policy("PandaReach-v1")
-    env = torch_panda.make("PandaReach-v1", num_envs=num_envs, seed=0)
-    rollout = env.rollout(50, policy)
-    assert rollout["next", "success"][..., -1, :].all()
-
-
 def test_a_policy_of_an_unregistered_id_loads(tmp_path):
     scene = {"robot": torch_panda.Panda(), "task": torch_panda.Flip()}
     options = {"relative_inputs": "coarse"}
