@@ -1,7 +1,6 @@
-"""The packed solver in forked children, in pickled environments, in many clients."""
+"""The packed solver in forked children and in many clients."""
 
 import multiprocessing
-import pickle
 import random
 
 import torch
@@ -65,17 +64,6 @@ def test_a_forked_child_steps_with_the_packed_solver():
     env.set_seed(5)
     assert steps(env) == expected  # the parent goes on
     env.close()
-
-
-def test_a_pickled_environment_steps_with_the_packed_solver():
-    expected = reference()
-    with make() as env:
-        steps(env, 3)
-        copy = pickle.loads(pickle.dumps(env))
-    with copy:
-        assert "[solver: packed]" in repr(copy)
-        copy.set_seed(5)
-        assert steps(copy) == expected
 
 
 def pile():

@@ -107,16 +107,17 @@ def test_ten_cubes_in_a_pile():
     assert_same(scene(pile), 300)
 
 
-@pytest.mark.parametrize("friction", [0.0, 10.0])
-def test_frictions(friction):
-    assert_same(scene(lambda world: pile(world, lateralFriction=friction)), 150)
-
-
-def test_spinning_friction():
-    assert_same(
-        scene(lambda world: pile(world, spinningFriction=0.1)),
-        150,
-    )
+@pytest.mark.parametrize(
+    "dynamics",
+    [
+        {"lateralFriction": 0.0},
+        {"lateralFriction": 10.0},
+        {"spinningFriction": 0.1},
+        {"restitution": 0.9},
+    ],
+)
+def test_dynamics(dynamics):
+    assert_same(scene(lambda world: pile(world, **dynamics)), 200)
 
 
 def test_rolling_friction():
@@ -148,10 +149,6 @@ def test_settings_of_contacts(dynamics):
             world.client.changeDynamics(chain, link, **dynamics)
 
     assert_same(scene(fill), 150, leaves_groups=None)
-
-
-def test_restitution():
-    assert_same(scene(lambda world: pile(world, restitution=0.9)), 200)
 
 
 @pytest.mark.parametrize("masses", [(1e-3, 1e3), (1e3, 1e-3)])
