@@ -135,6 +135,19 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
     assert points[0] == points[1]
 
 
+def test_a_run_is_not_resumed_with_other_demonstrations(make_demos, tmp_path):
+    args = small(make_demos(), total_steps=0, pretrain_updates=1)
+    run = make_run(args, tmp_path)
+    run.checkpoint.save()
+    run.close()
+    make_run(replace(args, resume=True), tmp_path).close()
+    content = torch.load(args.demos)
+    content["action"] *= 0.5
+    torch.save(content, args.demos)
+    with pytest.raises(ValueError, match="cannot resume with other demonstrations"):
+        make_run(replace(args, resume=True), tmp_path)
+
+
 def test_what_was_imitated_is_evaluated_also_after_a_kill(make_demos, tmp_path):
     """A kill, or a second Ctrl-C, ends the evaluation after the last imitation."""
     options = {"total_steps": 100, "pretrain_updates": 4, "updates_per_step": 0.05}

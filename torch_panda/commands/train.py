@@ -93,11 +93,11 @@ def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
     if isinstance(args, OfflineArgs):
         data = read_data(args, out)
         return OfflineRun(args, out, data, sha256(data))
-    demos = None
-    if args.demos is not None:
-        with torch_panda.make(args.env_id) as env:
-            demos = read_demos(args.demos, env)
-    return Run(args, out, demos)
+    if args.demos is None:
+        return Run(args, out)
+    with torch_panda.make(args.env_id) as env:
+        demos = read_demos(args.demos, env)
+    return Run(args, out, demos, sha256(demos))
 
 
 def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:

@@ -74,6 +74,8 @@ class Checkpoint:
 
     The file ``path``, which is called resume.pt, holds this state. The file
     checkpoint.pt beside it holds the policy alone, for `load_policy`.
+
+    The demonstrations of a run are not saved, only their hash.
     """
 
     path: Path
@@ -81,6 +83,7 @@ class Checkpoint:
     agent: AnyAgent
     buffer: TrainingData
     progress: Progress
+    demos_hash: str = ""  # empty without demonstrations
 
     def save(self) -> None:
         """Write the state into resume.pt, and the policy into checkpoint.pt.
@@ -94,6 +97,7 @@ class Checkpoint:
             "optimizer": self.agent.optimizer.state_dict(),
             "updates": self.agent.updates,
             "buffer": self.buffer.state_dict(),
+            "demos_hash": self.demos_hash,
             "random": torch.get_rng_state(),
             "cuda_random": torch.cuda.get_rng_state_all(),
             "progress": asdict(self.progress),
@@ -106,7 +110,8 @@ class Checkpoint:
         """Restore the state that `save` wrote.
 
         Raises:
-            ValueError: The file is damaged, or its run had other options.
+            ValueError: The file is damaged, or its run had other options or other
+                demonstrations.
         """
         keys = (
             *("args", "agent", "optimizer", "updates", "buffer"),
@@ -115,6 +120,14 @@ class Checkpoint:
         finite = ("agent", "optimizer")
         state = files.read(self.path, "the state of a run", keys, finite=finite)
         check_same(self.path.parent, state["args"], fixed_options(self.args))
+        # Runs of earlier versions saved no hash.
+        demos_hash = state.get("demos_hash", self.demos_hash)
+        if demos_hash != self.demos_hash:
+            raise ValueError(
+                "cannot resume with other demonstrations: the run learned from "
+                f"demonstrations with the hash {demos_hash}, these have "
+                f"{self.demos_hash}"
+            )
         self.agent.load_state_dict(state["agent"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]

@@ -60,6 +60,8 @@ class Run:
         out: Folder of the results.
         demos: Demonstrated transitions (n,), as `torch_panda.datasets.read_demos`
             returns them. They are a part of each batch.
+        demos_hash: Hash of the demonstrations, which must be the same when the run is
+            resumed.
 
     Raises:
         ValueError: An option does not fit the task or another option, or the run to
@@ -67,7 +69,11 @@ class Run:
     """
 
     def __init__(
-        self, args: Args, out: Path, demos: TensorDictBase | None = None
+        self,
+        args: Args,
+        out: Path,
+        demos: TensorDictBase | None = None,
+        demos_hash: str = "",
     ) -> None:
         self.args, self.out = args, out
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
@@ -145,7 +151,12 @@ class Run:
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
-            out / "resume.pt", args, self.agent, self.buffer, self.progress
+            out / "resume.pt",
+            args,
+            self.agent,
+            self.buffer,
+            self.progress,
+            demos_hash,
         )
         if args.resume:
             self.checkpoint.load()
