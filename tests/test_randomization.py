@@ -1,7 +1,5 @@
 """Physics that are drawn for every episode."""
 
-import time
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -183,19 +181,3 @@ def test_every_task_can_be_randomized(env_id):
 def test_bad_ranges_are_refused(options):
     with pytest.raises(ValueError, match=r"must be|needs a range"):
         Randomization(**options)
-
-
-@pytest.mark.slow
-def test_a_reset_costs_at_most_a_third_more(capsys):
-    """CPU time of the fastest resets, with and without randomization in turn."""
-    options = {"num_envs": 1, "num_threads": 1}
-    with make(**options) as env, make(None, **options) as plain:
-        seconds = {plain: [], env: []}
-        for timed in (plain, env) * 300:
-            start = time.process_time()
-            timed.episodes.reset()
-            seconds[timed].append(time.process_time() - start)
-    ratio = min(seconds[env]) / min(seconds[plain])
-    with capsys.disabled():
-        print(f"a randomised reset takes {ratio:.2f} times a plain one")
-    assert ratio < 4 / 3

@@ -120,13 +120,6 @@ def test_a_minari_data_set_holds_the_same(tmp_path, capsys, monkeypatch, kind):
     env.close()
 
 
-def test_demonstrations_may_be_such_a_file(tmp_path):
-    out = tmp_path / "data.pt"
-    record.main(make_args(out))
-    with torch_panda.make("PandaReach-v3") as env:
-        assert read_demos(out, env).shape == (TRANSITIONS,)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torch_panda
+from tests.envs.test_exact_state import follow
 from tests.envs.test_parity import choose_actions
 
 pytestmark = pytest.mark.usefixtures("loop")
@@ -17,14 +18,6 @@ STEPS = 60
 # Lengths of the earlier episodes [steps]. Their numbers of substeps, 20 per step,
 # differ modulo every power of two above 4.
 HISTORY = (41, 50, 57)
-
-
-def act(env, td, actions):
-    observations = []
-    for action in actions:
-        td = env.step(td.set("action", action))["next"]
-        observations.append(td["observation"])
-    return torch.stack(observations, dim=1)
 
 
 def count_differences(env_id, episodes):
@@ -38,10 +31,14 @@ def count_differences(env_id, episodes):
             actions.append(choose_actions(env_id, td["observation"], rngs, size))
             td = env.step(td.set("action", actions[-1]))["next"]
             first.append(td["observation"])
-        again = act(env, env.reset(state.clone(), set_state=True), actions)
+        again = follow(env, env.reset(state.clone(), set_state=True), actions)[
+            "observation"
+        ]
         for steps in HISTORY:
-            act(env, env.reset(), [a.roll(7, 0) for a in actions[:steps]])
-        later = act(env, env.reset(state.clone(), set_state=True), actions)
+            follow(env, env.reset(), [a.roll(7, 0) for a in actions[:steps]])
+        later = follow(env, env.reset(state.clone(), set_state=True), actions)[
+            "observation"
+        ]
     first = torch.stack(first, dim=1)
     differ = (first != again) | (first != later)
     return int(differ.flatten(1).any(dim=1).sum())

@@ -1,11 +1,10 @@
-"""torchrl's own transforms, batched environments and collectors work."""
+"""torchrl's own transforms and batched environments work."""
 
 import functools
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.data import Unbounded
 from torchrl.envs import (
     CatTensors,
@@ -19,7 +18,7 @@ from torchrl.envs import (
     TensorDictPrimer,
     TransformedEnv,
 )
-from torchrl.envs.utils import RandomPolicy, check_env_specs
+from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from torch_panda.envs import StateTransform
@@ -189,15 +188,3 @@ def test_a_state_transform_wraps_one_environment():
     with pytest.raises(TypeError, match="must wrap a RobotTaskEnv, got SerialEnv"):
         env.reset()
     env.close()
-
-
-def test_collector():
-    collector = Collector(
-        make_env(seed=0), RandomPolicy(make_env().action_spec), frames_per_batch=120
-    )
-    data = next(iter(collector))
-    collector.shutdown()
-    assert data.batch_size == (2, 60)
-    assert data["next", "truncated"][:, 49].all()
-    ids = data["collector", "traj_ids"]
-    assert (ids[:, 50] != ids[:, 49]).all()

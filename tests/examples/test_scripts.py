@@ -1,5 +1,7 @@
 """The scripts that teach: each runs, and each is short enough to read."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import custom_pipeline
@@ -31,6 +33,17 @@ def test_a_script_has_fewer_than_100_lines(script):
 def test_the_guide_lists_every_script():
     guide = (ROOT / "examples" / "README.md").read_text()
     assert [x.name for x in SCRIPTS if f"]({x.name})" not in guide] == []
+
+
+@pytest.mark.timeout(600)
+def test_the_first_script_learns_reach_and_is_short():
+    script = ROOT / "examples" / "first_steps.py"
+    assert len(script.read_text().splitlines()) <= 60
+    command = [sys.executable, script]
+    run = subprocess.run(command, check=True, capture_output=True, text=True)
+    lines = [line for line in run.stdout.splitlines() if "steps: success" in line]
+    assert lines[0].startswith("400 steps")
+    assert lines[-1] == "2400 steps: success at the end of 50 episodes 100%"
 
 
 def test_ppo_lowers_the_distance_from_the_goal(monkeypatch, capsys):

@@ -12,19 +12,13 @@ from torch_panda.experts.cube_orientations import (
     straighten,
     turn,
 )
+from torch_panda.rotations import rotate
 from torch_panda.rotations import rotation_distance as distance
 
 
 def orientations(number, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return normalize(torch.randn(number, 4, generator=generator), dim=-1)
-
-
-def rotate(quaternion, vector):
-    """A vector turned by a quaternion: q v q*, (..., 3)."""
-    pure = torch.cat((vector, torch.zeros_like(vector[..., :1])), -1)
-    conjugate = quaternion * quaternion.new_tensor((-1.0, -1.0, -1.0, 1.0))
-    return compose(compose(quaternion, pure), conjugate)[..., :3]
 
 
 def angles(*values):
@@ -35,14 +29,6 @@ def test_turns_go_from_x_to_y_about_z():
     quarter = turn(2, angles(math.pi / 2))
     x, y = torch.eye(3)[:2, None]
     torch.testing.assert_close(rotate(quarter, x), y)
-
-
-def test_compose_turns_by_the_second_first():
-    a, b = orientations(50).split(25)
-    vector = torch.randn(25, 3, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(
-        rotate(compose(a, b), vector), rotate(a, rotate(b, vector))
-    )
 
 
 def test_straight_orientations_are_the_24_that_map_axes_to_axes():
