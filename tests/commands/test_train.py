@@ -248,6 +248,10 @@ def test_crl_draws_geometric_goals_in_every_preset(preset, env_id):
             "there is no file or folder nofile.pt: ",
         ),
         ({"pretrain_updates": 9}, "pretrain_updates needs demonstrations: pass"),
+        (
+            {"demos": Path("nofile.pt"), "batch_size": 3},
+            "batch_size must be at least 4 with demos",
+        ),
         ({"noise_eps": 0.0, "random_eps": (0.0, 0.0)}, "algo ddpg explores by"),
         ({"algo": "crl"}, "--her geometric --desired-ratio 0"),
         (

@@ -21,6 +21,8 @@ from torch_panda.learning.logger import LoggerName, check_logger
 from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.user_modules import Imports
 
+DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
+
 Preset = Literal["paper", "tuned", "sample-efficient"]
 
 
@@ -141,6 +143,12 @@ def check(args: Args) -> None:
         check_crl(args)
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demonstrations: pass --demos")
+    has_demos = args.demos is not None and args.total_steps > 0
+    if has_demos and DEMO_RATIO * args.batch_size < 1:
+        raise ValueError(
+            f"batch_size must be at least {1 / DEMO_RATIO:g} with demos, which are "
+            f"{DEMO_RATIO:.0%} of each batch, got {args.batch_size}"
+        )
     if not args.total_steps and not args.pretrain_updates:
         raise ValueError("total_steps must be positive without pretrain_updates, got 0")
     check_device(args.device)

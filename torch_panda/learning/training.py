@@ -36,12 +36,11 @@ from torch_panda.learning.checkpoint import (
 )
 from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.logger import make_logger
-from torch_panda.learning.options import Args
+from torch_panda.learning.options import DEMO_RATIO, Args
 from torch_panda.learning.pretraining import make_demo_buffer, pretrain
 from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
-DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 # With ``--start-at-object``, each environment takes at most this number of steps in an
 # iteration. Episodes that start in the middle of the task need no more. The limit also
 # cuts the other episodes, because all environments take the same number of steps.
