@@ -93,14 +93,6 @@ def test_ctrl_c_in_close_does_not_free_a_client_twice(monkeypatch):
     assert len(freed) == 1
 
 
-def test_a_closed_client_raises_and_may_be_closed_again():
-    client = PhysicsClient()
-    client.close()
-    client.close()
-    with pytest.raises(BulletError, match="closed"):
-        client.step()
-
-
 def test_a_missing_urdf_is_named():
     with PhysicsClient() as client:
         with pytest.raises(FileNotFoundError, match=r"no_such\.urdf"):
