@@ -85,7 +85,9 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
             seed: Seed with which the sequence of episodes starts again, as with a new
                 `RobotTaskEnv` of this seed; None continues the sequence.
             options: May hold ``state``, the state to start from, as
-                `RobotTaskEnv.get_state` returns it, or some of its entries.
+                `RobotTaskEnv.get_state` returns it, or some of its entries. The
+                ``TimeLimit`` of ``gymnasium.make`` counts the steps since this reset,
+                whatever the ``step_count`` of the state is.
 
         Raises:
             ValueError: An option is unknown, or the state is wrong.
