@@ -5,7 +5,7 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 import torch_panda
 from tests.devices import on_gpu
@@ -124,6 +124,15 @@ def test_the_first_call_must_be_a_reset(env):
         assert (env.get_state() == other.get_state()).all()
     env.set_seed(1)
     env.step(action)  # a new seed takes effect in the next episode
+
+
+def test_unknown_options_of_a_reset_are_refused(env):
+    for refusing in (env, TransformedEnv(env)):
+        with pytest.raises(TypeError, match=r"'seed'; call set_seed\(seed\) before"):
+            refusing.reset(seed=0)
+    env.reset()
+    with pytest.raises(TypeError, match="'set_sate'; did you mean 'set_state'"):
+        env.reset(env.get_state(), set_sate=True)
 
 
 def test_partial_reset_leaves_the_others_alone(env):

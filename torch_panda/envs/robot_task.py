@@ -17,6 +17,7 @@ from torchrl.envs.utils import _update_during_reset
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
+from torch_panda.arguments import check_names
 from torch_panda.bullet import PhysicsName, PhysicsParams, native
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
@@ -40,6 +41,12 @@ if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.window import Window
 
 _CPU = torch.device("cpu")
+
+# Arguments of Gymnasium's ``reset``, and what to call instead.
+_RESET_ADVICE = {
+    "seed": "call set_seed(seed) before reset()",
+    "options": "to start from a state, call reset(state, set_state=True)",
+}
 
 
 class RobotTaskEnv(EnvBase):
@@ -267,6 +274,7 @@ class RobotTaskEnv(EnvBase):
             ValueError: The state is missing or wrong; or ``set_state`` is None and the
                 tensordict holds observations and a state; or torchrl's `TransformedEnv`
                 or `ParallelEnv` would not pass the state on (see `StateTransform`).
+            TypeError: An option is unknown, for example ``seed``.
         """
         # In a rollout, torchrl passes the last observations with `select_reset_only`.
         # Such a reset does not start from a state.
@@ -278,7 +286,7 @@ class RobotTaskEnv(EnvBase):
         # that are not reset. But here they are those of a state, and its
         # ``desired_goal`` is not the goal of these environments.
         self._assert_tensordict_shape(tensordict)
-        start = self._reset(tensordict, set_state=True)
+        start = self._reset(tensordict, set_state=True, **kwargs)
         return tensordict.exclude("_reset", *EXACT_KEYS).update(start)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -576,6 +584,7 @@ class RobotTaskEnv(EnvBase):
         set_state: bool | None = None,
         **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
     ) -> TensorDict:
+        check_names("reset", kwargs, ("tensordict", "set_state"), _RESET_ADVICE)
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = None if mask is None else indices(mask)
         state = unpack_state({} if tensordict is None else tensordict)
