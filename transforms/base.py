@@ -20,6 +20,7 @@ from torch_panda.transforms.data_checks import (
     MULTI_STEP_ERROR,
     DataCheck,
     check_goals_agree,
+    check_time_is_last,
 )
 from torch_panda.transforms.goal_memory import GoalMemory
 from torch_panda.transforms.rewrite import DONE, GoalFunction, Rewriter
@@ -293,7 +294,8 @@ class BufferTransform(envs.Transform):
         Raises:
             RuntimeError: The buffer has a `MultiStepTransform`.
             KeyError: Entries are missing in the data.
-            ValueError: The goals have a wrong type, or do not fit `goal_parts`.
+            ValueError: The goals have a wrong type, or do not fit `goal_parts`; or data
+                without trajectory ids are [time, num_envs].
         """
         if any(isinstance(t, envs.MultiStepTransform) for t in get_chain(self)):
             raise RuntimeError(MULTI_STEP_ERROR)
@@ -309,6 +311,8 @@ class BufferTransform(envs.Transform):
             )
         if torch.bfloat16 in (achieved.dtype, desired.dtype):
             raise ValueError("hindsight cannot hold goals of bfloat16: use float32")
+        if batch.ndim == 2 and batch.get(self.trajectory_key, None) is None:
+            check_time_is_last(batch, self._rewriter)
 
     def _get_ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:
         """Returns the trajectory id of each row, (n,).

@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_panda.transforms.rewrite import Rewriter, call_goal_function
+from torch_panda.transforms.rewrite import DONE, Rewriter, call_goal_function
 
 MAX_BATCH_ROWS = 128  # rows of one batch that are checked
 MAX_POOL_ROWS = 512  # rows of earlier batches that are kept for the next check
@@ -52,6 +52,42 @@ def check_goals_agree(batch: TensorDictBase, rewriter: Rewriter) -> None:
             "environment has reset itself (torchrl's GymEnv(num_envs=...) does); use "
             "ParallelEnv or SerialEnv of single environments, or write the goal of the "
             "step under 'next'"
+        )
+
+
+def check_time_is_last(batch: TensorDictBase, rewriter: Rewriter) -> None:
+    """Checks that data without trajectory ids are not [time, num_envs].
+
+    The goal achieved before a step equals the goal that the previous step achieved. So
+    if all rows follow each other along the first dimension, but not along the last
+    one, the first dimension is time.
+
+    Args:
+        batch: Transitions of two dimensions.
+        rewriter: Keys of the transform.
+
+    Raises:
+        ValueError: The first dimension is time.
+    """
+    roots = batch.get(rewriter.achieved_goal_key, None)
+    if roots is None:
+        return
+    achieved, ends = batch.get(rewriter.next_achieved_key), batch.get(DONE)
+    roots, achieved, ends = (
+        x.reshape(*batch.shape, -1) for x in (roots, achieved, ends)
+    )
+    follows_first = (roots[1:] == achieved[:-1]).all(-1, keepdim=True)
+    follows_last = (roots[:, 1:] == achieved[:, :-1]).all(-1, keepdim=True)
+    if (
+        not ends[:-1].all()
+        and (follows_first | ends[:-1]).all()
+        and not (follows_last | ends[:, :-1]).all()
+    ):
+        raise ValueError(
+            f"data of shape {list(batch.shape)} without trajectory ids must be "
+            "[num_envs, time], but their steps follow each other along the first "
+            "dimension: call extend(data.transpose(0, 1)), or stack the steps with "
+            "torch.stack(steps, dim=1)"
         )
 
 

@@ -185,6 +185,14 @@ def test_layouts_that_are_refused_at_once(hindsight, options, message):
         rb.extend(data.reshape(-1) if "sampler" in options else data)
 
 
+def test_data_with_time_first_are_refused():
+    steps = Envs(3, [4]).chunk(8).exclude("collector").unbind(1)
+    rb = buffer(HindsightRelabel(reward_fn), ndim=2)
+    with pytest.raises(ValueError, match=r"\[8, 3\].*must be \[num_envs, time\]"):
+        rb.extend(torch.stack(steps))
+    rb.extend(torch.stack(steps, dim=1))
+
+
 def test_adding_several_steps_as_one_is_refused():
     rb = buffer(HindsightRelabel(reward_fn))
     with pytest.raises(RuntimeError, match=r"add\(\).*\[16\].*call extend\(\)"):
