@@ -105,6 +105,28 @@ def test_resumed_run_equals_uninterrupted_run(tmp_path, options, device):
     torch.testing.assert_close(weights(again), weights(whole), rtol=0, atol=0)
 
 
+def test_a_finished_run_continues_with_more_steps(tmp_path):
+    """The result is that of a run that had all steps from the start."""
+    args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=200, video=False)
+    args = replace(args, updates_per_step=0.1, eval_interval=100)
+    whole = Run(replace(args, total_steps=400), tmp_path)
+    whole.train()
+    whole.close()
+
+    args.out = tmp_path / "continued"
+    train.main(args)
+    train.main(replace(args, resume=True, total_steps=400))
+    written = json.loads((args.out / "args.json").read_text())
+    assert written["total_steps"] == 400
+    continued = Run(replace(args, resume=True, total_steps=400), args.out)
+    continued.close()
+    torch.testing.assert_close(weights(continued), weights(whole), rtol=0, atol=0)
+    assert points(continued) == points(whole)
+    assert len(continued.buffer) == len(whole.buffer)
+    for ours, theirs in zip(continued.buffer[:], whole.buffer[:], strict=True):
+        assert torch.equal(ours["observation"], theirs["observation"])
+
+
 def test_a_killed_run_goes_on_from_its_last_save(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "SAVE_INTERVAL", 200)
     args = Args(num_envs=2, total_steps=400, updates_per_step=0.1)
@@ -143,6 +165,7 @@ def test_other_options_and_other_runs_are_refused(tmp_path):
     train.main(args)
     for options, message in (
         ({"resume": True, "batch_size": 16}, "batch_size was 256 and is now 16"),
+        ({"resume": True, "total_steps": 50}, "total_steps was 100 and is now 50"),
         ({}, "holds a run: continue it with --resume"),
     ):
         with pytest.raises(SystemExit, match=message):
@@ -150,6 +173,14 @@ def test_other_options_and_other_runs_are_refused(tmp_path):
     (tmp_path / "resume.pt").unlink()
     with pytest.raises(SystemExit, match="there is no run to resume"):
         train.main(replace(args, resume=True))
+
+
+def test_a_falling_learning_rate_needs_the_same_total_steps(tmp_path):
+    args = Args(num_envs=2, total_steps=100, updates_per_step=0.0, anneal_lr=True)
+    args = replace(args, video=False, out=tmp_path)
+    train.main(args)
+    with pytest.raises(SystemExit, match="total_steps was 100 and is now 200"):
+        train.main(replace(args, resume=True, total_steps=200))
 
 
 def test_a_resumed_run_keeps_its_label(tmp_path):

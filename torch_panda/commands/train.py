@@ -28,6 +28,7 @@ from torch_panda.learning.checkpoint import (
     StopSignal,
     check_folder,
     lock_folder,
+    update_total_steps,
     write_options,
 )
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -162,7 +163,9 @@ def main(args: Args | OfflineArgs) -> None:
             print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
         stop = StopSignal()
         with lock_folder(out):
-            if not args.resume:
+            if args.resume:
+                update_total_steps(out, args.total_steps)
+            else:
                 write_options(out, args, default, **preset)
             finished = run.train(stop)
     except (ValueError, OSError) as error:

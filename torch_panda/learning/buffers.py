@@ -1,9 +1,9 @@
 """Replay buffers with hindsight, and the choice of the transitions to store."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, pad
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -34,6 +34,20 @@ STORED_KEYS: list[NestedKey] = [
     ("next", "terminated"),
     ("next", "done"),
 ]
+
+
+class ResumableReplayBuffer(TensorDictReplayBuffer):
+    """A replay buffer that also loads the state of a buffer with a smaller capacity."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the state of a buffer whose capacity is at most that of this one."""
+        storage = state_dict["_storage"]
+        rows = TensorDict().load_state_dict(storage["_storage"], strict=False)
+        missing = self.storage.max_size - len(rows)
+        if storage["initialized"] and missing > 0:
+            padded = pad(rows, [0, missing])
+            storage = {**storage, "_storage": padded.state_dict()}
+        super().load_state_dict({**state_dict, "_storage": storage})
 
 
 def make_buffer(
@@ -85,7 +99,7 @@ def make_buffer(
             seed=seed,
         )
     storage = LazyTensorStorage(min(capacity, BUFFER_SIZE), device=env.device)
-    return TensorDictReplayBuffer(storage=storage, transform=transform)
+    return ResumableReplayBuffer(storage=storage, transform=transform)
 
 
 def has_moved(data: TensorDictBase) -> Tensor:

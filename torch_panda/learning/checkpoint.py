@@ -109,6 +109,9 @@ class Checkpoint:
     def load(self) -> None:
         """Restore the state that `save` wrote.
 
+        The options must be those of the saved run. Only `total_steps` may be larger,
+        if the learning rate does not depend on it.
+
         Raises:
             ValueError: The file is damaged, or its run had other options or other
                 demonstrations.
@@ -119,7 +122,11 @@ class Checkpoint:
         )
         finite = ("agent", "optimizer")
         state = files.read(self.path, "the state of a run", keys, finite=finite)
-        check_same(self.path.parent, state["args"], fixed_options(self.args))
+        saved, options = state["args"], fixed_options(self.args)
+        steps = options.get("total_steps", 0)
+        if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
+            saved["total_steps"] = steps
+        check_same(self.path.parent, saved, options)
         # Runs of earlier versions saved no hash.
         demos_hash = state.get("demos_hash", self.demos_hash)
         if demos_hash != self.demos_hash:
@@ -188,6 +195,18 @@ def write_options(
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(options, default=str, indent=2)
     files.save_text(out / "args.json", text)
+
+
+def update_total_steps(out: Path, total_steps: int) -> None:
+    """Write the number of steps with which a run is resumed into its args.json.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    path = out / "args.json"
+    options = json.loads(path.read_text())
+    options["total_steps"] = total_steps
+    files.save_text(path, json.dumps(options, indent=2))
 
 
 def check_folder(out: Path, *, resume: bool) -> None:

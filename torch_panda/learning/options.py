@@ -84,7 +84,8 @@ class Args(Hyperparameters):
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
     """continue the run in the folder. Only --out, --video, --import and --logger may
-    differ from the options with which it was started"""
+    differ from the options with which it was started, and --total-steps may be larger
+    if the learning rate does not fall"""
     device: str = "cpu"
     """device of the networks and the replay buffer"""
     video: bool = True

@@ -42,7 +42,8 @@ class OfflineArgs(OfflineHyperparameters):
     """module or .py file to import first, which registers ids of your own"""
     resume: bool = False
     """continue the run in the folder. Only --out, --video, --import and --logger may
-    differ from the options with which it was started"""
+    differ from the options with which it was started, and --total-steps may be
+    larger"""
     logger: LoggerName = "none"
     """also log each evaluation to TensorBoard (folder "tensorboard" of the run) or to
     Weights & Biases (project "torch_panda")"""
