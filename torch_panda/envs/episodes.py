@@ -430,7 +430,10 @@ class Episodes:
 
     def _check_open(self) -> None:
         if self.is_closed:
-            raise BulletError("the environment is closed")
+            raise BulletError(
+                "the environment is closed: make a new one (a Collector of torchrl "
+                "closes its environment after its last batch)"
+            )
 
     def _check_all_reset(self) -> None:
         self._check_open()
