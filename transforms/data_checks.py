@@ -322,7 +322,8 @@ class DataCheck:
             raise ValueError(
                 f"the stored rewards equal {factor:.4g} * reward_fn + {constant:.4g}, "
                 "perhaps because of RewardScaling: scale rewards in the buffer, after "
-                "this transform"
+                'this transform, with in_keys=[("next", "reward")]; or because of '
+                "FrameSkipTransform, which adds up rewards: leave it out"
             )
         row = int(find_wrong_rows(1.0, 0.0).nonzero()[0])
         self._warn(

@@ -11,6 +11,7 @@ from torchrl.data import MultiStep, Unbounded
 from torchrl.envs import (
     CatTensors,
     Compose,
+    FrameSkipTransform,
     ObservationNorm,
     ParallelEnv,
     RewardScaling,
@@ -313,6 +314,12 @@ def test_scaled_rewards_are_refused(env_id, scaling):
     env = TransformedEnv(make(env_id, 8), RewardScaling(*scaling))
     with pytest.raises(ValueError, match=r"\* reward_fn.*RewardScaling.*after"):
         store(env, HindsightRelabel.from_env(env), 50, 30)
+
+
+def test_rewards_that_frame_skipping_added_up_are_refused():
+    env = TransformedEnv(make("PandaReach-v1", 8), FrameSkipTransform(4))
+    with pytest.raises(ValueError, match=r"4 \* reward_fn.*FrameSkipTransform"):
+        store(env, HindsightRelabel.from_env(env))
 
 
 @pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaStackDense-v1"])
