@@ -256,5 +256,6 @@ def _check_layout(
     if method == "add" and data.shape[ndim - 1 :].numel() > 1:
         raise RuntimeError(
             f"add() writes a single step, got data {list(data.shape)} for ndim={ndim}: "
-            "call extend(); if a collector with replay_buffer= called add(), use ndim=2"
+            "call extend(); a collector with replay_buffer= needs ndim=2, and not "
+            "extend_buffer=False"
         )
