@@ -163,7 +163,7 @@ def main(args: Args | OfflineArgs) -> None:
             print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
         stop = StopSignal()
         with lock_folder(out):
-            if args.resume:
+            if args.resume and (out / "args.json").exists():
                 update_total_steps(out, args.total_steps)
             else:
                 write_options(out, args, default, **preset)
