@@ -195,7 +195,8 @@ def test_data_with_time_first_are_refused():
 
 def test_adding_several_steps_as_one_is_refused():
     rb = buffer(HindsightRelabel(reward_fn))
-    with pytest.raises(RuntimeError, match=r"\[16\].*call extend\(\).*extend_buffer"):
+    message = r"add\(\).*\[16\].*call extend\(\).*extend_buffer"
+    with pytest.raises(RuntimeError, match=message):
         rb.add(Envs(2, [4]).chunk(8).reshape(-1))
 
 

@@ -210,8 +210,7 @@ def main(args: Args) -> None:
         more = {"algo": run.agent.hp.algo, "preset": "refined"}
         stop = StopSignal()
         with lock_folder(args.out):
-            if not args.resume:
-                write_options(args.out, args, default, **more)
+            write_options(args.out, args, default, resume=args.resume, **more)
             finished = run.run(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None

@@ -28,7 +28,6 @@ from torch_panda.learning.checkpoint import (
     StopSignal,
     check_folder,
     lock_folder,
-    update_total_steps,
     write_options,
 )
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -163,10 +162,7 @@ def main(args: Args | OfflineArgs) -> None:
             print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
         stop = StopSignal()
         with lock_folder(out):
-            if args.resume and (out / "args.json").exists():
-                update_total_steps(out, args.total_steps)
-            else:
-                write_options(out, args, default, **preset)
+            write_options(out, args, default, resume=args.resume, **preset)
             finished = run.train(stop)
     except (ValueError, OSError) as error:
         raise SystemExit(str(error)) from None

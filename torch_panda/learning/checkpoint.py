@@ -181,32 +181,27 @@ def write_options(
     out: Path,
     args: Any,  # noqa: ANN401 (a dataclass)
     default: Any,  # noqa: ANN401 (the same dataclass)
+    *,
+    resume: bool = False,
     **more: str,
 ) -> None:
     """Make the folder of a run, and write its options into args.json.
 
     Its entry ``changed`` has the options that differ from ``default``, for the legends
-    of plots. The entries ``more`` are written too.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    options = {**more, **asdict(args), "changed": find_changes(args, default)}
-    out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(options, default=str, indent=2)
-    files.save_text(out / "args.json", text)
-
-
-def update_total_steps(out: Path, total_steps: int) -> None:
-    """Write the number of steps with which a run is resumed into its args.json.
+    of plots. The entries ``more`` are written too. If a run is resumed, its file keeps
+    its entries, such as a label, and gets the new value of ``total_steps``. Before, the
+    run must have checked that its other options are the same (see `check_same`).
 
     Raises:
         OSError: The file cannot be written.
     """
     path = out / "args.json"
-    options = json.loads(path.read_text())
-    options["total_steps"] = total_steps
-    files.save_text(path, json.dumps(options, indent=2))
+    if resume and path.exists():
+        options = json.loads(path.read_text()) | fixed_options(args)
+    else:
+        options = {**more, **asdict(args), "changed": find_changes(args, default)}
+    out.mkdir(parents=True, exist_ok=True)
+    files.save_text(path, json.dumps(options, default=str, indent=2))
 
 
 def check_folder(out: Path, *, resume: bool) -> None:
