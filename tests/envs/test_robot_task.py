@@ -356,6 +356,12 @@ def test_reward_functions_pickle_without_the_simulator(env):
     assert success(*goals).all()
 
 
+@pytest.mark.parametrize("name", ["max_episode_steps", "terminate_on_success"])
+def test_a_change_without_effect_is_refused(env, name):
+    with pytest.raises(AttributeError, match=name):
+        setattr(env, name, 5)
+
+
 def test_a_viewer_without_viser_is_refused(env, monkeypatch):
     monkeypatch.setattr(robot_task, "find_spec", lambda name: None)
     message = r"^viewers need viser: pip install 'torch_panda\[viewer\]'$"

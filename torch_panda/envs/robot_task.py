@@ -171,8 +171,7 @@ class RobotTaskEnv(EnvBase):
         self.episodes, self.num_envs = episodes, num_envs
         self.robot, self.task = robot, task
         self.physics = episodes.physics
-        self.max_episode_steps = episodes.max_episode_steps
-        self.terminate_on_success = terminate_on_success
+        self._terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
         self.goal = goal
         self._observe_state = observe_state
@@ -188,6 +187,17 @@ class RobotTaskEnv(EnvBase):
     def num_threads(self) -> int:
         """Number of threads that step the environments."""
         return self.episodes.simulation.num_threads
+
+    # The next two have no setter, because a later change would have no effect.
+    @property
+    def max_episode_steps(self) -> int:
+        """Number of steps after which an episode is ``truncated``."""
+        return self.episodes.max_episode_steps
+
+    @property
+    def terminate_on_success(self) -> bool:
+        """Whether success ends an episode."""
+        return self._terminate_on_success
 
     @property
     def goal_indices(self) -> tuple[int, ...] | None:
