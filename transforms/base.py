@@ -292,13 +292,21 @@ class BufferTransform(envs.Transform):
         """Checks that hindsight is possible with the buffer's transforms and its data.
 
         Raises:
-            RuntimeError: The buffer has a `MultiStepTransform`.
+            RuntimeError: The buffer has a `MultiStepTransform` or a second transform of
+                this kind.
             KeyError: Entries are missing in the data.
             ValueError: The goals have a wrong type, or do not fit `goal_parts`; or data
                 without trajectory ids are [time, num_envs].
         """
-        if any(isinstance(t, envs.MultiStepTransform) for t in get_chain(self)):
+        chain = get_chain(self)
+        if any(isinstance(t, envs.MultiStepTransform) for t in chain):
             raise RuntimeError(MULTI_STEP_ERROR)
+        names = [type(t).__name__ for t in chain if isinstance(t, BufferTransform)]
+        if len(names) > 1:
+            raise RuntimeError(
+                f"a buffer can have one hindsight transform, got {', '.join(names)}: "
+                "keep one of them, or make a buffer for each"
+            )
         self._rewriter.check_entries(batch)
         achieved = batch.get(self._rewriter.next_achieved_key)
         desired = batch.get(self._rewriter.goal_key)

@@ -653,6 +653,14 @@ def test_multi_step_raises(nested, late):
         rb.extend(envs.chunk(20))
 
 
+@pytest.mark.parametrize("second", [HindsightRelabel, HindsightAugment])
+def test_a_second_hindsight_transform_raises(second):
+    chain = Compose(HindsightRelabel(reward_fn), second(reward_fn))
+    rb = buffer(chain, capacity=100, batch_size=8)
+    with pytest.raises(RuntimeError, match=f"one .*Relabel, {second.__name__}"):
+        rb.extend(Envs(3, [5]).chunk(5).reshape(-1))
+
+
 @pytest.mark.parametrize("nested", [False, True])
 def test_environment_raises(nested):
     transform = HindsightRelabel(reward_fn)
