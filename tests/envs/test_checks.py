@@ -216,6 +216,20 @@ def test_wrong_tensors_of_a_task_are_refused(name, function, error, message):
 
 
 @pytest.mark.parametrize(
+    ("name", "function"),
+    [
+        ("observation", lambda s, sim: sim.ee_position.mul_(2)[:, :0]),
+        ("extra_observation", lambda s, sim: {"double": sim.ee_position[0].mul_(2)}),
+        ("compute_reward", lambda s, a, d: a.sub_(d)[:, :1]),
+        ("reward", lambda s, sim, action, a, d: d.square_()[:, :1]),
+    ],
+)
+def test_functions_that_change_goals_or_the_state_are_refused(name, function):
+    with pytest.raises(ValueError, match=f"Own.{name} must not change"):
+        make(task_with(name, function), num_envs=2)
+
+
+@pytest.mark.parametrize(
     "key",
     ["joint_position", "physics_seed", "actions", "success", "next", "_reset", "_step"],
 )

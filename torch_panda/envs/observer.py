@@ -1,6 +1,7 @@
 """Observes episodes: state, goals, sensors, reward, success, and how episodes end."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -24,8 +25,8 @@ class EpisodeObserver:
     """Observes n environments of one robot and one task.
 
     Raises:
-        ValueError: A function of the robot or the task returns a wrong shape or dtype,
-            or two sensors observe the same entry.
+        ValueError: A function of the robot or the task returns a wrong shape or dtype
+            or changes goals or state, or two sensors observe the same entry.
         TypeError: A function of the robot or the task does not return a tensor.
 
     Attributes:
@@ -238,30 +239,36 @@ class EpisodeObserver:
     def _check_functions(self) -> None:
         """Check that robot and task return the shapes that they declare."""
         robot, task, simulation = self._robot, self._task, self._simulation
-        n = simulation.num_envs
+        n, state = simulation.num_envs, simulation.state.rows
         goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
         for owner, name, size in (
             (robot, "observation", robot.observation_dim),
             (task, "observation", task.observation_dim),
             (task, "achieved_goal", task.goal_dim),
         ):
-            value = getattr(owner, name)(simulation)
-            check_output(f"{type(owner).__name__}.{name}", value, (n, size))
+            function = f"{type(owner).__name__}.{name}"
+            with _read_only(function, state):
+                value = getattr(owner, name)(simulation)
+            check_output(function, value, (n, size))
         task_name = type(task).__name__
         if simulation.scene.markers:
             shape = (n, len(simulation.scene.markers), 7)
             check_output(f"{task_name}.marker_pose", task.marker_pose(goal), shape)
         goals = task.achieved_goal(simulation).float(), goal.float()
-        check_output(f"{task_name}.compute_reward", task.compute_reward(*goals), (n, 1))
-        check_output(
-            f"{task_name}.is_success", task.is_success(*goals), (n, 1), torch.bool
-        )
+        with _read_only(f"{task_name}.is_success", *goals):
+            success = task.is_success(*goals)
+        check_output(f"{task_name}.is_success", success, (n, 1), torch.bool)
+        with _read_only(f"{task_name}.compute_reward", *goals):
+            reward = task.compute_reward(*goals)
+        check_output(f"{task_name}.compute_reward", reward, (n, 1))
         if self._has_reward:
             action = torch.zeros(n, robot.action_dim, dtype=torch.float32, device="cpu")
-            reward = task.reward(simulation, action, *goals)
+            with _read_only(f"{task_name}.reward", state, *goals):
+                reward = task.reward(simulation, action, *goals)
             check_output(f"{task_name}.reward", reward, (n, 1))
         if self._has_failure:
-            failure = task.failure(simulation)
+            with _read_only(f"{task_name}.failure", state):
+                failure = task.failure(simulation)
             check_output(f"{task_name}.failure", failure, (n, 1), torch.bool)
         if self._goal_indices is not None:
             size = robot.observation_dim + task.observation_dim
@@ -292,7 +299,8 @@ class ExtraObserver:
         self.entries: dict[str, Entry] = {}
         if type(task).extra_observation is Task.extra_observation:
             return
-        observed = task.extra_observation(simulation)
+        with _read_only(self._function, simulation.state.rows):
+            observed = task.extra_observation(simulation)
         if not isinstance(observed, dict):
             raise TypeError(
                 f"{self._function} must return a dict of tensors, got {observed!r}"
@@ -316,6 +324,23 @@ class ExtraObserver:
                 f"got {sorted(observed)}"
             )
         return {key: _float32_copy(value) for key, value in observed.items()}
+
+
+@contextmanager
+def _read_only(function: str, *tensors: Tensor) -> Iterator[None]:
+    """Check that a function of a robot or task does not change tensors in place.
+
+    Raises:
+        ValueError: A tensor has changed.
+    """
+    # Changes in place increment this counter, also changes of a view of the tensor.
+    versions = [tensor._version for tensor in tensors]
+    yield
+    if [tensor._version for tensor in tensors] != versions:
+        raise ValueError(
+            f"{function} must not change goals or the state of the simulation in "
+            f"place: change a copy, such as tensor.clone()"
+        )
 
 
 def _float32_copy(value: Tensor) -> Tensor:
