@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torch_panda import Flip, Panda, PickAndPlace, Push, RobotTaskEnv, Stack
+from torch_panda import Flip, Panda, PickAndPlace, Push, Reach, RobotTaskEnv, Stack
 from torch_panda.rotations import rotate
 
 angle = st.floats(-math.pi, math.pi)
@@ -74,6 +74,19 @@ def test_a_step_calls_the_overridden_reward_and_success(reward_type):
     assert td["success"].tolist() == [[True], [False]]
     assert td["reward"].tolist() == [[10.0], [0.0]]
     assert td["reward"].dtype == torch.float32
+
+
+class Above(Reach):
+    """Succeeds when the hand is above its goal."""
+
+    def is_success(self, achieved_goal, desired_goal):
+        return (achieved_goal - desired_goal)[..., 2:] > 0
+
+
+def test_the_sparse_reward_follows_an_overridden_success():
+    goals = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.01]])
+    assert Above().is_success(*goals).tolist() == [[True], [False]]
+    assert Above().compute_reward(*goals).tolist() == [[0.0], [-1.0]]
 
 
 def test_a_distance_at_the_threshold_is_neither_success_nor_punished():

@@ -105,8 +105,9 @@ class Task(Configured, ABC):
     that a task leaves out is never called, so it costs nothing.
 
     Args:
-        reward_type: "sparse" gives -1 above ``distance_threshold`` and 0 otherwise;
-            "dense" gives minus the distance to the goal.
+        reward_type: "sparse" gives -1 above ``distance_threshold`` and 0 otherwise, or
+            0 on success and -1 otherwise if a subclass overrides `is_success`; "dense"
+            gives minus the distance to the goal.
         distance_threshold: Distance below which a goal is reached.
 
     Raises:
@@ -350,6 +351,8 @@ class Task(Configured, ABC):
         self._check_goals(achieved_goal, desired_goal)
         if self.reward_type == "dense":
             return -self.distance(achieved_goal, desired_goal).float()
+        if type(self).is_success is not Task.is_success:
+            return self.is_success(achieved_goal, desired_goal).float() - 1.0
         distance = self.success_distance(achieved_goal, desired_goal)
         return (distance > self.distance_threshold).float().neg()
 
