@@ -76,6 +76,11 @@ def test_a_step_calls_the_overridden_reward_and_success(reward_type):
     assert td["reward"].dtype == torch.float32
 
 
+def test_a_method_of_a_task_object_cannot_be_replaced():
+    with pytest.raises(AttributeError, match="override it in a subclass of Push"):
+        Push().compute_reward = torch.zeros_like
+
+
 class Above(Reach):
     """Succeeds when the hand is above its goal."""
 

@@ -31,6 +31,21 @@ OBJECT_LAYOUT: tuple[Quantity, ...] = (
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
 """A function of achieved and desired goals, both (..., goal_dim), to (..., 1)."""
 
+# The environment looks these methods up in the class of a task: it never calls a hook
+# that the class does not override, and C code may do the work of the others.
+_CLASS_METHODS = (
+    "observation",
+    "achieved_goal",
+    "distance",
+    "success_distance",
+    "is_success",
+    "compute_reward",
+    "reward",
+    "failure",
+    "extra_observation",
+    "randomize",
+)
+
 
 class Bodies(NamedTuple):
     """Body ids of the bodies that a task has built in a client.
@@ -140,6 +155,14 @@ class Task(Configured, ABC):
     def __post_init__(self) -> None:
         check_choice("reward_type", self.reward_type, get_args(RewardType))
         check_not_negative(distance_threshold=self.distance_threshold)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in _CLASS_METHODS:
+            raise AttributeError(
+                f"{name} cannot be replaced in an object, because environments look it "
+                f"up in the class: override it in a subclass of {type(self).__name__}"
+            )
+        super().__setattr__(name, value)
 
     @abstractmethod
     def build(self, client: PhysicsClient) -> Bodies:
