@@ -71,12 +71,19 @@ def test_links_and_joints_that_the_urdf_lacks_are_refused(options):
         {"base_position": (0.0, 0.0)},
         {"base_position": (0.0, 0.0, float("nan"))},
         {"neutral_joint_position": (float("nan"),) * 7},
+        {"joint_forces": (-200.0,) * 7},
     ],
 )
 def test_numbers_out_of_range_are_refused(options):
     (name,) = options
     with pytest.raises(ValueError, match=f"{name} must be"):
         make_kuka(**options)
+
+
+def test_a_neutral_position_in_degrees_is_refused():
+    degrees = (0.0, 30.0, 0.0, -90.0, 0.0, 60.0, 0.0)
+    with pytest.raises(ValueError, match=r"lbr_iiwa_joint_2 .*-2.0944 and 2.0944, got"):
+        make(Reach(), make_kuka(neutral_joint_position=degrees))
 
 
 def test_a_wrong_number_of_joint_forces_is_refused():

@@ -55,12 +55,17 @@ class Joint(NamedTuple):
         name: Name of the joint.
         is_movable: Whether the joint has one degree of freedom.
         damping: Damping [N m s/rad] or [N s/m].
+        lower_limit: Lowest position [rad] or [m].
+        upper_limit: Highest position. It is below ``lower_limit`` if the joint has no
+            limits.
     """
 
     number: int
     name: str
     is_movable: bool
     damping: float
+    lower_limit: float
+    upper_limit: float
 
 
 class PhysicsClient:
@@ -310,8 +315,15 @@ class PhysicsClient:
         joints = []
         for index in range(capi.joint_count(handle, body)):
             capi.joint_info(handle, body, index, byref(info))
-            name, is_movable = info.joint_name.decode(), info.u_size == 1
-            joints.append(Joint(index, name, is_movable, info.damping))
+            joint = Joint(
+                number=index,
+                name=info.joint_name.decode(),
+                is_movable=info.u_size == 1,
+                damping=info.damping,
+                lower_limit=info.lower_limit,
+                upper_limit=info.upper_limit,
+            )
+            joints.append(joint)
         return joints
 
     def mass(self, body: int, link: int = -1) -> float:

@@ -46,6 +46,8 @@ _ARM_MODES: dict[ControlType, ArmMode] = {
 Workspace = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest (x, y, z) of a box, world frame [m]."""
 _FAR = math.inf
+# A neutral position this far outside a joint's limits [rad] or [m] is a rounding error.
+_LIMIT_TOLERANCE = 0.01
 ABOVE_THE_TABLE: Workspace = ((-_FAR, -_FAR, 0.0), (_FAR, _FAR, _FAR))
 
 
@@ -122,6 +124,8 @@ class Robot(Configured):
             raise ValueError(
                 f"neutral_joint_position must be finite, got {neutral_joint_position}"
             )
+        if not all(force >= 0 for force in joint_forces):
+            raise ValueError(f"joint_forces must be at least 0, got {joint_forces}")
         if len(base_position) != 3 or not np.isfinite(base_position).all():
             raise ValueError(
                 f"base_position must be three finite numbers, got {base_position}"
@@ -200,7 +204,8 @@ class Robot(Configured):
         Raises:
             FileNotFoundError: The URDF does not exist.
             ValueError: The number of movable joints in the URDF is not that of
-                ``joint_forces``, or the URDF has no link or joint with a given index.
+                ``joint_forces``, a neutral position is outside the limits of its joint,
+                or the URDF has no link or joint with a given index.
         """
         body = client.load_urdf(
             self.urdf,
@@ -210,12 +215,22 @@ class Robot(Configured):
             tool=self.tool,
         )
         joints = client.joints(body)
-        movable = [joint.name for joint in joints if joint.is_movable]
+        movable = [joint for joint in joints if joint.is_movable]
         if len(movable) != len(self.joint_forces):
             raise ValueError(
-                f"{self.urdf} has {len(movable)} movable joints {movable}, but "
-                f"joint_forces has {len(self.joint_forces)} values"
+                f"{self.urdf} has {len(movable)} movable joints "
+                f"{[joint.name for joint in movable]}, but joint_forces has "
+                f"{len(self.joint_forces)} values"
             )
+        for joint, position in zip(movable, self.neutral_joint_position, strict=True):
+            low, high = joint.lower_limit, joint.upper_limit
+            is_inside = low - _LIMIT_TOLERANCE <= position <= high + _LIMIT_TOLERANCE
+            if low <= high and not is_inside:
+                raise ValueError(
+                    f"neutral_joint_position of {joint.name} must be between its "
+                    f"limits in {self.urdf}, {low:g} and {high:g}, got {position:g}; "
+                    f"angles are in radians"
+                )
         wrist = () if self.wrist_joint is None else (self.wrist_joint,)
         for name, indices in (
             ("ee_link", (self.ee_link,)),
