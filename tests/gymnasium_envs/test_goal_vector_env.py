@@ -110,6 +110,7 @@ def test_the_default_device_changes_nothing(mode):
         ({"seed": [1, -2, 3]}, ValueError, "non-negative"),
         ({"options": {"mask": 1}}, ValueError, "only accepted option is .state"),
         ({"options": {"state": {}}}, ValueError, "must have entries, got none"),
+        ({"options": {"state": {"object": [0]}}}, ValueError, "unknown entries .'obje"),
         ({"options": {"state": None}}, TypeError, "must be a mapping to arrays"),
         ({"options": {"reset_mask": [True] * 3}}, TypeError, "array of bool"),
         ({"options": {"reset_mask": np.ones(3)}}, TypeError, "array of bool"),

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.envs.state import EXACT_KEYS, PLAIN_KEYS
 
 Observation = dict[str, NDArray[Any]]
 
@@ -59,7 +60,8 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
         The state as tensors; None if the options have no ``state``.
 
     Raises:
-        ValueError: An option has another name, or the state has no entries.
+        ValueError: An option has another name, or the state has no entries or unknown
+            ones.
         TypeError: The state is not a mapping of names to arrays of numbers.
     """
     if unknown := set(options) - {"state"}:
@@ -73,6 +75,12 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
         raise TypeError(f"the state must be a mapping to arrays, got {state!r}")
     if not state.keys():
         raise ValueError("the state must have entries, got none")
+    unknown_keys = set(state.keys()).difference(PLAIN_KEYS, EXACT_KEYS)
+    if unknown_keys:
+        raise ValueError(
+            f"the state has unknown entries {sorted(map(str, unknown_keys))}; accepted "
+            f"are those of get_state(): {', '.join(PLAIN_KEYS)}"
+        )
     return {
         key: torch.from_numpy(np.asarray(value).copy()) for key, value in state.items()
     }
