@@ -1,11 +1,14 @@
 """A mistake in a robot, a task, a scene or a state raises one clear error."""
 
+import re
+
 import pytest
 import torch
 
 import torch_panda
 from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv
 from torch_panda.bullet import VectorSimulation
+from torch_panda.sensors import Entry, Sensor
 from torch_panda.tasks import Bodies, create_table
 
 
@@ -268,6 +271,48 @@ def test_draws_of_a_wrong_shape_or_not_finite_are_refused(function, values):
         pytest.raises(ValueError, match=f"{function} must return finite numbers"),
     ):
         env.reset()
+
+
+class Height(Sensor):
+    """Observes what a function of the simulation returns."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def attach(self, simulation, renderer, robot):
+        return HeightReading(self.function, simulation)
+
+
+class HeightReading:
+    def __init__(self, function, simulation):
+        self.function, self.simulation = function, simulation
+        self.entries = {"height": Entry((1,), torch.float64)}
+        self.buffer = torch.zeros(2, 1, dtype=torch.float64)
+
+    def after_reset(self, envs): ...
+
+    def after_step(self, envs): ...
+
+    def observe(self):
+        return self.function(self, self.simulation.ee_position[:, 2:])
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda s, z: {"z": z.clone()}, "the entries ['height'], got ['z']"),
+        (lambda s, z: {"height": z[:, 0].clone()}, "shape (2, 1), got (2,)"),
+        (lambda s, z: {"height": z.float()}, "float64, got torch.float32"),
+        (lambda s, z: {"height": z}, "must return new tensors"),
+        (lambda s, z: {"height": s.buffer.copy_(z)}, "must return new tensors"),
+    ],
+)
+def test_wrong_tensors_of_a_sensor_are_refused(function, message):
+    with (
+        make(Reach(), num_envs=2, sensors=(Height(function),)) as env,
+        pytest.raises(ValueError, match=f"HeightReading.observe.*{re.escape(message)}"),
+    ):
+        env.rollout(2)
 
 
 # ---- rotations ---------------------------------------------------------------

@@ -51,6 +51,8 @@ class EpisodeObserver:
         self._terminate_on_success = terminate_on_success
         self._goal_indices = None if goal_indices is None else list(goal_indices)
         self._num_to_check = _NUM_CHECKED
+        # Kept while observations are checked, so that their memory is not used again.
+        self._last_values: Observed = {}
         # A hook that the task does not override is never called.
         self._has_reward = type(task).reward is not Task.reward
         self._has_failure = type(task).failure is not Task.failure
@@ -107,9 +109,11 @@ class EpisodeObserver:
             float32.
 
         Raises:
-            ValueError: One of the first observations or rewards is NaN or infinite, or
-                the observation does not hold the achieved goal where
-                `Task.goal_entries` declares it.
+            ValueError: One of the first observations or rewards is NaN or infinite; a
+                sensor returns other entries than it declares, or memory that it
+                overwrites later; or the observation does not hold the achieved goal
+                where `Task.goal_entries` declares it.
+            TypeError: A sensor does not return tensors.
         """
         if self._compiled is None:
             observed, has_outcome = self._observe_goals(goal), False
@@ -122,10 +126,15 @@ class EpisodeObserver:
         if action is None:
             observed.pop("reward", None)
         for observer in self._observers:
-            observed |= observer.observe()
+            values = observer.observe()
+            if self._num_to_check:
+                self._check_entries(observer, values)
+            observed |= values
         if self._num_to_check:
             self._check_numbers(observed)
             self._num_to_check -= 1
+            if not self._num_to_check:
+                self._last_values.clear()
         return observed
 
     def _observe_goals(self, goal: Tensor) -> Observed:
@@ -189,6 +198,29 @@ class EpisodeObserver:
             "truncated": truncated,
             "done": terminated | truncated,
         }
+
+    def _check_entries(self, observer: Observer, values: Observed) -> None:
+        """Check the tensors that an observer returned; see `observe`."""
+        function = f"{type(observer).__name__}.observe"
+        if values.keys() != observer.entries.keys():
+            raise ValueError(
+                f"{function} must return the entries {sorted(observer.entries)}, "
+                f"got {sorted(values)}"
+            )
+        n, state = self._simulation.num_envs, self._simulation.state.rows
+        for key, (shape, dtype, _) in observer.entries.items():
+            value = values[key]
+            check_output(f"{function}()[{key!r}]", value, (n, *shape), dtype)
+            memory = value.untyped_storage().data_ptr()
+            others = (state, self._last_values.get(key, state))
+            if value.numel() and any(
+                memory == other.untyped_storage().data_ptr() for other in others
+            ):
+                raise ValueError(
+                    f"{function} must return new tensors, but the next step overwrites "
+                    f"the memory of {key!r}: return a copy, such as tensor.clone()"
+                )
+            self._last_values[key] = value
 
     def _check_numbers(self, observed: Observed) -> None:
         """Check the numbers that robot and task returned; see `observe`."""
