@@ -52,7 +52,8 @@ class Bodies(NamedTuple):
 
     Attributes:
         objects: Movable objects, in the order of ``simulation.object_pose``. Their
-            joints are part of the state too.
+            joints are part of the state too. A movable body that is not listed starts
+            every episode where `Task.build` put it, and states do not hold it.
         markers: Bodies without collisions that show the goal.
     """
 
