@@ -1,5 +1,6 @@
 """Learning from a file of demonstrations, before and beside one's own transitions."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -42,6 +43,48 @@ def test_demonstrations_of_another_task(env, make_demos):
         read_demos(path, env)
 
 
+@pytest.mark.parametrize("case", ["time first", "pieces", "one id", "without ends"])
+def test_episodes_are_found_in_any_layout(env, make_demos, case):
+    path = make_demos()
+    whole = TensorDict(torch.load(path)).auto_batch_size_(1).unflatten(0, (4, 50))
+    content = whole.clone()
+    if case == "time first":
+        content = content.transpose(0, 1)
+    elif case == "pieces":  # as a collector yields them
+        content = torch.cat([content[:, :20].reshape(-1), content[:, 20:].reshape(-1)])
+    else:
+        content["collector", "traj_ids"].fill_(7)
+        content["next", "done"] &= case == "one id"
+    torch.save(content.to_dict(), path)
+    demos = read_demos(path, env).unflatten(0, (4, 50))
+    assert (demos["observation"] == whole["observation"]).all()
+    assert (demos["collector", "traj_ids"] == torch.arange(4)[:, None]).all()
+
+
+def test_shuffled_demonstrations(env, make_demos):
+    path = make_demos()
+    content = TensorDict(torch.load(path)).auto_batch_size_(1)
+    torch.save(content[torch.randperm(200)].to_dict(), path)
+    with pytest.raises(ValueError, match="not in the order of time"):
+        read_demos(path, env)
+
+
+def test_demonstrations_of_double_precision(env, make_demos):
+    path = make_demos()
+    content = TensorDict(torch.load(path))
+    torch.save(content.to(torch.float64).to_dict(), path)
+    demos = read_demos(path, env)
+    assert demos["observation"].dtype == demos["action"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("key", ["desired_goal", ("next", "reward")])
+def test_demonstrations_without_an_entry(env, make_demos, key):
+    path = make_demos()
+    torch.save(TensorDict(torch.load(path)).exclude(key).to_dict(), path)
+    with pytest.raises(ValueError, match=re.escape(f"there is no entry {key!r}")):
+        read_demos(path, env)
+
+
 def test_demonstrations_of_unequal_lengths(env, make_demos):
     path = make_demos()
     content = torch.load(path)
@@ -56,6 +99,15 @@ def test_demonstrations_without_a_transition(env, make_demos):
     content = TensorDict(torch.load(path)).auto_batch_size_(1)
     torch.save(content[:0].to_dict(), path)
     with pytest.raises(ValueError, match=f"{path} holds no transitions"):
+        read_demos(path, env)
+
+
+def test_demonstrations_with_rewards_of_another_shape(env, make_demos):
+    path = make_demos()
+    content = torch.load(path)
+    content["next"]["reward"] = content["next"]["reward"].squeeze(-1)
+    torch.save(content, path)
+    with pytest.raises(ValueError, match=r"shape \[\.\.\., 1\].*got \(200,\) for 200"):
         read_demos(path, env)
 
 

@@ -19,17 +19,20 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     """Read demonstrations and check that they fit an environment.
 
     Args:
-        path: File that ``python -m torch_panda record`` wrote, or the folder of a data
-            set in Minari's or LeRobot's format.
+        path: File that ``python -m torch_panda record`` wrote, or another file of a
+            nested dict with the entries `STORED_KEYS`; or the folder of a data set in
+            Minari's or LeRobot's format.
         env: Environment of the task that was demonstrated.
 
     Returns:
-        Transitions (n,) of whole episodes, on the device of the environment. Actions
-        are clipped to [-1, 1], as the environment clips them.
+        Transitions (n,) of whole episodes, on the device of the environment, episode
+        after episode. Floating-point numbers are float32. Actions are clipped to
+        [-1, 1], as the environment clips them.
 
     Raises:
-        ValueError: The path holds no demonstrations, or their sizes or rewards differ
-            from those of the environment.
+        ValueError: The path holds no demonstrations, their sizes or rewards differ
+            from those of the environment, or the rows of an episode are not in the
+            order of time.
     """
     if not path.exists():
         raise ValueError(
@@ -42,7 +45,9 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             demos = load_format(name).read(path)
         else:
             keys = STORED_KEYS
-            content = files.read(path, "demonstrations", keys, finite=keys)
+            content = files.read(
+                path, "demonstrations", keys, finite=keys, map_location="cpu"
+            )
             # The batch shape is (n,), or [episodes, steps] for the data of `generate`.
             demos = TensorDict(content, content["action"].shape[:-1])
         demos = demos.select(*STORED_KEYS)
@@ -51,7 +56,7 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         raise ValueError(f"{path} does not hold demonstrations: {error}") from None
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
-    demos = demos.reshape(-1)
+    demos = demos.reshape(-1).apply(lambda x: x.float() if x.is_floating_point() else x)
     for key in ("observation", "action", "desired_goal"):
         expected = env.full_observation_spec.get(key, None)
         size = (env.action_spec if expected is None else expected).shape[-1]
@@ -61,19 +66,56 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
                 f"{demos[key].shape[-1]}, that of the environment has size {size}"
             )
     _check_rewards(path, demos, env)
+    demos = _sort_episodes(path, demos)
     demos["action"] = demos["action"].clamp(-1.0, 1.0)
     return demos.to(env.device)
+
+
+def _sort_episodes(path: Path, demos: TensorDictBase) -> TensorDictBase:
+    """Make the rows of each episode consecutive, and number the episodes 0, 1, ...
+
+    A collector's batches may hold an episode in several pieces, and merged data sets
+    may have the same trajectory ids. So an episode consists of the rows with one id, up
+    to a row that is done or that the next row does not continue.
+
+    Raises:
+        ValueError: Most rows do not continue the row before them.
+    """
+    ids = demos["collector", "traj_ids"].reshape(-1)
+    order = ids.argsort(stable=True)
+    if (order.diff() != 1).any():
+        demos, ids = demos[order], ids[order]  # type: ignore[assignment]  # a TensorDict
+    ends = demos["next", "done"].reshape(-1) != 0
+    ends[:-1] |= ids.diff() != 0
+    ends[-1] = True
+    expected, following = demos["next", "observation"][:-1], demos["observation"][1:]
+    breaks = ~ends[:-1] & (following != expected).any(-1)
+    if breaks.sum() > (~ends).sum() / 2:
+        raise ValueError(
+            f"{path}: the rows of an episode are not in the order of time. In most "
+            "rows, the next observation is not the observation of the following row "
+            "with the same trajectory id"
+        )
+    ends[:-1] |= breaks
+    numbers = ends.cumsum(0) - ends.long()
+    return demos.replace({"collector": {"traj_ids": numbers}})
 
 
 def _check_rewards(path: Path, demos: TensorDictBase, env: RobotTaskEnv) -> None:
     """Check that the stored rewards are those that the task computes.
 
     Raises:
-        ValueError: More than `DIFFERENT_REWARDS` of them differ.
+        ValueError: More than `DIFFERENT_REWARDS` of them differ, or their shape is
+            wrong.
     """
     achieved_goal = demos["next", "achieved_goal"]
     expected = env.compute_reward(achieved_goal, demos["desired_goal"])
     stored = demos["next", "reward"].to(expected)
+    if stored.shape != expected.shape:
+        raise ValueError(
+            f"{path}: the rewards must have the shape [..., 1], one for each "
+            f"transition, got {tuple(stored.shape)} for {len(demos)} transitions"
+        )
     differs = ~torch.isclose(stored, expected, rtol=1e-3, atol=1e-3)
     if differs.double().mean() > DIFFERENT_REWARDS:
         k = int(differs.flatten().nonzero()[0])

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from operator import getitem
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, BinaryIO
 
 import torch
@@ -102,6 +103,8 @@ def read(
             check_finite(key, get(content, key))
     except Exception as error:  # damaged bytes can raise almost any exception
         reason = str(error) if isinstance(error, ValueError) else type(error).__name__
+        if isinstance(error, UnpicklingError):
+            reason = "it may hold only tensors, numbers, strings, dicts and lists"
         raise ValueError(
             f"{path} does not hold {content_name}, or is damaged ({reason})"
         ) from None
@@ -109,8 +112,15 @@ def read(
 
 
 def get(content: Any, key: NestedKey) -> Any:  # noqa: ANN401 (nested dicts)
-    """Return the value under a key, which may be a tuple of nested keys."""
-    return reduce(getitem, key if isinstance(key, tuple) else (key,), content)
+    """Return the value under a key, which may be a tuple of nested keys.
+
+    Raises:
+        ValueError: There is no such value.
+    """
+    try:
+        return reduce(getitem, key if isinstance(key, tuple) else (key,), content)
+    except (LookupError, TypeError):
+        raise ValueError(f"there is no entry {key!r}") from None
 
 
 def check_archive(path: Path) -> None:
