@@ -12,7 +12,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torch_panda.transforms.rewrite import DONE, Rewriter, call_goal_function
+from torch_panda.transforms.rewrite import (
+    DONE,
+    TERMINATED,
+    Rewriter,
+    call_goal_function,
+)
 
 MAX_BATCH_ROWS = 128  # rows of one batch that are checked
 MAX_POOL_ROWS = 512  # rows of earlier batches that are kept for the next check
@@ -94,14 +99,15 @@ def check_time_is_last(batch: TensorDictBase, rewriter: Rewriter) -> None:
 class DataCheck:
     """Checks the first batches for entries that relabelling would make wrong.
 
-    Three checks need rows with several different goals:
+    Four checks need rows with several different goals:
 
     - `_check_rewards`: are the stored rewards those of `reward_fn`?
+    - `_check_ends`: does success end episodes, if `terminated_fn` says so?
     - `_check_copies`: does an entry contain a copy of the desired goal?
     - `_check_affine`: is an entry an affine function of the goals, such as the
       difference of desired and achieved goal?
 
-    Rows are collected until their goals differ. Then all three checks run. Because they
+    Rows are collected until their goals differ. Then all four checks run. Because they
     cost time, they stop after `MIN_CHECKS` runs if they saw enough different goals, and
     after `MAX_TOTAL_ROWS` rows in any case.
 
@@ -114,12 +120,14 @@ class DataCheck:
     Attributes:
         shapes: Observation entries of the base environment, without its transforms, and
             their shapes. None if the environment is unknown.
+        keeps_rows: Whether some rows keep their goal, and so their stored ends.
     """
 
     def __init__(
         self, rewriter: Rewriter, ignored: Sequence[NestedKey], warned: set[str]
     ) -> None:
         self.shapes: dict[NestedKey, torch.Size] | None = None
+        self.keeps_rows = True
         self._rewriter = rewriter
         self._ignored = ignored
         self._warned = warned
@@ -146,6 +154,7 @@ class DataCheck:
         if (goals != goals[:1]).any():
             self._unchecked, self._pool = None, _append(self._pool, rows)
             self._check_rewards(rows)
+            self._check_ends(rows)
             self._check_copies(self._pool)
             has_enough_goals = self._check_affine(self._pool)
             self._num_checks += 1
@@ -170,7 +179,7 @@ class DataCheck:
             rewriter.achieved_goal_key,
             rewriter.next_achieved_key,
         )
-        selected = {*suspects, *goal_keys, rewriter.reward_key}
+        selected = {*suspects, *goal_keys, rewriter.reward_key, TERMINATED}
         return rows.select(*selected, strict=False).to_tensordict()
 
     def _get_suspects(self, rows: TensorDictBase) -> dict[NestedKey, Tensor]:
@@ -290,6 +299,11 @@ class DataCheck:
             ValueError: The rewards were scaled or shifted.
         """
         rewriter = self._rewriter
+        # Data without desired goals may hold NaN instead.
+        is_known = rows.get(rewriter.goal_key).flatten(1).isfinite().all(1)
+        if not is_known.any():
+            return
+        rows = rows[is_known]  # type: ignore[assignment]  # a TensorDict
         stored, goals = rows.get(rewriter.reward_key), rows.get(rewriter.goal_key)
         achieved = rows.get(rewriter.next_achieved_key)
         expected = call_goal_function(rewriter.reward_fn, achieved, goals, stored)
@@ -333,6 +347,29 @@ class DataCheck:
             f"{_format(goals[row])}; perhaps the environment normalises the goals",
             "rewards",
         )
+
+    def _check_ends(self, rows: TensorDictBase) -> None:
+        """Warns if `terminated_fn` ends relabelled rows at success, but not the data.
+
+        Rounding of the stored goals changes the success of single rows. So tolerate
+        half of the successful rows.
+        """
+        rewriter = self._rewriter
+        if rewriter.terminated_fn is None or not self.keeps_rows:
+            return
+        terminated = rows.get(TERMINATED)
+        reached = call_goal_function(
+            rewriter.terminated_fn,
+            rows.get(rewriter.next_achieved_key),
+            rows.get(rewriter.goal_key),
+            terminated,
+        )
+        if (reached & ~terminated).sum() > reached.sum() / 2:
+            self._warn(
+                "episodes go on after success in the data, but terminated_fn ends "
+                "relabelled rows at success: pass terminated_fn=None",
+                "ends",
+            )
 
     def _warn(self, message: str, subject: str) -> None:
         """Warns, unless this transform has given a warning of the same subject."""

@@ -75,6 +75,7 @@ class GoalSampler(SampleTimeTransform):
                 f"strategies must not replace {self._rewriter.achieved_goal_key!r}: "
                 "name a new entry"
             )
+        self._check_written.keeps_rows = self._check_sampled.keeps_rows = False
 
     @classmethod
     def from_env(  # type: ignore[override]  # the strategies have no default

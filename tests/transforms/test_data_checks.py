@@ -34,7 +34,7 @@ from tests.transforms.identifiable import (
     reward_fn,
 )
 from tests.transforms.pipelines import BOTH, buffer, collect, make
-from torch_panda import Randomization
+from torch_panda import Randomization, datasets
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 STALE = r"{}.*after this transform"
@@ -393,6 +393,20 @@ def test_unknown_goals_may_be_nan():
 
 
 # -- padding --------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [({}, 1), ({"her_ratio": 1.0}, 0), ({"terminated_fn": None}, 0)],
+)
+def test_episodes_that_go_on_after_success_warn_once(options, count):
+    env = make("PandaReach-v3")
+    data = datasets.generate(
+        "PandaReach-v3", kind="noisy", transitions=400, seed=0, num_envs=8
+    )
+    rb = buffer(HindsightRelabel.from_env(env, **options))
+    messages = get_warnings(lambda: [rb.extend(episode) for episode in data])
+    assert len([m for m in messages if "pass terminated_fn=None" in m]) == count
+
+
 
 
 def make_padded():
