@@ -218,6 +218,13 @@ class GoalMemory:
         positions = self._ring.take(serials % len(self._ring))
         return positions["trajectory"], positions["step"]
 
+    def get_achieved(self, serials: Integers) -> Goals:
+        """Returns the goals that transitions achieved, (n, *goal)."""
+        numbers, steps = self.find(serials)
+        rows = self._trajectories["offset"].take(numbers) + steps
+        achieved: Goals = self._goals[rows, 0]
+        return achieved
+
     def is_open(self, serials: Integers) -> NDArray[np.bool_]:
         """Returns whether each transition's trajectory is still open, (n,)."""
         open_numbers = [number for number, _, _ in self._open.values()]

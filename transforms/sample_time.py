@@ -89,8 +89,8 @@ class SampleTimeTransform(BufferTransform):
             oldest = self._find_oldest(buffer)
             if tags is None or oldest < 0:
                 raise self._explain_unknown_rows(has_tags=tags is not None)
-            if self._is_first_sample:
-                self._is_first_sample = False
+            is_first, self._is_first_sample = self._is_first_sample, False
+            if is_first:
                 self._rewriter.check_entries(tensordict)
                 self._warn_of_slices(buffer)
             self._check_sampled(tensordict)
@@ -98,6 +98,9 @@ class SampleTimeTransform(BufferTransform):
             if not all(m.only_looks_ahead for m in self._get_mixtures()):
                 self._memory.forget(oldest)
             serials = tags.numpy(force=True).reshape(-1)
+            # One buffer of an ensemble may hold rows of another transform.
+            if is_first or isinstance(buffer, ReplayBufferEnsemble):
+                self._check_tags(serials, tensordict)
             drawn = self._draw(serials, tensordict)
         # The buffer's `_sample` returns a copy, which may be changed in place. Other
         # methods of the buffer may return the storage itself, or a lazy stack.
@@ -107,6 +110,27 @@ class SampleTimeTransform(BufferTransform):
         if batch is tensordict and not inplace:
             return batch.exclude(SERIAL_KEY)
         return batch.del_(SERIAL_KEY)
+
+    def _check_tags(self, serials: Integers, batch: TensorDictBase) -> None:
+        """Checks that this transform has tagged the sampled rows.
+
+        Raises:
+            RuntimeError: Most rows achieved another goal than the transitions that the
+                transform remembers under their serial numbers.
+        """
+        known = serials >= self._memory.oldest
+        achieved = batch.get(self._rewriter.next_achieved_key)
+        achieved = achieved.reshape(len(serials), *achieved.shape[batch.ndim :])
+        achieved = achieved[torch.from_numpy(known).to(achieved.device)]
+        remembered = torch.from_numpy(self._memory.get_achieved(serials[known]))
+        differs = achieved != remembered.to(achieved)
+        differs &= ~achieved.isnan()
+        if differs.flatten(1).any(1).sum() > len(achieved) / 2:
+            raise RuntimeError(
+                f"the sampled rows passed through another {type(self).__name__} when "
+                "they were stored: sample them with that transform, or pass all of "
+                "them through this one"
+            )
 
     @abstractmethod
     def _draw(self, serials: Integers, batch: TensorDictBase) -> Any:  # noqa: ANN401

@@ -158,6 +158,17 @@ def test_an_ensemble_of_buffers_is_relabelled(strategy):
     assert [transform._memory.oldest for transform in transforms] == [0, 0]
 
 
+def test_rows_of_another_transform_in_an_ensemble_are_refused():
+    mine, other = (HindsightRelabel(reward_fn) for _ in "ab")
+    members = [buffer(None), buffer(None)]
+    members[0].extend(mine.prepare(Envs(4, [10]).chunk(20)))
+    members[1].extend(other.prepare(Envs(4, [10], first_env=4).chunk(20)))
+    both = ReplayBufferEnsemble(*members, batch_size=64, transform=mine)
+    with pytest.raises(RuntimeError, match="through another HindsightRelabel"):
+        for _ in range(20):  # each sample draws from which buffers its rows come
+            both.sample()
+
+
 @pytest.mark.parametrize("unit", ["row", "slice"])
 def test_slices_with_goals_per_row_warn_once(unit):
     rb = buffer(HindsightRelabel(reward_fn, unit=unit), sampler=slices())
