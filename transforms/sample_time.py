@@ -12,7 +12,7 @@ from torchrl.data import ReplayBuffer, ReplayBufferEnsemble, RoundRobinWriter
 
 from torch_panda.transforms.base import SERIAL_KEY, BufferTransform
 from torch_panda.transforms.buffer import find_buffer, get_chain, samples_slices
-from torch_panda.transforms.rewrite import GoalFunction
+from torch_panda.transforms.rewrite import DONE, GoalFunction
 from torch_panda.transforms.strategies import Integers
 
 
@@ -67,7 +67,7 @@ class SampleTimeTransform(BufferTransform):
         with self._lock:
             self._claim(buffer)
             stored = self._count_stored(buffer)
-            self._last_write = stored, batch.numel()
+            self._last_write = stored, batch.shape.numel()
             batch = self._remember(batch, stored)  # type: ignore[arg-type]  # rows
         return batch.squeeze(-1) if is_one_item else batch
 
@@ -206,6 +206,26 @@ class SampleTimeTransform(BufferTransform):
                 stacklevel=2,
             )
 
+    def _check_order(self, data: TensorDictBase) -> None:
+        """Checks that most transitions of a data set continue the one before them.
+
+        Raises:
+            ValueError: Most of them begin a trajectory, although their id or the end of
+                the transition before them does not say so.
+        """
+        ids = data.get(self.trajectory_key, None)
+        num_ids = 1 if ids is None else len(ids.unique())
+        num_begun = num_ids + int(data.get(DONE).sum())
+        steps = self._memory.find(np.arange(len(data)))[1]
+        if (steps == 0).sum() > num_begun + len(data) / 2:
+            self._forget()
+            raise ValueError(
+                "most transitions do not continue the transition before them with the "
+                f"same id: their {self._rewriter.achieved_goal_key!r} is not the one "
+                "that it achieved. Pass whole trajectories in the order of time, not "
+                "shuffled rows"
+            )
+
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
         """Remembers stored transitions, such as those of a data set.
 
@@ -219,7 +239,11 @@ class SampleTimeTransform(BufferTransform):
 
         Raises:
             RuntimeError: The transform has remembered other transitions before.
+            ValueError: There are no transitions, or most of them are not in the order
+                of time.
         """
+        if not data.shape.numel():
+            raise ValueError(f"there are no transitions in data {list(data.shape)}")
         if self._memory.count:
             raise RuntimeError(
                 "prepare() must come before any extend(): make a new transform, or "
@@ -235,6 +259,7 @@ class SampleTimeTransform(BufferTransform):
             flat, identified = flat[mask.reshape(-1)], identified[mask.reshape(-1)]
         with self._lock:
             tags = self._remember(identified, 0).get(SERIAL_KEY)
+            self._check_order(identified)
         self.end_trajectories()
         return flat.copy().set(SERIAL_KEY, tags)
 

@@ -425,6 +425,12 @@ EXISTING = {
 }
 
 
+def test_shuffled_data_are_refused():
+    data = Envs(4, [9]).chunk(90).reshape(-1)[torch.randperm(360)]
+    with pytest.raises(ValueError, match="in the order of time, not shuffled"):
+        HindsightRelabel(reward_fn).prepare(data)
+
+
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
 @pytest.mark.parametrize("layout", EXISTING)
 def test_data_that_exist_already(storage, layout, tmp_path):
