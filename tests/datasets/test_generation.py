@@ -98,6 +98,9 @@ def test_play_pursues_goal_after_goal():
         ({"kind": "expert"}, "kind must be one of noisy, play, random, got 'expert'"),
         ({"kind": "noisy", "env_id": "KukaReach-v1"}, "no expert for"),
         ({"kind": "random", "transitions": 0}, "transitions must be"),
+        ({"kind": "noisy", "goal": "observation"}, "leave out goal='observation'"),
+        ({"kind": "play", "max_episode_steps": 50}, "max_episode_steps must be 120"),
+        ({"kind": "random", "terminate_on_success": True}, "must be False .* random"),
         (
             {"kind": "play", "env_id": "PandaPegInsertion-v1"},
             "needs goals that do",

@@ -69,8 +69,8 @@ def generate(
 
     Raises:
         ValueError: The kind is unknown, there is no expert for the id, a number is out
-            of range, or the kind is "play" and the goals of the task depend on the
-            start of an episode.
+            of range, an option of `make` contradicts the kind, or the kind is "play"
+            and the goals of the task depend on the start of an episode.
     """
     parts = generate_parts(
         env_id,
@@ -113,6 +113,17 @@ def generate_parts(
         raise ValueError(f"kind must be one of {names}, got {kind!r}")
     check_positive(transitions=transitions, num_envs=num_envs)
     seed = check_seed(seed)
+    for name, fixed in fixed_options(kind).items():
+        if make_options.get(name) not in (None, fixed):
+            raise ValueError(
+                f"{name} must be {fixed} in data of the kind {kind}, got "
+                f"{make_options[name]!r}"
+            )
+    if kind != "random" and make_options.get("goal", "task") != "task":
+        raise ValueError(
+            f"the experts of the kind {kind} need the goals of the task: leave out "
+            f"goal={make_options['goal']!r}, or use the kind random"
+        )
     expert = None if kind == "random" else make_expert(env_id)
     make_options = {**make_options, **fixed_options(kind)}
     num_episodes, steps = batch_shape(env_id, kind, transitions, **make_options)
