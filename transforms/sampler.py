@@ -90,6 +90,23 @@ class GoalSampler(SampleTimeTransform):
         """
         return super().from_env(env, strategies=strategies, **options)
 
+    def _check_setup(self, batch: TensorDictBase) -> None:
+        """Also checks that the new entries replace no entries of the data.
+
+        Raises:
+            ValueError: The data have an entry under one of the keys.
+        """
+        super()._check_setup(batch)
+        for key in self._mixtures:
+            places = key, unravel_key(("next", key))
+            if key != self._rewriter.goal_key and any(
+                batch.get(place, None) is not None for place in places
+            ):
+                raise ValueError(
+                    f"strategies must not replace {key!r}, which the data have "
+                    "already: name a new entry"
+                )
+
     def _get_mixtures(self) -> Collection[Mixture]:
         return self._mixtures.values()
 

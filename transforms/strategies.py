@@ -60,13 +60,14 @@ class Mixture:
         """
         if not 0 <= discount <= 1:
             raise ValueError(f"discount must be within [0, 1], got {discount}")
-        weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
-        for name in weights or [strategy]:
+        names = [*strategy] if isinstance(strategy, Mapping) else [strategy]
+        for name in names or [strategy]:
             if not callable(name) and name not in NAMES:
                 raise ValueError(
                     f"strategy must be one of {[*NAMES]}, a callable, or a mapping of "
                     f"these to weights, got {name!r}"
                 )
+        weights = strategy if isinstance(strategy, Mapping) else {strategy: 1.0}
         if not all(weight > 0 and np.isfinite(weight) for weight in weights.values()):
             raise ValueError(
                 f"strategy must have positive, finite weights, got {strategy!r}"

@@ -157,6 +157,7 @@ def test_rows_that_were_overwritten_get_their_own_goal(capacity):
         ({}, {}, "strategies must map keys"),
         ("future", {}, "strategies must map keys.*'future'"),
         ({"goal": "past"}, {}, "strategy must be one of.*'past'"),
+        ({"goal": ["future"]}, {}, r"strategy must be one of.*\['future'\]"),
         ({"achieved_goal": "future"}, {}, "must not replace 'achieved_goal'"),
         ({"goal": "future"}, {"discount": 1.5}, r"discount must be within \[0, 1\]"),
     ],
@@ -164,6 +165,13 @@ def test_rows_that_were_overwritten_get_their_own_goal(capacity):
 def test_bad_values_are_refused(strategies, options, message):
     with pytest.raises(ValueError, match=message):
         GoalSampler(strategies, reward_fn, **options)
+
+
+@pytest.mark.parametrize("key", ["action", "reward", ("collector", "traj_ids")])
+def test_entries_of_the_data_are_not_replaced(key):
+    rb = buffer(GoalSampler({key: "future"}, reward_fn))
+    with pytest.raises(ValueError, match=r"must not replace .* which the data have"):
+        rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
 
 
 def test_from_env_needs_strategies_too():
