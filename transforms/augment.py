@@ -72,6 +72,8 @@ class HindsightAugment(BufferTransform):
             )
         mask = self._find_mask(tensordict)
         batch = tensordict if mask is None else tensordict[mask]
+        if not batch.shape.numel():
+            return None
         with self._lock:
             self._claim(buffer)
             ended = self._take_ended(batch)  # type: ignore[arg-type]  # a TensorDict

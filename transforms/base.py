@@ -214,6 +214,8 @@ class BufferTransform(envs.Transform):
             batch: Transitions, [*environments, time].
             stored: Number of transitions in the buffer before this batch is written.
         """
+        if not batch.shape.numel():
+            return batch.set(SERIAL_KEY, torch.zeros(batch.shape, dtype=torch.int64))
         if not self._has_checked_setup:
             self._check_setup(batch)
             self._has_checked_setup = True
@@ -235,6 +237,12 @@ class BufferTransform(envs.Transform):
         )
         if achieved is None or desired is None or next_desired is None or done is None:
             rewriter.check_entries(batch)  # raises
+        if done.numel() != len(flat):
+            raise ValueError(
+                f"{DONE!r} must hold one value per transition, got {tuple(done.shape)} "
+                f"in data of batch size {list(shape)}: if the transitions have further "
+                "dimensions, add these to the batch size, such as [episodes, steps]"
+            )
         self._check_written(batch)
         check_goals_agree(flat, rewriter)
         goals: Any = [achieved.numpy(force=True)]

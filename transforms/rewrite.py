@@ -59,8 +59,11 @@ class Rewriter:
         missing = [key for key in needed if batch.get(key, None) is None]
         if missing:
             entries = sorted(map(str, batch.keys(True, True)))
+            hint = ""
+            if self.success_key in missing:
+                hint = "; if the data hold no success, pass success_fn=None"
             raise KeyError(
-                f"hindsight needs {missing} in the data, which has {entries}"
+                f"hindsight needs {missing} in the data, which has {entries}{hint}"
             )
 
     def rewrite(

@@ -256,6 +256,30 @@ def test_missing_entries_raise(key, later):
         rb.extend(envs.chunk(5).exclude(("next", key)).reshape(-1))
 
 
+@pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
+def test_an_empty_batch_changes_nothing(hindsight):
+    rb, envs = buffer(hindsight(reward_fn)), Envs(2, [5])
+    rb.extend(envs.chunk(5).reshape(-1))
+    stored = len(rb)
+    rb.extend(envs.chunk(5).reshape(-1)[:0])
+    assert len(rb) == stored
+    rb.extend(envs.chunk(5).reshape(-1))
+    check_batch(rb.sample(), rb.storage[:], "future")
+
+
+@pytest.mark.parametrize("ids", [True, False])
+def test_a_batch_size_that_lacks_the_time_raises(ids):
+    data = Envs(3, [5]).chunk(5).exclude("collector")
+    data.batch_size = [3]
+    if ids:
+        data["collector", "traj_ids"] = torch.arange(3)
+    rb = make_buffer(single_env=not ids)
+    with pytest.raises(
+        ValueError, match=r"got \(3, 5, 1\) in data of batch size \[3\]"
+    ):
+        rb.extend(data)
+
+
 def test_rows_stored_without_the_transform_raise(tmp_path):
     plain = buffer(None, capacity=100)
     plain.extend(Envs(2, [5]).chunk(5).reshape(-1))
