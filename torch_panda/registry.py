@@ -340,6 +340,8 @@ def find_registration(env_id: str) -> Registration:
     raise ValueError(
         f"unknown environment id {env_id!r}; {hint}accepted are {_id_patterns()}"
         + (f" and the registered: {own}" if own else "")
+        + "; to use an id of your own, import the module that registers it in every "
+        "process (in commands: --import)"
     )
 
 
