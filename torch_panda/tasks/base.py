@@ -220,7 +220,9 @@ class Task(Configured, ABC):
 
         Optional. It runs in the thread that resets the environment. Its changes may
         depend on ``rng`` only. They last until the next change, so if it sets a
-        property in one episode, it must set this property in every episode.
+        property in one episode, it must set this property in every episode. It runs
+        after a `Randomization` of the environment. If both set the same property, the
+        ``physics_parameters`` that the `Randomization` observes are wrong.
 
         Args:
             client: Client of the environment; see `PhysicsClient.set_dynamics`.
