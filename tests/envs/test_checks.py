@@ -83,6 +83,11 @@ def test_numbers_out_of_range_are_refused(options):
         make_kuka(**options)
 
 
+def test_the_name_of_a_link_is_refused():
+    with pytest.raises(TypeError, match="ee_link must be an integer, got 'hand'"):
+        make_kuka(ee_link="hand")
+
+
 def test_a_neutral_position_in_degrees_is_refused():
     degrees = (0.0, 30.0, 0.0, -90.0, 0.0, 60.0, 0.0)
     with pytest.raises(ValueError, match=r"lbr_iiwa_joint_2 .*-2.0944 and 2.0944, got"):

@@ -19,7 +19,7 @@ from torch_panda.bullet import (
 )
 from torch_panda.bullet.control import ArmMode
 from torch_panda.bullet.urdf import Tool
-from torch_panda.checks import check_choice, check_quaternion
+from torch_panda.checks import check_choice, check_integer, check_quaternion
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
     NO_ROTATION,
@@ -92,6 +92,7 @@ class Robot(Configured):
 
     Raises:
         ValueError: An argument is out of range, or two arguments contradict each other.
+        TypeError: ``ee_link`` is not an integer.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class Robot(Configured):
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
         self.joint_forces = tuple(map(float, joint_forces))
-        self.ee_link = ee_link
+        self.ee_link = check_integer("ee_link", ee_link)
         x, y, z, w = ee_orientation
         self.ee_orientation = (float(x), float(y), float(z), float(w))
         num_fingers = 0 if gripper is None else gripper.num_joints
