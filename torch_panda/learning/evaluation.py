@@ -97,7 +97,7 @@ def evaluate(
         episodes: Number of episodes.
         seed: Seed of the episodes; None draws a random seed.
         num_envs: Number of environments stepped in parallel, at most one for each
-            episode.
+            episode. Random starts depend on this number, fixed starts do not.
         tasks: "random" draws the start and the goal of each episode. "fixed" takes them
             from the five `torch_panda.evaluation_tasks`, and also reports the success
             from each of these starts. ``episodes`` is then rounded up to a multiple of
