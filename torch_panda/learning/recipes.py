@@ -148,8 +148,8 @@ SAMPLE_EFFICIENT_CHANGES: dict[type[Task], dict[str, Any]] = {
         "total_steps": 40_000,
         "eval_interval": 5_000,
     },
-    # These options were tried with demonstrations and without special starts: with
-    # `--demos FILE --start-at-object 0`.
+    # For training with special starts, or with demonstrations and without special
+    # starts: `--demos FILE --start-at-object 0`.
     Stack: {
         "action_l2": 0.1,
         "ema_rate": 0.003,
