@@ -53,7 +53,7 @@ class Args:
     policy: Annotated[Path, tyro.conf.Positional]
     """folder of a run, or its checkpoint.pt"""
     out: Path
-    """folder of the results, with the same files as a run of `train`"""
+    """folder of the results, with the files of a run of `train` except the video"""
     env_id: str | None = None
     """another task with the same spaces; None means the task of the policy"""
     steps: Positive = 640_000

@@ -38,8 +38,8 @@ class GoalVectorEnv(
             NEXT_STEP: the next call of `step` resets it, and ignores its action.
             SAME_STEP: the step that ends the episode also resets it. The infos then
             hold ``final_obs`` and ``final_info``. DISABLED: the caller resets it with
-            ``reset(options={"reset_mask": ...})``. torchrl's `GymWrapper` supports
-            SAME_STEP and DISABLED.
+            ``reset(options={"reset_mask": ...})``, and torchrl's `GymWrapper` needs
+            this mode.
         render_mode: "rgb_array" or None.
         render_camera: Camera of `render`, as for `GoalEnv`.
         **arguments: Further arguments of `GoalEnv`.
