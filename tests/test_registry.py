@@ -117,8 +117,8 @@ def test_wrong_registrations(arguments, error, message):
 
 def test_an_unknown_id_is_named_with_a_similar_one_and_the_accepted_ones(env_id):
     message = (
-        r"'PandaPsh-v1'; did you mean PandaPush-v1.*accepted are Panda\{Reach,.*: "
-        ".*Unversioned.*import the module"
+        r"'PandaPsh-v1'; did you mean PandaPush-v1.*accepted ids are Panda\{Reach,.*"
+        "registered ids are .*Unversioned.*import the module"
     )
     with pytest.raises(ValueError, match=message):
         torch_panda.make("PandaPsh-v1")

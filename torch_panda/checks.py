@@ -175,7 +175,10 @@ def check_action(action: object, shape: tuple[int, ...]) -> Tensor:
             f"the action must have shape {shape}, got {tuple(action.shape)}"
         )
     if not action.dtype.is_floating_point:
-        raise TypeError(f"the action must be float32, got {action.dtype}")
+        raise TypeError(
+            f"the action must have a floating-point dtype, got {action.dtype}: pass "
+            "action.float()"
+        )
     action = action.detach().to("cpu").reshape(-1, shape[-1])
     if not all_finite(action):
         env = int((~action.isfinite()).any(dim=1).nonzero()[0])

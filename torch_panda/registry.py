@@ -103,7 +103,7 @@ class Family(NamedTuple):
 
 
 BLOCKED = {"block_gripper": True}
-FIRM_FINGERS = {"finger_friction": 5.0}
+ROUGH_FINGERS = {"finger_friction": 5.0}
 # As in panda-gym 3.0.7. The default is the URDF's value, 0.1.
 SPIN_FRICTION = {"finger_spinning_friction": 0.001}
 
@@ -146,14 +146,14 @@ FAMILIES = (
     Family(
         Panda,
         _task("pick_and_place:PickAndPlace"),
-        FIRM_FINGERS,
+        ROUGH_FINGERS,
         v3_task={"table_friction": 0.5, "object_mass": 1.0, "object_friction": 0.5},
         v3_robot={"finger_friction": 1.0, **SPIN_FRICTION},
     ),
     Family(
         Panda,
         _task("stack:Stack"),
-        FIRM_FINGERS,
+        ROUGH_FINGERS,
         v3_task={
             "table_friction": 0.5,
             "object_mass": (2.0, 1.0),
@@ -164,13 +164,13 @@ FAMILIES = (
         },
         v3_robot={"finger_friction": 1.0, **SPIN_FRICTION},
     ),
-    # panda-gym 1.1.0 has no Flip, so Flip-v1 has the finger friction of 3.0.7.
+    # panda-gym 1.1.0 has no Flip, so Flip-v1 has the fingers of 3.0.7.
     Family(Panda, _task("flip:Flip"), SPIN_FRICTION, v3_task={"table_friction": 0.5}),
     Family(Panda, _task("drawer:Drawer"), BLOCKED),
     Family(
         Panda,
         _task("peg_insertion:PegInsertion"),
-        BLOCKED | FIRM_FINGERS | {"fingers_width": GRASP_WIDTH},
+        BLOCKED | ROUGH_FINGERS | {"fingers_width": GRASP_WIDTH},
     ),
     Family(_robot("kuka:Kuka"), _task("reach:Reach"), joints=False),
     Family(_robot("xarm:XArm6"), _task("reach:Reach"), joints=False),
@@ -178,7 +178,7 @@ FAMILIES = (
     Family(
         _robot("xarm:XArm6Gripper"),
         _task("pick_and_place:PickAndPlace"),
-        FIRM_FINGERS,
+        ROUGH_FINGERS,
         joints=False,
     ),
 )
@@ -305,7 +305,8 @@ def register(
     Raises:
         ValueError: The id belongs to torch_panda or is invalid for Gymnasium, or
             ``max_episode_steps`` is below 1.
-        TypeError: ``robot`` or ``task`` cannot be called.
+        TypeError: ``robot`` or ``task`` cannot be called, or ``max_episode_steps`` is
+            None and ``task`` needs arguments.
     """
     if env_id in ENV_IDS:
         raise ValueError(
@@ -338,8 +339,8 @@ def find_registration(env_id: str) -> Registration:
     hint = f"did you mean {' or '.join(similar)}? " if similar else ""
     own = ", ".join(sorted(_REGISTRATIONS.keys() - set(ENV_IDS)))
     raise ValueError(
-        f"unknown environment id {env_id!r}; {hint}accepted are {_id_patterns()}"
-        + (f" and the registered: {own}" if own else "")
+        f"unknown environment id {env_id!r}; {hint}accepted ids are {_id_patterns()}"
+        + (f"; registered ids are {own}" if own else "")
         + "; to use an id of your own, import the module that registers it in every "
         "process (in commands: --import)"
     )

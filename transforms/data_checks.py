@@ -230,9 +230,9 @@ class DataCheck:
         """Refuses entries that are affine functions of achieved and desired goal.
 
         An affine function has 2 * goal_dim + 1 coefficients per column. With too few
-        equations, it also fits columns that do not depend on the goals. All rows of an
-        episode in which no object has moved yet agree in their achieved and in their
-        desired goal, so together they give one equation. Therefore the check waits
+        equations, it also fits columns that do not depend on the goals. Until an
+        object moves, all rows of an episode have the same achieved and the same desired
+        goal, so together they give one equation. Therefore the check waits
         until there are more distinct desired goals than coefficients.
 
         Then the check refuses a column if an affine function fits it, with three
@@ -349,7 +349,7 @@ class DataCheck:
         )
 
     def _check_ends(self, rows: TensorDictBase) -> None:
-        """Warns if `terminated_fn` ends relabelled rows at success, but not the data.
+        """Warns if `terminated_fn` ends rows at success but the stored episodes go on.
 
         Rounding of the stored goals changes the success of single rows. So tolerate
         half of the successful rows.

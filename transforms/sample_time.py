@@ -28,8 +28,8 @@ class SampleTimeTransform(BufferTransform):
             goal for all rows of a sampled slice. It is drawn for the last of these
             rows, so that a "future" goal lies in the future of all of them.
         capacity: Number of transitions to remember, for a transform that is called
-            without a buffer or in a `ReplayBufferEnsemble`. Otherwise the transform
-            remembers the transitions that the buffer holds.
+            without a buffer or in a `ReplayBufferEnsemble`. None remembers as
+            many as the buffer holds.
         **options: Other arguments of `BufferTransform`.
     """
 
@@ -210,8 +210,8 @@ class SampleTimeTransform(BufferTransform):
         """Checks that most transitions of a data set continue the one before them.
 
         Raises:
-            ValueError: Most of them begin a trajectory, although their id or the end of
-                the transition before them does not say so.
+            ValueError: Most transitions begin a new trajectory, although the last
+                transition with the same id did not end one.
         """
         ids = data.get(self.trajectory_key, None)
         num_ids = 1 if ids is None else len(ids.unique())
@@ -220,10 +220,9 @@ class SampleTimeTransform(BufferTransform):
         if (steps == 0).sum() > num_begun + len(data) / 2:
             self._forget()
             raise ValueError(
-                "most transitions do not continue the transition before them with the "
-                f"same id: their {self._rewriter.achieved_goal_key!r} is not the one "
-                "that it achieved. Pass whole trajectories in the order of time, not "
-                "shuffled rows"
+                f"the {self._rewriter.achieved_goal_key!r} of most transitions is not "
+                "the goal that the transition before them with the same id achieved: "
+                "pass whole trajectories in the order of time, not shuffled rows"
             )
 
     def prepare(self, data: TensorDictBase) -> TensorDictBase:
@@ -305,6 +304,6 @@ def _check_layout(
     if method == "add" and data.shape[ndim - 1 :].numel() > 1:
         raise RuntimeError(
             f"add() writes a single step, got data {list(data.shape)} for ndim={ndim}: "
-            "call extend(); a collector with replay_buffer= needs ndim=2, and not "
-            "extend_buffer=False"
+            "call extend(); a collector with replay_buffer= needs ndim=2 and "
+            "extend_buffer=True"
         )

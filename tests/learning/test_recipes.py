@@ -73,7 +73,7 @@ def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(tmp_path, c
     assert find_recipe("PushNear-v0") == RECIPES[torch_panda.Push]
     small = {"total_steps": 50, "num_envs": 1, "video": False}
     train.main(replace(default, **small, out=tmp_path / "run"))
-    message = "PushBall-v0 has no recipe: training as in the panda-gym paper"
+    message = "PushBall-v0 has no recipe: using the options of the panda-gym paper"
     assert message in capsys.readouterr().out
 
 

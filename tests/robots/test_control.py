@@ -184,7 +184,7 @@ def test_a_robot_on_a_turned_base_moves_in_the_turned_directions():
     ("options", "message"),
     [
         ({"control_type": "force"}, "control_type must be one of"),
-        ({"action_scale": 0.0}, "action_scale must be above 0"),
+        ({"action_scale": 0.0}, "action_scale must be finite and above 0"),
         ({"workspace": ((0, 0, 1), (0, 0, 0))}, "workspace must be"),
         ({"base_orientation": (0, 0, 0, 0)}, "base_orientation must be"),
     ],

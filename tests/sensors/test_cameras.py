@@ -214,7 +214,7 @@ def test_two_cameras_of_which_one_is_on_the_hand():
 
 
 def test_two_cameras_without_names_are_refused():
-    with pytest.raises(ValueError, match="two sensors observe"):
+    with pytest.raises(ValueError, match="are observed twice"):
         torch_panda.make("PandaPush-v1", sensors=(CameraSensor(), CameraSensor()))
     with pytest.raises(ValueError, match="line of sight"):
         HandCamera(up=(0.0, 0.0, 1.0), eye=(0.0, 0.0, -0.1), target=(0.0, 0.0, 0.1))

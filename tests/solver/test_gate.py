@@ -199,7 +199,7 @@ def test_groups_that_are_left_to_bullet(closed, monkeypatch):
     ("field", "wrong"),
     [
         ("manifolds", "did not create the rows of the self-test"),
-        ("bodies", "did not accelerate the arm of the self-test"),
+        ("bodies", "did not compute the accelerations of the self-test"),
         ("aabbs", "did not move the AABBs of the self-test"),
         ("answers", "did not compute the inverse kinematics of the self-test"),
     ],

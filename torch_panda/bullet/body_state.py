@@ -1,7 +1,7 @@
 """The state of a body as Bullet reports it, in views of Bullet's memory.
 
 The views are valid until the client's next command, so copy the numbers that you want
-to keep. All numbers are float64 and in the world frame.
+to keep. All numbers are float64. Poses and velocities are in the world frame.
 """
 
 from ctypes import byref, c_double, c_int, c_void_p
@@ -95,7 +95,7 @@ class BodyState:
 
     @property
     def wrenches(self) -> Doubles:
-        """Wrench that each link got from its parent link in the last step (m, 6).
+        """Wrench that each link got from its parent link in the last substep (m, 6).
 
         A wrench is a force [N] and a torque [N m]. It acts at the joint between the two
         links and is given in the child link's frame. It is zero unless the joint has a
@@ -106,7 +106,7 @@ class BodyState:
 
     @property
     def motor_forces(self) -> Doubles:
-        """Torques [N m] or forces [N] of the joints' motors in the last step (m,)."""
+        """Torques [N m] or forces [N] of the motors in the last substep (m,)."""
         num_links, _, motors = self._read_forces()
         return _view(motors, 0, num_links)
 

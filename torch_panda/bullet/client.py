@@ -83,6 +83,8 @@ class PhysicsClient:
     Raises:
         ImportError: The C API of the installed pybullet is not the supported one.
         BulletError: Bullet could not create a client.
+        ValueError: The environment variable ``TORCH_PANDA_SOLVER`` is wrong.
+        RuntimeError: It asks for the faster solver, which cannot run here.
 
     Attributes:
         connection: The connection to Bullet, for commands that this class lacks.
@@ -309,7 +311,7 @@ class PhysicsClient:
     # ---- links and joints --------------------------------------------------------
 
     def joints(self, body: int) -> list[Joint]:
-        """The joints of a body, in the order of its URDF."""
+        """The joints of a body in Bullet's order: depth-first from the base."""
         handle = self.connection.handle
         info = capi.JointInfo()
         joints = []

@@ -10,9 +10,9 @@ class Scene(NamedTuple):
         robot: Body id of the robot.
         joints: Indices of the robot's movable joints.
         ee_link: Link of the robot whose centre of mass is the end-effector.
-        objects: Body ids of the movable objects.
+        objects: Body ids of the objects that a reset places.
         object_joints: Indices of the movable joints of every object.
-        markers: Body ids of the markers that show where the objects should go.
+        markers: Body ids of the markers that show the goal.
     """
 
     robot: int

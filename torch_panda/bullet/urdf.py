@@ -237,7 +237,8 @@ def make_scratch_folder() -> Path:
 def urdf_with_tool(file: str, tool: Tool) -> str:
     """Write a copy of a URDF with a tool, and return the path of the copy.
 
-    The tool is the last link of the copy and is named "tool".
+    The tool is named "tool" and is the last link in the file. Its index in Bullet may
+    be another one, because Bullet's order is depth-first.
 
     Raises:
         ValueError: The URDF has no link of the name to which the tool is fixed.

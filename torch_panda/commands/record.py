@@ -102,7 +102,7 @@ def check(args: Args) -> None:
     """Check options before recording starts.
 
     Raises:
-        ValueError: An option is out of its limits, or two do not fit together.
+        ValueError: An option is outside its limits, or two options are incompatible.
     """
     check_limits(args)
     is_generated = args.kind != "expert"

@@ -57,8 +57,8 @@ class Args:
     env_id: str | None = None
     """another task with the same spaces; None means the task of the policy"""
     steps: Positive = 640_000
-    """environment steps to play, rounded up to whole episodes. The last million steps
-    are imitated"""
+    """environment steps to play, rounded up to one episode per environment. Of the
+    episodes that end at a goal of the task, the last million steps are imitated"""
     updates: Positive = 60_000
     """gradient steps of imitation, during which the learning rate falls to 0"""
     batch_size: Positive = 1024

@@ -60,7 +60,8 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
     """Read the command line.
 
     With ``--offline``, the algorithm determines the other options and their defaults.
-    Otherwise preset and task determine the defaults. So these options are read first.
+    Otherwise preset, task and algorithm determine the defaults. So these options are
+    read first.
 
     Raises:
         ValueError: A module of ``--import`` does not exist, or ``--offline`` and the
@@ -159,7 +160,9 @@ def main(args: Args | OfflineArgs) -> None:
         run = make_run(args, out)
         is_tuned = isinstance(args, Args) and args.preset == "tuned"
         if is_tuned and not find_recipe(args.env_id):
-            print(f"{args.env_id} has no recipe: training as in the panda-gym paper")
+            print(
+                f"{args.env_id} has no recipe: using the options of the panda-gym paper"
+            )
         stop = StopSignal()
         with lock_folder(out):
             write_options(out, args, default, resume=args.resume, **preset)

@@ -16,7 +16,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch_panda import RobotTaskEnv
 
 STATE = "observation.state"
-# The achieved goal, then the desired goal. Policies of LeRobot read it beside STATE.
+# The achieved goal, then the desired goal. Policies of LeRobot read it in addition to
+# STATE.
 GOALS = "observation.environment_state"
 PICTURE = "observation.images.scene"
 FPS = 25  # steps per second
@@ -145,7 +146,7 @@ def read(path: Path) -> TensorDict:
     }
     for key, values in observed.items():
         data[key], data["next", key] = values[:-1], values[1:]
-    # The goal of a step, also where the next step pursues another one.
+    # The goal of a step, even if the next step pursues another one.
     data["next", "desired_goal"] = data["desired_goal"]
     transitions: TensorDict
     transitions = TensorDict(data, [len(kept)])[kept]  # type: ignore[assignment]

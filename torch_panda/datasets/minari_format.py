@@ -78,7 +78,7 @@ class Writer:
 
     def _write(self) -> None:
         with warnings.catch_warnings():
-            # Minari warns of missing metadata (author, address, second environment),
+            # Minari warns of missing metadata (author, e-mail, evaluation environment),
             # and Gymnasium that -v1 is older than -v3.
             warnings.filterwarnings("ignore", "`.*` is set to None")
             warnings.filterwarnings("ignore", ".*is out of date")
@@ -134,7 +134,7 @@ def read(path: Path) -> TensorDict:
         for key in OBSERVED:
             values = torch.as_tensor(episode.observations[key])
             data[key], data["next", key] = values[:-1], values[1:]
-        # The goal of a step, also where the next step pursues another one.
+        # The goal of a step, even if the next step pursues another one.
         data["next", "desired_goal"] = data["desired_goal"]
         episodes.append(TensorDict(data, [len(done)]))
     return TensorDict.cat(episodes)

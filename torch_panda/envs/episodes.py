@@ -110,7 +110,8 @@ class Episodes:
             raise ValueError(
                 f'goal="observation" needs a task that declares where the observation '
                 f"holds the achieved goal, but {type(task).__name__} has no "
-                f'goal_entries; set Task.goal_entries, or use goal="task"'
+                "goal_entries, or overrides observation or achieved_goal without "
+                'declaring them again; set Task.goal_entries, or use goal="task"'
             )
         self.robot, self.task = robot, task
         self._control = robot.controller
@@ -128,8 +129,8 @@ class Episodes:
         # Environments that need a reset: new ones, and those whose last reset failed.
         self._needs_reset = set(range(n))
         sensors = read_sensors(sensors, robot)
-        # Not a bound method: the simulation would then refer back to this object, and
-        # the cycle of references would keep a forgotten environment alive.
+        # With a bound method, the simulation would refer back to this object, and the
+        # cycle of references would keep a forgotten environment alive.
         build = partial(build_scene, robot, task, sensors)
         self.simulation = VectorSimulation(
             build, n, num_threads=num_threads, physics=self.physics
@@ -203,6 +204,7 @@ class Episodes:
         Raises:
             ValueError: The state is wrong.
             BulletError: The environment is closed, or another thread is using it.
+            WorkerError: Bullet failed in at least one environment.
         """
         with self._guard:
             self._check_open()
@@ -247,6 +249,7 @@ class Episodes:
         Raises:
             BulletError: The environment is closed or needs a reset; another thread is
                 using it; or the step diverges and ``on_divergence`` is "raise".
+            WorkerError: Bullet failed in at least one environment.
             ValueError: The action has a wrong shape or is not finite.
             TypeError: The action has an integer dtype.
         """

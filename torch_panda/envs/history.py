@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_panda.bullet import BulletError
 
-# An exact state has these keys beside the keys of a plain state.
+# An exact state has these keys in addition to those of a plain state.
 START = "start_"  # prefix of the keys of the state at the start of the episode
 ACTIONS = "actions"
 NUM_ACTIONS = "num_actions"

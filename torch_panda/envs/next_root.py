@@ -7,9 +7,9 @@ from torchrl.envs.utils import _StepMDP
 
 
 class NextRoot(_StepMDP):
-    """torchrl's ``step_mdp`` with a short way for tensordicts that hold only tensors.
+    """torchrl's ``step_mdp`` with a fast path for tensordicts that hold only tensors.
 
-    The short way takes a fifth of the time.
+    The fast path takes a fifth of the time.
 
     Args:
         env: The environment, whose keys are not nested.

@@ -1,4 +1,4 @@
-"""Domain randomization: the physics of every episode are drawn at random.
+"""Domain randomization: each episode has physics parameters drawn at random.
 
 `Randomization` holds the ranges. `PhysicsFactors` multiplies the physics of a client by
 factors. `DomainRandomizer` draws the factors of n environments and applies them.
@@ -46,7 +46,7 @@ _CONSTANT = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
-    """Ranges from which the physics of every episode are drawn.
+    """Ranges from which the physics parameters of every episode are drawn.
 
     A range is the lowest and the highest value of a factor. The factor multiplies the
     nominal value, which the task, the robot or the URDF sets. None keeps the nominal
@@ -59,8 +59,8 @@ class Randomization:
         object_mass: Mass and inertia of all objects.
         object_friction: Lateral friction of all objects and their links. For a
             contact, Bullet multiplies the frictions of the two bodies.
-        table_friction: Lateral friction of the table and the bases of all other fixed
-            bodies.
+        table_friction: Lateral friction of the table, the ground and the bases of all
+            other fixed bodies that are not objects.
         finger_friction: Lateral friction of the robot's ``finger_links``.
         object_restitution: Restitution of all objects. If the nominal value is 0
             (Bullet's default), the drawn number replaces it instead of multiplying it.

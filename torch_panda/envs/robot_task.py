@@ -93,8 +93,8 @@ class RobotTaskEnv(EnvBase):
         terminate_on_success: Whether success ends an episode, as in panda-gym 3. In
             panda-gym's paper, episodes continue after success.
         physics: How Bullet integrates: "exact" as in panda-gym, "fast", or parameters.
-        sensors: Sensors to observe beside ``observation``, each under its own keys. A
-            sensor without arguments may be given by its name.
+        sensors: Sensors to observe in addition to ``observation``, each under its own
+            keys. A sensor without arguments may be given by its name.
         observe_state: Whether the outputs have ``observation``. Set False, for example,
             to learn from pictures only. The goals are always observed.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer.
@@ -108,8 +108,8 @@ class RobotTaskEnv(EnvBase):
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
             and ``desired_goal`` full observations: the desired goal is the observation
             of a state in which the task's goal is reached, with the objects at their
-            goals and at rest, and the hand in its neutral pose (in Reach at the goal).
-            Reward and success stay the task's, computed from the numbers at
+            goals and at rest, and the end-effector in its neutral pose (in Reach at the
+            goal). Reward and success stay the task's, computed from the numbers at
             `goal_indices`. The ``desired_goal`` in states (`get_state`, `reset`) stays
             the task's goal.
 
@@ -293,7 +293,7 @@ class RobotTaskEnv(EnvBase):
         if not set_state or tensordict is None or kwargs.get("select_reset_only"):
             return super().reset(tensordict, set_state=set_state, **kwargs)
         # torchrl's reset would keep the entries of this tensordict for environments
-        # that are not reset. But here they are those of a state, and its
+        # that are not reset. But this tensordict holds a state, whose
         # ``desired_goal`` is not the goal of these environments.
         self._assert_tensordict_shape(tensordict)
         start = self._reset(tensordict, set_state=True, **kwargs)
@@ -409,7 +409,8 @@ class RobotTaskEnv(EnvBase):
             ``physics_seed`` (*batch, 1) int64.
 
         Raises:
-            BulletError: The environment is closed or needs a reset.
+            BulletError: The environment is closed or needs a reset, or an episode is
+                too long for an exact state.
         """
         return self._emit(self.episodes.get_state(exact=exact))
 
@@ -457,8 +458,8 @@ class RobotTaskEnv(EnvBase):
         """The numbers in segmentations, by name.
 
         The shipped tasks have ``nothing`` (-1), ``robot``, ``ground``, ``table``, and
-        ``object`` (``object1`` and ``object2`` in Stack). A task can give a body
-        another name with `Visual.name`.
+        the objects, such as ``object`` in Push, and ``object1`` and ``object2`` in
+        Stack. A task can give a body another name with `Visual.name`.
         """
         from torch_panda.rendering.env_renderer import segmentation_ids
 
@@ -538,8 +539,8 @@ class RobotTaskEnv(EnvBase):
                 connect.
             port: First port to try; the viewer takes the next free one, see ``url``.
             allowed_hosts: Names of this machine under which browsers may open the page,
-                beside ``host`` and the loopback names. Requests under any other name
-                are refused, and so are requests that a page of another site sends.
+                in addition to ``host`` and the loopback names. Requests under any other
+                name are refused, and so are requests that a page of another site sends.
 
         Raises:
             ImportError: viser is not installed.

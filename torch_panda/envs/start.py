@@ -23,7 +23,7 @@ class EpisodeStarts:
     """Draws the starts of n environments' episodes and resets the simulation to them.
 
     The robot starts in its neutral pose. The task draws the goal, the objects and their
-    joints, and the randomizer draws the physics.
+    joints. The randomizer draws the physics, and offsets of the robot's joints.
 
     Attributes:
         goal: Desired goals of the present episodes, (n, goal_dim) float64.

@@ -15,7 +15,7 @@ class StateSupport:
 
     torchrl asks an environment whether its resets may start from a state. The wrappers
     `TransformedEnv`, `SerialEnv` and `ParallelEnv` give the answer of the environment
-    that they wrap, also if it runs in another process.
+    that they wrap, even if it runs in another process.
 
     torchrl evaluates the answer as a boolean in every reset of a wrapper, before the
     wrapper passes the state on. `__bool__` uses this moment to raise an error if the
@@ -23,7 +23,8 @@ class StateSupport:
     arguments of the reset, so `__bool__` reads them from the calling function.
 
     Args:
-        observed: Keys of `BODY_KEYS` under which the environment has observations.
+        observed: Keys of the entries that the environment observes in addition to
+            ``observation`` and the goals.
     """
 
     def __init__(self, observed: frozenset[str]) -> None:

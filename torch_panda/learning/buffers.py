@@ -63,11 +63,11 @@ def make_buffer(
 
     Args:
         env: Environment whose transitions will be stored.
-        capacity: Number of transitions, at most `BUFFER_SIZE`.
+        capacity: Number of transitions. A number above `BUFFER_SIZE` is reduced to it.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
             the goal is relabelled. "geometric" gives every sampled transition the goal
-            achieved k steps later in its episode, with a probability in proportion to
+            achieved k steps later in its episode, with probability proportional to
             discount**k. "none" keeps the original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of random
             transitions. The rest are goals achieved later in the same episode.

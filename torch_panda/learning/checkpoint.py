@@ -189,8 +189,8 @@ def write_options(
 
     Its entry ``changed`` has the options that differ from ``default``, for the legends
     of plots. The entries ``more`` are written too. If a run is resumed, its file keeps
-    its entries, such as a label, and gets the new value of ``total_steps``. Before, the
-    run must have checked that its other options are the same (see `check_same`).
+    its entries, such as a label, and gets the new value of ``total_steps``. Call
+    `check_same` first, which checks that the other options are the same.
 
     Raises:
         OSError: The file cannot be written.

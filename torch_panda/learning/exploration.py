@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 # Two corners of the box from which points are drawn, in the world frame [m]. The box is
-# over the middle of the table.
+# around the origin, where the objects start.
 LOWEST_POINT, HIGHEST_POINT = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
 # Half of the points are near an object: at most OBJECT_DISTANCE from its centre along x
 # and along y, and up to the heights in OBJECT_HEIGHTS below and above its centre [m].
@@ -25,8 +25,8 @@ NEAR_OBJECTS = 0.5
 OBJECT_DISTANCE = 0.1
 OBJECT_HEIGHTS = (-0.02, 0.06)
 # In its first WARM_UP steps, each environment always moves to points, so that the
-# replay buffer soon has many contacts. In a training, torchrl's collector uses up one
-# of these steps when it is made.
+# replay buffer soon has many contacts. During training, torchrl's collector uses up
+# one of these steps when it is made.
 WARM_UP = 250
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point

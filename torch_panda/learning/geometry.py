@@ -21,7 +21,7 @@ from torch_panda.tasks.base import Quantity
 
 OBSERVED = ("observation", "desired_goal")
 
-# Factors that mirror a quantity in the plane y = 0, in which robot and table are
+# Factors that mirror a quantity across the plane y = 0, about which robot and table are
 # symmetric.
 _MIRROR: dict[Quantity, tuple[float, ...]] = {
     "position": (1.0, -1.0, 1.0),
@@ -51,14 +51,14 @@ class Part(NamedTuple):
 class Geometry:
     """Layout and symmetry of observations, goals and actions.
 
-    The robot and the table are symmetric in the plane y = 0. Multiplying a vector by
-    its factors, which are 1 and -1, mirrors it in this plane.
+    The robot and the table are symmetric about the plane y = 0. Multiplying a vector by
+    its factors, which are 1 and -1, mirrors it across this plane.
 
     Attributes:
         points: Indices of the coordinates of all objects and goals, in the
             concatenation of observation and goal.
         origins: Indices of the coordinates that are subtracted from ``points``: the
-            hand's for an object, and the object's for its goal.
+            hand's for an object, and the object's (in Reach the hand's) for its goal.
         observation: Factors that mirror an observation, (observation size,).
         goal: Factors that mirror a goal, (goal size,).
         action: Factors that mirror an action, (action size,); None for joint control.

@@ -31,7 +31,8 @@ class Hyperparameters:
     """hidden layers of actors and critics: three of 256 units ("paper"), the same with
     LayerNorm ("layer-norm"), or three of 448 units with LayerNorm ("wide")"""
     target_interval: Positive = 1
-    """gradient steps between two updates of the target networks. CRL has none"""
+    """gradient steps between two updates of the target networks (CRL has no target
+    networks)"""
     action_l2: Weight = 1.0
     """DDPG, TD3, CRL: weight of the mean squared action in the actor's loss"""
     ema_rate: Ratio = 0.0

@@ -1,4 +1,4 @@
-"""Options of a training, and checks of their values."""
+"""Options of a training run, and checks of their values."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +41,7 @@ class Args(Hyperparameters):
     """hindsight goals. "relabel" relabels four of five transitions when they are
     sampled. "parts" does the same with a separate draw for each object's part of the
     goal. "geometric", the default of CRL, relabels every transition with the goal
-    achieved k steps later, with a probability in proportion to gamma**k. "none" uses no
+    achieved k steps later, with probability proportional to gamma**k. "none" uses no
     hindsight"""
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of random transitions. The
@@ -96,7 +96,7 @@ class Args(Hyperparameters):
 
 
 # CRL needs these goals: the critic's positive goals are achieved k steps later in the
-# same episode, with a probability in proportion to gamma**k.
+# same episode, with probability proportional to gamma**k.
 CRL_OPTIONS: dict[str, Any] = {"her": "geometric", "desired_ratio": 0.0}
 
 
@@ -136,7 +136,7 @@ def check(args: Args) -> None:
     """Check options before the training starts.
 
     Raises:
-        ValueError: An option is out of its limits, or two do not fit together.
+        ValueError: An option is outside its limits, or two options are incompatible.
     """
     check_limits(args)
     check_exploration(args, args.num_envs)

@@ -36,11 +36,11 @@ DASHES = ("-", "--", ":", "-.")
 MARKERS = ("", "s", "^", "D", "v", "P", "X", "*")
 
 Curves = dict[str, list[Curve]]
-"""The curves of all seeds, by the label of the way to train."""
+"""The curves of all seeds, by the label of the options."""
 Runs = dict[str, dict[str, Curves]]
-"""Curves by algorithm, by task."""
+"""Curves by task, then by algorithm."""
 Line = tuple[str, str]
-"""Algorithm and way to train."""
+"""Algorithm and label of the options."""
 Panel = dict[Line, list[Curve]]
 """The curves of all seeds, by line."""
 
@@ -79,7 +79,7 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     """
     panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
     lines = [line for _, panel in panels for line in panel]
-    # The first 28 ways to train differ in dashes or colour.
+    # The first 28 sets of options differ in dashes or colour.
     looks = itertools.cycle(itertools.product(DASHES, COLORS))
     ways = dict(zip(dict.fromkeys(way for _, way in lines), looks, strict=False))
     names = sorted({algo for algo, _ in lines})
@@ -203,7 +203,7 @@ def read_runs(folders: list[Path]) -> Runs:
 
 
 def line_label(preset: str, changed: dict[str, object]) -> str:
-    """Label of a way to train: its preset and the options that differ from it."""
+    """Label of a set of options: its preset and the options that differ from it."""
     parts = [preset]
     for key, value in changed.items():
         name = key.replace("_", " ")

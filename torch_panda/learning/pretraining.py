@@ -36,8 +36,7 @@ def pretrain(
         demos: Demonstrations.
         updates: Total number of gradient steps, including the steps before a resume.
         batch_size: Transitions per gradient step.
-        learning_rate: Learning rate of the first step, as a fraction of the learning
-            rate of training.
+        learning_rate: Learning rate of the first step, divided by `LEARNING_RATE`.
         stop: Object that becomes true to end the imitation early, such as `StopSignal`.
     """
     agent, progress = checkpoint.agent, checkpoint.progress

@@ -30,8 +30,7 @@ class Spaces:
         has_free_gripper: Whether the last number of an action moves the fingers.
         has_sparse_reward: Whether every reward is -1 or 0.
         geometry: Layout of observation, goal and action; None if it is unknown.
-        action_scale: Displacement that an action of 1 causes in one step, [m] for the
-            end-effector and [rad] for joints.
+        action_scale: What an action of 1 means; see `Robot`.
         moves_joints: Whether actions are displacements of joints, and not of the
             end-effector.
     """

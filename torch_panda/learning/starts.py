@@ -57,8 +57,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
         ``number``.
 
     Raises:
-        ValueError: The task has no objects on the table, or the robot is not under
-            end-effector control.
+        ValueError: The task is not Push, PickAndPlace, Slide, Stack or Flip, or the
+            robot is not under end-effector control.
     """
     generator = torch.Generator().manual_seed(seed)
 

@@ -1,6 +1,6 @@
 """Videos of a policy in several environments side by side.
 
-Each environment has a cell of the picture, whose frame is green while its goal is
+Each environment has a cell of the picture, whose border is green while its goal is
 reached. Markers of goals are translucent.
 """
 

@@ -62,7 +62,8 @@ class Robot(Configured):
 
     Args:
         urdf: Path of the URDF, or its name among the files that pybullet ships.
-        neutral_joint_position: Start position of each movable joint [rad] or [m].
+        neutral_joint_position: Start position of each movable joint [rad] or [m], in
+            Bullet's order (see `PhysicsClient.joints`).
         joint_forces: Largest torque [N m] or force [N] of each movable joint's motor.
         ee_link: Index of the link whose centre of mass is the end-effector.
         ee_orientation: Orientation that the end-effector keeps under the control type
@@ -136,7 +137,9 @@ class Robot(Configured):
         if action_scale is None:
             action_scale = _ACTION_SCALES[control_type]
         if not 0 < action_scale < math.inf:
-            raise ValueError(f"action_scale must be above 0, got {action_scale}")
+            raise ValueError(
+                f"action_scale must be finite and above 0, got {action_scale}"
+            )
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
         self.joint_forces = tuple(map(float, joint_forces))

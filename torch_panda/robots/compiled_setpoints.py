@@ -84,7 +84,8 @@ def has_compiled_width(robot: Robot) -> bool:
     """Whether C can compute the distance between the fingers of a free gripper."""
     gripper = robot.gripper
     # The width is a weighted sum of the positions of the fingers' joints. For more than
-    # two joints, the order in which torch adds is unknown. C code has no followers.
+    # two joints, the order in which torch adds is unknown. The C code does not support
+    # ``followers``.
     return (
         type(gripper) is Gripper and gripper.num_joints == 2 and not gripper.followers
     )

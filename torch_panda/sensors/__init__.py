@@ -1,4 +1,4 @@
-"""Sensors: observations beside the state of robot and task."""
+"""Sensors: observations in addition to the state of robot and task."""
 
 from torch_panda.sensors.base import Entry, Observer, Reading, Sensor, join_entries
 from torch_panda.sensors.cameras import CameraSensor

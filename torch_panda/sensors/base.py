@@ -102,7 +102,8 @@ def join_entries(
             )
         if shared := entries.keys() & observer.entries.keys():
             raise ValueError(
-                f"two sensors observe {sorted(shared)}; give cameras different names"
+                f"{sorted(shared)} are observed twice; give cameras different names, "
+                "or rename entries of extra_observation"
             )
         entries |= observer.entries
     return entries

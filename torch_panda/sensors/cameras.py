@@ -23,8 +23,9 @@ class CameraSensor(Sensor):
         camera: View and size, the same in all environments. The default is panda-gym's
             view in 64 x 64 pixels.
         pixels: Observe ``pixels``, (height, width, 3) uint8.
-        depth: Observe ``depth``, (height, width, 1) float32: the distance along the
-            line of sight [m], or ``camera.far`` where there is nothing.
+        depth: Observe ``depth``, (height, width, 1) float32: the distance from the
+            camera along its optical axis [m] (z-depth, not the length of a ray), or
+            ``camera.far`` where there is nothing.
         segmentation: Observe ``segmentation``, (height, width, 1) int32: the body ids
             that ``segmentation_ids`` names, or -1 where there is nothing.
         name: Name of the camera if there are several. The name "wrist" observes

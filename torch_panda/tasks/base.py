@@ -31,8 +31,8 @@ OBJECT_LAYOUT: tuple[Quantity, ...] = (
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
 """A function of achieved and desired goals, both (..., goal_dim), to (..., 1)."""
 
-# The environment looks these methods up in the class of a task: it never calls a hook
-# that the class does not override, and C code may do the work of the others.
+# The environment looks these methods up in the class of a task. It skips a hook that
+# the class does not override, and C code may replace the other inherited methods.
 _CLASS_METHODS = (
     "observation",
     "achieved_goal",
@@ -51,9 +51,10 @@ class Bodies(NamedTuple):
     """Body ids of the bodies that a task has built in a client.
 
     Attributes:
-        objects: Movable objects, in the order of ``simulation.object_pose``. Their
-            joints are part of the state too. A movable body that is not listed starts
-            every episode where `Task.build` put it, and states do not hold it.
+        objects: Bodies that `Task.sample_objects` places, in the order of
+            ``simulation.object_pose``. Their joints are part of the state too. A
+            movable body that is not listed starts every episode where `Task.build` put
+            it, and states do not hold it.
         markers: Bodies without collisions that show the goal.
     """
 
@@ -171,7 +172,7 @@ class Task(Configured, ABC):
 
         Returns:
             The ids of the objects and the markers. The ground, the table and other
-            fixed bodies are not among them.
+            bodies that stay where this method puts them are not among them.
         """
 
     def sample_start(self, rng: np.random.Generator) -> Start:
@@ -262,7 +263,7 @@ class Task(Configured, ABC):
         return torch.zeros(simulation.num_envs, 1, dtype=torch.bool, device="cpu")
 
     def extra_observation(self, simulation: VectorSimulation) -> dict[str, Tensor]:
-        """Further observed entries beside ``observation``. Optional.
+        """Entries to observe in addition to ``observation``. Optional.
 
         Returns:
             Tensors (num_envs, ...) by key. A float64 tensor is observed as float32.

@@ -35,8 +35,8 @@ class Drawer(Task):
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
         distance_threshold: Distance below which a goal is reached [m].
-        cabinet_x_range: Range of the cabinet's position along x [m].
-        cabinet_y_range: Range of the cabinet's position along y [m].
+        cabinet_x_range: Width of the range of the cabinet's x coordinate [m].
+        cabinet_y_range: Width of the range of the cabinet's y coordinate [m].
         min_change: Smallest distance between start and goal, at most 0.125 [m].
         drawer_mass: Mass of the drawer [kg].
         drawer_friction: Friction force of the slide [N].

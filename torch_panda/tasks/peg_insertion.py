@@ -26,8 +26,8 @@ HOLE_WIDTH = 0.021  # edge length of the square hole [m]
 HOLE_DEPTH = 0.05  # height of the block that the hole goes through [m]
 PEG_LENGTH = 0.08  # [m]
 # Distance between the fingers throughout an episode [m]. It is a little less than the
-# width of the peg, so the fingers press on the peg. If it were much less, the peg could
-# slip from one finger towards the other.
+# width of the peg (with the default clearance), so the fingers press on the peg. If it
+# were much less, the peg could slip from one finger towards the other.
 GRASP_WIDTH = 0.0198
 # Centre of the peg at the start, world frame [m]. The end-effector of a neutral Panda
 # is at (0.0384, 0, 0.1974), so the fingers hold the upper part of the peg.

@@ -1,4 +1,4 @@
-"""Faster dynamics, kinematics and broad phase for Bullet, with the same bits.
+"""Faster dynamics, kinematics and broad phase for Bullet, equal bit for bit.
 
 `activate` replaces eight of Bullet's functions in this process if all conditions of
 ``gate.py`` hold. From then on, all clients of the process run the replacements, also

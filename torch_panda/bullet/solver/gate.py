@@ -106,7 +106,7 @@ class SolverStatus(NamedTuple):
 
     def __str__(self) -> str:
         if self.name == "packed":
-            return "packed: faster than Bullet's own, the same bits"
+            return "packed: faster than Bullet's own, equal bit for bit"
         return f"bullet: {self.reason}"
 
 

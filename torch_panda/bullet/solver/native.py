@@ -9,7 +9,9 @@ from typing import NamedTuple
 # sources of this version.
 VERSION = 7
 
-# ``enum mode`` in hook.c
+# ``enum mode`` in hook.c. A thread in the mode FOLLOW runs Bullet's functions or the
+# replacements, as `SolverLibrary.enable` chose. PROBE checks Bullet's layout, SOLVE
+# always runs the replacements, and LEAVE always runs Bullet's functions.
 FOLLOW, PROBE, SOLVE, LEAVE = range(4)
 
 # ``enum btMultibodyLink::eFeatherstoneJointType``

@@ -113,7 +113,9 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
     if counts.joints <= counts.bullet_joints or not counts.manifolds:
         raise GateError("the packed solver did not create the rows of the self-test")
     if counts.bodies != _NUM_STEPS:
-        raise GateError("the packed solver did not accelerate the arm of the self-test")
+        raise GateError(
+            "the packed solver did not compute the accelerations of the self-test"
+        )
     # The first of Bullet's answers creates numbers that the replacement reads.
     if (counts.answers, counts.bullet_answers) != (_NUM_STEPS - 1, 1):
         raise GateError(

@@ -9,7 +9,7 @@ of reaching g after (s, a), and p(g) is the frequency of g in the batches. So f 
 actions as Q does, and the actor ascends f.
 
 The distance in f and the loss of the critic are those of JaxGCRL (arXiv 2408.11052).
-The first paper, and `torch_panda.learning.offline.crl`, have an inner product and a
+arXiv 2206.07568 and `torch_panda.learning.offline.crl` use an inner product and a
 binary loss. With these, Reach had 39 % success after 3,200 steps instead of 100 % (one
 seed each).
 """

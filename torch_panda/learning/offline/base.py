@@ -59,7 +59,7 @@ class OfflineHyperparameters:
     actor_goal: Literal["future", "geometric"] = "future"
     """how to draw the goals of the policy among those achieved later in the episode.
     "future", as in OGBench: all are equally likely. "geometric": the goal achieved k
-    steps later has a probability in proportion to discount**k"""
+    steps later has probability proportional to discount**k"""
     relative_inputs: RelativeInputs = "fine"
     """additional inputs of the networks. "coarse" adds the offsets from the hand to
     objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
@@ -291,7 +291,8 @@ def ensemble_loss(q: Tensor, v: Tensor, v_target: Tensor, expectile: float) -> T
 
     HIQL's paper (2307.11949, eq. 4) has one value function. Here there are two, as in
     OGBench, and each regresses to its own target. Both squared errors have the same
-    weight. Its advantage is the smaller target minus the mean of the two ``v_target``.
+    weight, which depends on the advantage: the smaller target minus the mean of the two
+    ``v_target``.
 
     Args:
         q: Targets r + discount * mask * V(s', g) of the target networks, (2, n).

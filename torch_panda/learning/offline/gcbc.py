@@ -1,6 +1,6 @@
 """Goal-conditioned behavioural cloning, GCBC.
 
-One iteration of the paper's GCSL (arXiv 1912.06088) on fixed data.
+GCBC is one iteration of GCSL (arXiv 1912.06088) on fixed data.
 
 The policy imitates every action of the data, given a goal that its episode achieves
 later.

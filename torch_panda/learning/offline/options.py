@@ -1,4 +1,4 @@
-"""Options of ``train --offline``, and checks that they fit together."""
+"""Options of ``train --offline``, and checks of their values."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -18,7 +18,8 @@ class OfflineArgs(OfflineHyperparameters):
     """Options of offline training: algorithm, data, duration and folder."""
 
     algo: str = "gcivl"
-    """algorithm"""
+    """algorithm: "gcbc", "gcivl", "gciql", "hiql", "qrl" or "crl". Each has options of
+    its own: `train --offline --algo hiql --help`"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     data: str = "noisy"
