@@ -106,8 +106,9 @@ def has_moved(data: TensorDictBase) -> Tensor:
     """Find the sequences in which the achieved goal changes.
 
     If no object moves in an episode, all its hindsight goals are achieved from the
-    start. Such episodes teach little (arXiv 2012.08850). A sequence of several episodes
-    nearly always counts as changed, because every reset places the objects anew.
+    start. Such episodes teach little (doi 10.20517/ir.2023.10, figure 3). A sequence of
+    several episodes nearly always counts as changed, because every reset places the
+    objects anew.
 
     Args:
         data: Successive steps of each environment, [num_envs, steps].
