@@ -9,9 +9,14 @@ import torch_panda
 pytestmark = pytest.mark.usefixtures("loop")
 
 
-def make(on_divergence):
+def make(on_divergence, **options):
     return torch_panda.make(
-        "PandaPush-v1", num_envs=3, num_threads=2, seed=0, on_divergence=on_divergence
+        "PandaPush-v1",
+        num_envs=3,
+        num_threads=2,
+        seed=0,
+        on_divergence=on_divergence,
+        **options,
     )
 
 
@@ -85,6 +90,23 @@ def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
                 for _ in range(2):
                     theirs = other.reset(theirs.set("_reset", only_1))
                 theirs = theirs.exclude("_reset")
+
+
+@pytest.mark.parametrize("goal", ["task", "observation"])
+def test_the_last_transition_keeps_its_goal(goal):
+    with make("reset", goal=goal) as env:
+        start = env.reset()
+        step(env)
+        blow_up(env, 1, "object")
+        following = step(env)
+        assert following["truncated"].flatten().tolist() == [False, True, False]
+        assert torch.equal(following["desired_goal"], start["desired_goal"])
+        reward = env.compute_reward(following["achieved_goal"], start["desired_goal"])
+        assert torch.equal(following["reward"], reward)
+        only_1 = torch.tensor([[False], [True], [False]])
+        new = env.reset(following.set("_reset", only_1))
+        is_new = (new["desired_goal"] != start["desired_goal"]).any(1)
+        assert is_new.tolist() == [False, True, False]
 
 
 def test_a_step_returns_only_stepped_clients():

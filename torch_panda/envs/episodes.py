@@ -259,12 +259,17 @@ class Episodes:
             envs = None if step_mask is None else indices(step_mask)
             self._history.record(action, step_mask)
             if diverged := self._advance(action, envs):
+                ended = [goal[diverged] for goal in self._goals]
                 self._recover(diverged)
+                started = [goal[diverged] for goal in self._goals]
+                # Observe the next episodes with the goals that the policy pursued.
+                self._set_goals(diverged, ended)
             self._observer.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe(action)
             if step_mask is not None:
                 observed["reward"] = observed["reward"] * step_mask
             if diverged:
+                self._set_goals(diverged, started)
                 # `observed` shows the start of these environments' next episodes. A
                 # success there is not a success of this step.
                 observed["success"][diverged] = observed["terminated"][diverged] = False
@@ -336,6 +341,17 @@ class Episodes:
             self._goal_observer.update(envs, self._starts.goal)
         self._starts.reset_simulation(envs)
         self._observer.after_reset(envs)
+
+    @property
+    def _goals(self) -> list[Tensor]:
+        """Desired goals, (n, ...): the task's, and the observations of them."""
+        observer = self._goal_observer
+        return [self._starts.goal] + ([] if observer is None else [observer.desired])
+
+    def _set_goals(self, envs: list[int], values: list[Tensor]) -> None:
+        """Set the rows of `_goals` that belong to some environments."""
+        for goal, rows in zip(self._goals, values, strict=True):
+            goal[envs] = rows
 
     def _observe(self, action: Tensor | None = None) -> Observed:
         starts = self._starts

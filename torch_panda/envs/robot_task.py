@@ -101,8 +101,9 @@ class RobotTaskEnv(EnvBase):
         on_divergence: What happens when a step leaves an environment in a state that
             is not finite. In any case, the environment starts its next episode.
             "raise": the step raises `BulletError`. "reset": the step returns the first
-            observation of the next episode, and the reward of this observation;
-            ``success`` is False and ``truncated`` is True.
+            observation of the next episode, but with the ``desired_goal`` of the ended
+            episode, and the reward of both; ``success`` is False and ``truncated`` is
+            True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``
