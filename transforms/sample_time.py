@@ -71,6 +71,15 @@ class SampleTimeTransform(BufferTransform):
             batch = self._remember(batch, stored)  # type: ignore[arg-type]  # rows
         return batch.squeeze(-1) if is_one_item else batch
 
+    def _forget(self) -> None:
+        super()._forget()
+        self._last_write = 0, 0
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores the state that `get_extra_state` returned."""
+        super().set_extra_state(state)
+        self._last_write = 0, 0
+
     def _count_stored(self, buffer: ReplayBuffer | None) -> int:
         """Returns how many transitions the buffer holds."""
         if buffer is not None and not isinstance(buffer, ReplayBufferEnsemble):

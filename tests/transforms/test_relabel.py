@@ -611,6 +611,17 @@ def test_new_collector_after_a_reload(how, rooted, tmp_path):
     check_batch(new.sample(), new.storage[:], "future")
 
 
+def test_an_earlier_checkpoint_is_loaded_into_the_same_buffer(tmp_path):
+    rb, envs = make_buffer(), Envs(3, [5, 9])
+    rb.extend(envs.chunk(10).reshape(-1))
+    rb.dumps(tmp_path)
+    for steps in (10, 20):
+        rb.extend(envs.chunk(steps).reshape(-1))
+        rb.loads(tmp_path)
+        check_batch(rb.sample(), rb.storage[:], "future")
+    assert relabelled(rb.sample()).any()
+
+
 @pytest.mark.parametrize("forgets", [False, True])
 def test_emptied_buffer(forgets):
     rb, envs = make_buffer(100, strategy="random"), Envs(3, [5, 9, 40])
