@@ -304,7 +304,7 @@ def _check_layout(
             "the last dimension of a storage must be time, got dim_extend="
             f"{buffer.dim_extend} for ndim={ndim}: make the buffer without dim_extend="
         )
-    if data.ndim not in (ndim - 1, ndim):
+    if data.ndim != ndim and (method != "add" or data.ndim != ndim - 1):
         raise RuntimeError(
             f"data {list(data.shape)} for ndim={ndim} must have as many dimensions as "
             "the storage: call extend(data.reshape(-1)) with ndim=1, or use ndim=2 for "

@@ -188,6 +188,7 @@ def test_slices_with_goals_per_row_warn_once(unit):
         (HindsightAugment, {"ndim": 2}, "ndim=1"),
         (HindsightRelabel, {}, r"\[2, 8\] for ndim=1.*reshape.*ndim=2"),
         (HindsightRelabel, {"ndim": 2, "dim_extend": 0}, "dim_extend=0 for ndim=2"),
+        (HindsightRelabel, {"ndim": 3}, r"\[2, 8\] for ndim=3.*reshape.*ndim=1"),
     ],
 )
 def test_layouts_that_are_refused_at_once(hindsight, options, message):
