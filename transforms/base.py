@@ -20,6 +20,7 @@ from torch_panda.transforms.data_checks import (
     MULTI_STEP_ERROR,
     DataCheck,
     check_goals_agree,
+    check_ids_differ,
     check_time_is_last,
 )
 from torch_panda.transforms.goal_memory import GoalMemory
@@ -304,7 +305,8 @@ class BufferTransform(envs.Transform):
                 this kind.
             KeyError: Entries are missing in the data.
             ValueError: The goals have a wrong type, or do not fit `goal_parts`; or data
-                without trajectory ids are [time, num_envs].
+                without trajectory ids are [time, num_envs]; or environments share
+                trajectory ids.
         """
         chain = get_chain(self)
         if any(isinstance(t, envs.MultiStepTransform) for t in chain):
@@ -327,7 +329,11 @@ class BufferTransform(envs.Transform):
             )
         if torch.bfloat16 in (achieved.dtype, desired.dtype):
             raise ValueError("hindsight cannot hold goals of bfloat16: use float32")
-        if batch.ndim == 2 and batch.get(self.trajectory_key, None) is None:
+        ids = batch.get(self.trajectory_key, None)
+        # torchrl's multi-process collectors first write a batch of zeros.
+        if ids is not None and achieved.any():
+            check_ids_differ(ids, batch.shape, self.trajectory_key)
+        if ids is None and batch.ndim == 2:
             check_time_is_last(batch, self._rewriter)
 
     def _get_ids(self, flat: TensorDictBase, shape: torch.Size) -> Integers:

@@ -96,6 +96,30 @@ def check_time_is_last(batch: TensorDictBase, rewriter: Rewriter) -> None:
         )
 
 
+def check_ids_differ(ids: Tensor, shape: torch.Size, key: NestedKey) -> None:
+    """Checks that no two environments have the same trajectory id at the same step.
+
+    Args:
+        ids: Trajectory ids of transitions, one per transition.
+        shape: Batch shape of the transitions, [*environments, time].
+        key: Key of the ids.
+
+    Raises:
+        ValueError: Two environments have the same id.
+    """
+    if len(shape) < 2 or ids.numel() != shape.numel():
+        return
+    ordered, _ = ids.reshape(-1, shape[-1]).sort(0)
+    shared = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(shared):
+        raise ValueError(
+            f"several environments have the trajectory id {int(shared[0])} at {key!r} "
+            f"at the same step of data {list(shape)}, so their episodes would be taken "
+            "for one: make the ids unique, for example episode * num_envs + "
+            "environment; or leave them out, if the data are [num_envs, time]"
+        )
+
+
 class DataCheck:
     """Checks the first batches for entries that relabelling would make wrong.
 

@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -22,6 +23,7 @@ from torchrl.envs import (
     ParallelEnv,
     SelectTransform,
     SerialEnv,
+    TrajCounter,
     TransformedEnv,
 )
 
@@ -195,6 +197,26 @@ def test_layouts_that_are_refused_at_once(hindsight, options, message):
     rb, data = buffer(hindsight(reward_fn), **options), Envs(2, [4]).chunk(8)
     with pytest.raises(RuntimeError, match=message):
         rb.extend(data.reshape(-1) if "sampler" in options else data)
+
+
+def count_trajectories(first_env):
+    env = toy.ToyEnv(3, first_env)
+    return TransformedEnv(env, TrajCounter())
+
+
+@BOTH
+def test_ids_that_environments_share_are_refused(hindsight):
+    workers = [partial(count_trajectories, first_env) for first_env in (1, 2)]
+    data = SerialEnv(2, workers).rollout(20, break_when_any_done=False)
+    data["next", "reward"] = reward_fn(
+        data["next", "achieved_goal"], data["desired_goal"]
+    )
+    ndim = 3 if hindsight is HindsightRelabel else 1
+    rb = buffer(hindsight(reward_fn, trajectory_key="traj_count"), ndim=ndim)
+    with pytest.raises(ValueError, match=r"id 0 at 'traj_count'.*make .* unique"):
+        rb.extend(data)
+    data["traj_count"][1] += 1000
+    rb.extend(data)
 
 
 def test_data_with_time_first_are_refused():
