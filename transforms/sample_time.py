@@ -67,6 +67,7 @@ class SampleTimeTransform(BufferTransform):
         with self._lock:
             self._claim(buffer)
             stored = self._count_stored(buffer)
+            self._check_last_write(buffer, stored)
             self._last_write = stored, batch.shape.numel()
             batch = self._remember(batch, stored)  # type: ignore[arg-type]  # rows
         return batch.squeeze(-1) if is_one_item else batch
@@ -89,6 +90,32 @@ class SampleTimeTransform(BufferTransform):
         # samples.
         count = self._memory.count
         return min(count, self.capacity or count)
+
+    def _check_last_write(self, buffer: ReplayBuffer | None, stored: int) -> None:
+        """Checks that the buffer has appended all rows of the last write.
+
+        Otherwise the memory counts rows that the buffer does not hold, and takes rows
+        that it does hold for overwritten ones, which keep their goals.
+
+        Args:
+            buffer: The buffer.
+            stored: Number of transitions in the buffer.
+
+        Raises:
+            RuntimeError: Some of the rows are missing, or replaced other rows.
+        """
+        if buffer is None or isinstance(buffer, ReplayBufferEnsemble):
+            return
+        before, written = self._last_write
+        added = stored - before
+        expected = min(written, buffer.storage.max_size - before)
+        if 0 < added < expected and buffer.storage.ndim == 1:
+            name = type(self).__name__
+            raise RuntimeError(
+                f"{written} rows passed through {name}, but the buffer has appended "
+                f"only {added}: put transforms that drop rows after {name}; do not use "
+                "a ConsumingSampler or consume_after_n_samples"
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Gives sampled transitions other goals."""

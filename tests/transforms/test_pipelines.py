@@ -24,6 +24,7 @@ from torchrl.envs import (
     SelectTransform,
     SerialEnv,
     TrajCounter,
+    Transform,
     TransformedEnv,
 )
 
@@ -217,6 +218,33 @@ def test_ids_that_environments_share_are_refused(hindsight):
         rb.extend(data)
     data["traj_count"][1] += 1000
     rb.extend(data)
+
+
+class KeepEveryThird(Transform):
+    def _inv_call(self, tensordict):
+        return tensordict[::3]
+
+
+def test_dropping_rows_before_hindsight_is_refused():
+    rb = buffer(Compose(KeepEveryThird(), HindsightRelabel(reward_fn)))
+    envs = Envs(2, [4])
+    rb.extend(envs.chunk(9).reshape(-1))
+    with pytest.raises(RuntimeError, match=r"18 rows.*only 6: .*after Hindsight"):
+        rb.extend(envs.chunk(9).reshape(-1))
+    rb = buffer(Compose(HindsightRelabel(reward_fn), KeepEveryThird()))
+    for _ in range(20):
+        rb.extend(envs.chunk(9).reshape(-1))
+    check_batch(rb.sample(), rb.storage[:], "future")
+
+
+def test_a_buffer_that_consumes_rows_is_refused():
+    rb = buffer(HindsightRelabel(reward_fn), consume_after_n_samples=1, batch_size=8)
+    envs = Envs(2, [4])
+    rb.extend(envs.chunk(9).reshape(-1))
+    rb.sample()
+    rb.extend(envs.chunk(9).reshape(-1))
+    with pytest.raises(RuntimeError, match=r"18 rows.*only 10: .*consume_after_n"):
+        rb.extend(envs.chunk(9).reshape(-1))
 
 
 def test_data_with_time_first_are_refused():
