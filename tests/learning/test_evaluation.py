@@ -69,6 +69,21 @@ def test_a_function_may_be_the_policy(tasks):
     assert torch.equal(results[0].returns, results[1].returns)
 
 
+def test_a_policy_in_training_mode_is_not_changed():
+    norm, frozen = torch.nn.BatchNorm1d(3), torch.nn.Dropout(0.5).eval()
+    network = torch.nn.Sequential(norm, torch.nn.Dropout(0.5), frozen)
+    policy = TensorDictModule(network, ["desired_goal"], ["action"])
+    options = {"episodes": 2, "seed": 0}
+    first, second = (
+        torch_panda.evaluate(policy, "PandaReachDense-v1", **options) for _ in range(2)
+    )
+    assert torch.equal(first.returns, second.returns)
+    assert norm.num_batches_tracked == 0
+    assert network.training
+    assert norm.training
+    assert not frozen.training
+
+
 def test_options_of_make_are_passed_on():
     policy = torch_panda.load_policy("PandaReach-v1")
     options = {"task_options": {"distance_threshold": 10.0}, "physics": "fast"}

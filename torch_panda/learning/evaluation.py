@@ -1,6 +1,7 @@
 """Evaluation of a policy over many episodes, which run in parallel."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import sqrt
 from typing import Any, Literal, get_args
@@ -92,7 +93,8 @@ def evaluate(
 
     Args:
         policy: Trained policy, scripted expert, or any module or function that writes
-            ``action`` into a TensorDict with the observations.
+            ``action`` into a TensorDict with the observations. A module acts in
+            evaluation mode (`torch.nn.Module.eval`).
         env_id: Id of the environment.
         episodes: Number of episodes.
         seed: Seed of the episodes; None draws a random seed.
@@ -119,11 +121,32 @@ def evaluate(
     if tasks not in get_args(Tasks):
         raise ValueError(f'tasks must be "random" or "fixed", got {tasks!r}')
     num_envs = min(num_envs, episodes)
-    with make(env_id, num_envs=num_envs, seed=seed, **options) as env:
+    with (
+        _evaluation_mode(policy),
+        make(env_id, num_envs=num_envs, seed=seed, **options) as env,
+    ):
         if tasks == "fixed":
             states = evaluation_tasks(env_id)
             return evaluate_fixed_starts(env, policy, episodes, states, seed=seed)
         return evaluate_episodes(env, policy, episodes)
+
+
+@contextmanager
+def _evaluation_mode(policy: Policy) -> Iterator[None]:
+    """Put a module into evaluation mode, and then all its parts back as they were.
+
+    In training mode, dropout is random, and batch normalisation changes the policy.
+    """
+    if not isinstance(policy, torch.nn.Module):
+        yield
+        return
+    training = [module for module in policy.modules() if module.training]
+    policy.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def evaluate_episodes(env: RobotTaskEnv, policy: Policy, episodes: int) -> Evaluation:
