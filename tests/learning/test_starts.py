@@ -144,3 +144,9 @@ def test_partial_reset_leaves_the_others_alone(states):
 def test_states_at_objects_need_objects_and_end_effector_control(env_id):
     with pytest.raises(ValueError, match=f"end-effector .* got {env_id}"):
         states_at_objects(env_id, seed=0)
+
+
+def test_a_hand_that_reaches_no_object_is_an_error(monkeypatch):
+    monkeypatch.setattr("torch_panda.learning.starts.SCRIPT_STEPS", 1)
+    with pytest.raises(ValueError, match="hand of PandaPush-v1 reaches no object"):
+        states_at_objects("PandaPush-v1", seed=0, number=2)

@@ -57,8 +57,8 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
         ``number``.
 
     Raises:
-        ValueError: The task is not Push, PickAndPlace, Slide, Stack or Flip, or the
-            robot is not under end-effector control.
+        ValueError: The task is not Push, PickAndPlace, Slide, Stack or Flip, the robot
+            is not under end-effector control, or all attempts failed.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -106,7 +106,14 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
             td = env.step(td.set("action", action))["next"]  # type: ignore[assignment]
         state = env.get_state().select(*PLACED_KEYS).set("first_to_goal", first_to_goal)
     speed = state["object_velocity"].abs().flatten(1).amax(1, keepdim=True)
-    return state[(arrived & (speed < 0.1)).squeeze(1)]
+    succeeded = (arrived & (speed < 0.1)).squeeze(1)
+    if not succeeded.any():
+        raise ValueError(
+            f"start_at_object found no start, because in {SCRIPT_STEPS} steps the hand "
+            f"of {env_id} reaches no object: let it move faster, or pass "
+            "--start-at-object 0"
+        )
+    return state[succeeded]
 
 
 class StartFrom(Transform):
