@@ -249,6 +249,17 @@ def test_interrupt_saves(tmp_path):
     assert (out / "checkpoint.pt").exists()
 
 
+def test_a_run_ends_well_if_its_video_cannot_be_written(tmp_path, monkeypatch, capsys):
+    def fail(*arguments):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(train, "record", fail)
+    train.main(Args(total_steps=100, num_envs=2, updates_per_step=0.0, out=tmp_path))
+    output = capsys.readouterr().out
+    assert "no video was written: the disk is full" in output
+    assert "after 100 steps" in output
+
+
 def test_command_line_overrules_the_recipe():
     args = parse(["--preset", "tuned", "--env-id", "PandaSlide-v1", "--gamma", "0.9"])
     recipe = default_args("tuned", "PandaSlide-v1")

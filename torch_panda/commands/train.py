@@ -179,6 +179,8 @@ def main(args: Args | OfflineArgs) -> None:
                 record(env, run.agent.policy, out / "video.mp4")
         except KeyboardInterrupt:
             print("interrupted: no video was written")
+        except OSError as error:
+            print(f"no video was written: {error}")
     progress = run.progress
     print(f"success {progress.success} after {progress.steps} steps; see {out}")
     if not finished:
