@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from torch_panda import registry
-from torch_panda.commands import main
+from torch_panda.commands import main, plot
 
 MODULE = """
 import torch_panda
@@ -121,3 +121,14 @@ def test_a_missing_extra_is_one_error_with_its_command(monkeypatch):
 def test_an_unknown_command_lists_the_commands():
     with pytest.raises(SystemExit, match=r"unknown command 'trian'(.|\n)*evaluate"):
         main(["trian"])
+
+
+@pytest.mark.parametrize("arguments", [["~/runs"], ["runs", "--out=~/curves.png"]])
+def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch, arguments):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(plot, "read_runs", lambda folders: folders)
+    drawn = []
+    monkeypatch.setattr(plot, "plot_panels", lambda *args: drawn.extend(args))
+    main(["plot", *arguments])
+    folders, _, out = drawn
+    assert tmp_path in (folders[0].parent, out.parent)

@@ -5,6 +5,7 @@ that the environments do not need. Its function ``run`` reads the options from t
 command line.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -32,7 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: Name and options of the command; None takes them from the command
             line.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    arguments = [
+        expand_home(x) for x in (sys.argv[1:] if arguments is None else arguments)
+    ]
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help"):
         print(describe())
@@ -48,6 +51,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(explanation) from None
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
+
+
+def expand_home(argument: str) -> str:
+    """Replace the ~ of a path, which shells leave unchanged in ``--out=~/run``."""
+    is_option = argument.startswith("--")
+    option, equals, value = argument.partition("=") if is_option else ("", "", argument)
+    return option + equals + os.path.expanduser(value)
 
 
 def describe() -> str:
