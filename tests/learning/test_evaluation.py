@@ -132,6 +132,8 @@ def test_episodes_of_a_fixed_task_differ_and_depend_on_the_seed_alone():
         ({"tasks": "named"}, ValueError, 'tasks must be "random" or "fixed"'),
         ({"env_id": "PandaFly-v1"}, ValueError, "unknown environment id"),
         ({"policy": "PandaReach-v1"}, TypeError, "load_policy reads one from a file"),
+        ({"policy": torch.nn.Linear}, TypeError, "must be a module or a function"),
+        ({"policy": lambda td: td["desired_goal"]}, TypeError, "wrap a network as"),
         ({"n_envs": 4}, TypeError, "n_envs"),
     ],
 )

@@ -110,16 +110,19 @@ def evaluate(
 
     Raises:
         ValueError: The id is unknown, or an argument is out of range.
-        TypeError: The policy cannot be called, or an argument is unknown.
+        TypeError: The policy cannot be called or returns no TensorDict, or an argument
+            is unknown.
     """
     check_positive(episodes=episodes, num_envs=num_envs)
-    if not callable(policy):
+    if not callable(policy) or isinstance(policy, type):
         raise TypeError(
             f"policy must be a module or a function, got {policy!r}: load_policy reads "
             "one from a file"
         )
     if tasks not in get_args(Tasks):
         raise ValueError(f'tasks must be "random" or "fixed", got {tasks!r}')
+    if not isinstance(policy, torch.nn.Module):
+        policy = _check_results(policy)
     num_envs = min(num_envs, episodes)
     with (
         _evaluation_mode(policy),
@@ -147,6 +150,24 @@ def _evaluation_mode(policy: Policy) -> Iterator[None]:
     finally:
         for module in training:
             module.training = True
+
+
+def _check_results(policy: Policy) -> Policy:
+    """Return a function that refuses other results of a policy than a TensorDict."""
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        result = policy(tensordict)
+        if result is None:  # the policy has changed the TensorDict in place
+            return tensordict
+        if not isinstance(result, TensorDictBase):
+            raise TypeError(
+                f"policy must write 'action' into the TensorDict and return it, got "
+                f"{type(result).__name__}: wrap a network as "
+                "TensorDictModule(network, in_keys=[...], out_keys=['action'])"
+            )
+        return result
+
+    return act
 
 
 def evaluate_episodes(env: RobotTaskEnv, policy: Policy, episodes: int) -> Evaluation:
