@@ -12,6 +12,7 @@ from torch_panda import datasets
 from torch_panda.commands import record
 from torch_panda.datasets import generation
 from torch_panda.datasets.demonstrations import read_demos
+from torch_panda.datasets.parts import Parts
 
 TRANSITIONS = 250
 
@@ -85,6 +86,19 @@ def test_a_stopped_data_set_continues_bit_for_bit(tmp_path, capsys, monkeypatch)
     assert list(tmp_path.iterdir()) == [out]
     with pytest.raises(SystemExit, match="no data set to resume"):
         record.main(make_args(out, resume=True))
+
+
+def test_two_processes_do_not_mix_their_parts(tmp_path):
+    first, second = (
+        Parts(tmp_path / "data.pt.unfinished", {"seed": seed}, resume=False)
+        for seed in (0, 1)
+    )
+    ids = torch.zeros(1, 2, dtype=torch.int64)
+    part = TensorDict({"action": ids, "next": {}, ("collector", "traj_ids"): ids})
+    first.add(part)
+    with pytest.raises(ValueError, match="another process writes into"):
+        second.add(part)
+    first.add(part)
 
 
 @pytest.mark.parametrize("kind", ["noisy", "play"])

@@ -30,6 +30,7 @@ class Parts:
         self, folder: Path, recipe: Mapping[str, object], *, resume: bool
     ) -> None:
         self.folder, self._recipe = folder, recipe
+        self._is_new = not resume
         file = folder / RECIPE
         if not resume and file.exists():
             raise ValueError(
@@ -56,11 +57,18 @@ class Parts:
         """Save a part [episodes, steps]. The first part creates the folder.
 
         Raises:
+            ValueError: Another process has begun a data set in the folder meanwhile.
             OSError: The file cannot be written.
         """
-        if not (self.folder / RECIPE).exists():
+        if self._is_new:
+            if (self.folder / RECIPE).exists():
+                raise ValueError(
+                    f"another process writes into {self.folder}: stop that process "
+                    "first, or choose another --out"
+                )
             self.folder.mkdir(parents=True, exist_ok=True)
             files.save_text(self.folder / RECIPE, json.dumps(self._recipe, indent=2))
+            self._is_new = False
         first = int(part["collector", "traj_ids"][0, 0])
         files.save(self.folder / f"{first:08d}.pt", part.to_dict())
 
