@@ -120,6 +120,21 @@ def test_demonstrations_of_other_rewards(make_demos):
         read_demos(path, env)
 
 
+def test_rewards_that_are_no_function_of_goals_are_accepted(make_demos):
+    class Effort(torch_panda.Push):
+        def reward(self, simulation, action, achieved_goal, desired_goal):
+            return -action.square().sum(1, keepdim=True)
+
+    path = make_demos()
+    content = torch.load(path)
+    content["next"]["reward"] = -content["action"].square().sum(1, keepdim=True)
+    torch.save(content, path)
+    robot = torch_panda.Panda(block_gripper=True)
+    with torch_panda.RobotTaskEnv(robot=robot, task=Effort()) as env:
+        demos = read_demos(path, env)
+    assert torch.equal(demos["next", "reward"], content["next"]["reward"])
+
+
 def small(path, **options):
     return Args(env_id="PandaPush-v1", demos=path, num_envs=2, **options)
 
