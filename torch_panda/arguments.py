@@ -4,6 +4,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib import import_module
+from types import FunctionType
 from typing import Any
 
 from typing_extensions import Self
@@ -17,11 +18,27 @@ class Configured:
     attribute ``x`` or ``_x``.
     """
 
+    _fixed: frozenset[str] = frozenset()
+
     def __new__(cls, *args: object, **arguments: object) -> Self:
         """Refuse unknown arguments."""
         if arguments:
             check_call(cls.__name__, cls, arguments)
         return super().__new__(cls)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Refuse to change attributes that `fix` named."""
+        if name in self._fixed:
+            raise AttributeError(
+                f"{name} cannot be changed in a {type(self).__name__} of an "
+                f"environment, because its scene is already built: make a new "
+                f"{type(self).__name__} with {name}={value!r}, and a new environment"
+            )
+        super().__setattr__(name, value)
+
+    def fix(self, names: Iterable[str]) -> None:
+        """Refuse changes of some attributes, because they would have no effect."""
+        super().__setattr__("_fixed", self._fixed.union(names))
 
     def __repr__(self) -> str:
         shown = [
@@ -109,6 +126,21 @@ def argument_names(owner: type) -> list[str]:
             if not _has_options(parameters):
                 break
     return names
+
+
+def arguments_in(owner: type, method: str) -> set[str]:
+    """Names of the arguments of a class that occur in the code of a method.
+
+    Arguments that only other functions read for this method are not included.
+    """
+    functions = [vars(base).get(method) for base in owner.__mro__]
+    names = {
+        name
+        for function in functions
+        if isinstance(function, FunctionType)
+        for name in function.__code__.co_names
+    }
+    return names.intersection(argument_names(owner))
 
 
 def _has_options(parameters: Mapping[str, inspect.Parameter]) -> bool:

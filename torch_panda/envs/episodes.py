@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from torch_panda.arguments import argument_names, arguments_in
 from torch_panda.bullet import (
     BulletError,
     PhysicsName,
@@ -135,6 +136,9 @@ class Episodes:
         self.simulation = VectorSimulation(
             build, n, num_threads=num_threads, physics=self.physics
         )
+        task.fix(arguments_in(type(task), "build"))
+        robot.fix(arguments_in(type(robot), "build"))
+        robot.fix({*argument_names(Robot)} - {"action_scale"})
         try:
             self._compiled_setpoints = None
             if CompiledSetpoints.applies(robot, self.simulation):

@@ -173,7 +173,6 @@ class RobotTaskEnv(EnvBase):
         self.robot, self.task = robot, task
         self.physics = episodes.physics
         self._terminate_on_success = terminate_on_success
-        self.on_divergence = on_divergence
         self.goal = goal
         self._observe_state = observe_state
         specs = Specs(episodes, device, observe_state=observe_state)
@@ -189,7 +188,7 @@ class RobotTaskEnv(EnvBase):
         """Number of threads that step the environments."""
         return self.episodes.simulation.num_threads
 
-    # The next two have no setter, because a later change would have no effect.
+    # The next three have no setter, because a later change would have no effect.
     @property
     def max_episode_steps(self) -> int:
         """Number of steps after which an episode is ``truncated``."""
@@ -199,6 +198,11 @@ class RobotTaskEnv(EnvBase):
     def terminate_on_success(self) -> bool:
         """Whether success ends an episode."""
         return self._terminate_on_success
+
+    @property
+    def on_divergence(self) -> OnDivergence:
+        """What happens when a step leaves an environment in an infinite state."""
+        return self.episodes.on_divergence
 
     @property
     def goal_indices(self) -> tuple[int, ...] | None:
