@@ -78,7 +78,8 @@ def make_expert(env_id: str) -> TensorDictModule:
     """Make the scripted expert for an id.
 
     Args:
-        env_id: Id of a Panda with end-effector control at one of the shipped tasks.
+        env_id: Id of a Panda with end-effector control at one of the shipped tasks. The
+            expert expects the default ``action_scale`` of 0.05 m.
 
     Returns:
         A module from ``observation``, ``achieved_goal`` and ``desired_goal`` to
