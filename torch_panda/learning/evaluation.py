@@ -269,11 +269,9 @@ def _join(
     return Evaluation(**chosen, tasks=tasks or {})
 
 
-def wilson_interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Confidence interval of a proportion after n trials (Wilson, 1927).
-
-    The quantile z of the normal distribution is 1.96 for the 95 % interval.
-    """
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """95 % confidence interval of a proportion after n trials (Wilson, 1927)."""
+    z = 1.96  # the 97.5 % quantile of the normal distribution
     p = successes / n
     center = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z * sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
