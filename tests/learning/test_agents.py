@@ -138,9 +138,9 @@ def test_failing_early_does_not_save_rewards(env, algo):
     seen = []
     backward = agent.backward
 
-    def remember(state, next_state, rows, num_demos):
+    def remember(state, rows, num_demos):
         seen.append(rows)
-        return backward(state, next_state, rows, num_demos)
+        return backward(state, rows, num_demos)
 
     agent.backward = remember
     batch = make_transitions(env, 64)

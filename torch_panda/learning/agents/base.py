@@ -143,9 +143,8 @@ class Agent(nn.Module, ABC):
             rows = Transitions(*map(torch.cat, pairs))
         rows = self._prepare(rows)
         state = self.normalizer(rows.observation, rows.goal)
-        next_state = self.normalizer(rows.next_observation, rows.goal)
         self.optimizer.zero_grad()
-        losses = self.backward(state, next_state, rows, num_demos)
+        losses = self.backward(state, rows, num_demos)
         self.optimizer.step()
         self._move_average()
         self.updates += 1
@@ -155,13 +154,12 @@ class Agent(nn.Module, ABC):
 
     @abstractmethod
     def backward(
-        self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
+        self, state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
         """Compute the losses and their gradients.
 
         Args:
             state: States before the environment's step, (n, state size).
-            next_state: States after it, (n, state size).
             rows: The transitions. The last ones are demonstrations.
             num_demos: Number of demonstrations.
 

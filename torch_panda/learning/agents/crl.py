@@ -52,7 +52,7 @@ class CRL(Agent):
         )
 
     def backward(
-        self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
+        self, state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
         """Compute the losses of critic and actor, and their gradients.
 

@@ -68,13 +68,14 @@ class DDPG(Agent):
         return self.target_actor(next_state)
 
     def backward(
-        self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
+        self, state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
         """Compute the losses of critics and actor, and their gradients.
 
         See `Agent.backward`.
         """
         with torch.no_grad():
+            next_state = self.normalizer(rows.next_observation, rows.goal)
             next_action = self.target_action(next_state)
             next_values = [
                 critic(next_state, next_action) for critic in self.target_critics

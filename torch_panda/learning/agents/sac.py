@@ -66,12 +66,13 @@ class SAC(Agent):
         return SACLoss(actor, critic, loss_function="l2", **options)
 
     def backward(
-        self, state: Tensor, next_state: Tensor, rows: Transitions, num_demos: int
+        self, state: Tensor, rows: Transitions, num_demos: int
     ) -> dict[str, Tensor]:
         """Compute torchrl's losses and their gradients; see `Agent.backward`.
 
         Demonstrations count as ordinary transitions.
         """
+        next_state = self.normalizer(rows.next_observation, rows.goal)
         flags = {"terminated": rows.terminated, "done": rows.terminated}
         after_step = {"normalized": next_state, "reward": rows.reward, **flags}
         batch = {"normalized": state, "action": rows.action, "next": after_step}
