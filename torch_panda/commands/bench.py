@@ -481,6 +481,8 @@ def plot(path: Path, results: Results) -> None:
     """Draw steps per second: a panel for each setting, and a bar for each contender."""
     from matplotlib.figure import Figure
 
+    from torch_panda.learning.plots import save
+
     settings = list(dict.fromkeys(setting for setting, _ in results))
     height = 0.8 * len(settings) + 0.3 * len(results)
     figure = Figure(figsize=(7, height), layout="constrained")
@@ -507,7 +509,7 @@ def plot(path: Path, results: Results) -> None:
             loc="left",
         )
     grid[-1, 0].set_xlabel("steps/s")
-    figure.savefig(path, dpi=150)
+    save(figure, path)
 
 
 def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
@@ -576,8 +578,9 @@ def run(arguments: Sequence[str]) -> None:
                 )
             from matplotlib.backend_bases import FigureCanvasBase
 
+            args.plot = args.plot.with_suffix(args.plot.suffix or ".png")
             formats = FigureCanvasBase.get_supported_filetypes()
-            if (args.plot.suffix or ".png")[1:].lower() not in formats:
+            if args.plot.suffix[1:].lower() not in formats:
                 raise ValueError(
                     f"plot must end in one of {', '.join(formats)}, got "
                     f"{args.plot.name!r}"

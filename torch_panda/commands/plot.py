@@ -30,7 +30,7 @@ class Args:
 
 def main(args: Args) -> None:
     """Draw the runs."""
-    out = args.out if args.out.suffix else args.out.with_suffix(".png")
+    out = args.out.with_suffix(args.out.suffix or ".png")
     try:
         import_modules(read_modules(args.imports))
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -61,7 +61,7 @@ def save(figure: Figure, path: Path) -> None:
         OSError: The file cannot be written.
         ValueError: There is no such format.
     """
-    format = path.suffix.removeprefix(".") or "png"
+    format = path.suffix.removeprefix(".")
     files.replace(path, lambda file: figure.savefig(file, dpi=120, format=format))
 
 
