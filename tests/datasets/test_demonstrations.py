@@ -211,7 +211,7 @@ def test_a_run_is_not_resumed_with_other_demonstrations(make_demos, tmp_path):
     content = torch.load(args.demos)
     content["action"] *= 0.5
     torch.save(content, args.demos)
-    with pytest.raises(ValueError, match="cannot resume with other demonstrations"):
+    with pytest.raises(ValueError, match="cannot resume with other data"):
         make_run(replace(args, resume=True), tmp_path)
 
 

@@ -8,10 +8,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
+from torchrl.data import ReplayBuffer
 from tqdm import tqdm
 
 from torch_panda.learning import files
@@ -54,20 +55,6 @@ class Progress:
         return f"{self.curve[-1]['success']:.0%}" if self.curve else "unknown"
 
 
-class TrainingData(Protocol):
-    """The data that a run learns from: a replay buffer or a data set.
-
-    A replay buffer is saved and restored. Of a data set only the hash is saved, so that
-    a resumed run can check that the data are the same.
-    """
-
-    def state_dict(self) -> dict[str, Any]:
-        """The state to save."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> Any:  # noqa: ANN401 (unused)
-        """Restore a state, or raise ValueError if it belongs to other data."""
-
-
 @dataclass
 class Checkpoint:
     """The complete state of a run between two iterations.
@@ -75,15 +62,16 @@ class Checkpoint:
     The file ``path``, which is called resume.pt, holds this state. The file
     checkpoint.pt beside it holds the policy alone, for `load_policy`.
 
-    The demonstrations of a run are not saved, only their hash.
+    Demonstrations, and the data of offline learning, are not saved, only their hash. So
+    a resumed run can check that they are the same.
     """
 
     path: Path
     args: Any  # options of the run, a dataclass
     agent: AnyAgent
-    buffer: TrainingData
+    buffer: ReplayBuffer | None  # None in offline learning
     progress: Progress
-    demos_hash: str = ""  # empty without demonstrations
+    data_hash: str = ""  # of demonstrations or offline data; empty without both
 
     def save(self) -> None:
         """Write the state into resume.pt, and the policy into checkpoint.pt.
@@ -96,8 +84,8 @@ class Checkpoint:
             "agent": self.agent.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
             "updates": self.agent.updates,
-            "buffer": self.buffer.state_dict(),
-            "demos_hash": self.demos_hash,
+            "buffer": self.buffer.state_dict() if self.buffer is not None else {},
+            "data_hash": self.data_hash,
             "random": torch.get_rng_state(),
             "cuda_random": torch.cuda.get_rng_state_all(),
             "progress": asdict(self.progress),
@@ -113,8 +101,7 @@ class Checkpoint:
         if the learning rate does not depend on it.
 
         Raises:
-            ValueError: The file is damaged, or its run had other options or other
-                demonstrations.
+            ValueError: The file is damaged, or its run had other options or data.
         """
         keys = (
             *("args", "agent", "optimizer", "updates", "buffer"),
@@ -127,18 +114,18 @@ class Checkpoint:
         if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps
         check_same(self.path.parent, saved, options)
-        # Runs of earlier versions saved no hash.
-        demos_hash = state.get("demos_hash", self.demos_hash)
-        if demos_hash != self.demos_hash:
+        # Runs of earlier versions saved no hash under this key.
+        data_hash = state.get("data_hash", self.data_hash)
+        if data_hash != self.data_hash:
             raise ValueError(
-                "cannot resume with other demonstrations: the run learned from "
-                f"demonstrations with the hash {demos_hash}, these have "
-                f"{self.demos_hash}"
+                "cannot resume with other data: the run learned from data with the "
+                f"hash {data_hash}, these have {self.data_hash}"
             )
         self.agent.load_state_dict(state["agent"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]
-        self.buffer.load_state_dict(state["buffer"])
+        if self.buffer is not None:
+            self.buffer.load_state_dict(state["buffer"])
         for name, value in state["progress"].items():
             setattr(self.progress, name, value)
         # Last, so that nothing draws random numbers before the run continues.

@@ -28,7 +28,6 @@ class OfflineData:
         goal_strategies: Strategy for each key under which goals are drawn. The first
             key holds the value goals.
         discount: Discount of the strategy "geometric".
-        data_hash: Hash of the data. A resumed run compares it with the saved hash.
 
     Attributes:
         rows: The transitions, (n,).
@@ -41,10 +40,7 @@ class OfflineData:
         env: RobotTaskEnv,
         goal_strategies: Mapping[str, StrategyOption],
         discount: float,
-        data_hash: str = "",
     ) -> None:
-        self.data_hash = data_hash
-
         def reward(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
             return env.is_success(achieved_goal, desired_goal).float() - 1.0
 
@@ -84,19 +80,3 @@ class OfflineData:
             ``goal_strategies``, and with their row numbers in the data under ``index``.
         """
         return self._buffer.sample(batch_size)
-
-    def state_dict(self) -> dict[str, str]:
-        """The hash of the data, which is saved instead of the data."""
-        return {"hash": self.data_hash}
-
-    def load_state_dict(self, state: dict[str, str]) -> None:
-        """Check that the data are those of a saved run.
-
-        Raises:
-            ValueError: The hashes differ.
-        """
-        if state["hash"] != self.data_hash:
-            raise ValueError(
-                "cannot resume with other data: the run learned from data with the "
-                f"hash {state['hash']}, these have {self.data_hash}"
-            )

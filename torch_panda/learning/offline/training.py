@@ -52,7 +52,7 @@ class OfflineRun:
             self.agent = cls(read_spaces(self.env), args)
         data = data.to(args.device)
         self.data = OfflineData(
-            data, self.env, self.agent.goal_strategies, args.discount, data_hash
+            data, self.env, self.agent.goal_strategies, args.discount
         )
         sample = self.sample(min(FIT_ROWS, len(self.data)))
         self.agent.fit(sample["observation"], sample["actor_goal"])
@@ -66,7 +66,7 @@ class OfflineRun:
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
-            out / "resume.pt", args, self.agent, self.data, self.progress
+            out / "resume.pt", args, self.agent, None, self.progress, data_hash
         )
         if args.resume:
             self.checkpoint.load()
