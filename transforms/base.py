@@ -79,6 +79,7 @@ class BufferTransform(envs.Transform):
     """
 
     goal_parts: tuple[int, ...] | None = None
+    _keeps_rows = True  # whether some rows keep their goal
     _shown: tuple[str, ...]  # names of the attributes in the repr
 
     def __init__(
@@ -244,7 +245,7 @@ class BufferTransform(envs.Transform):
                 f"in data of batch size {list(shape)}: if the transitions have further "
                 "dimensions, add these to the batch size, such as [episodes, steps]"
             )
-        self._check_written(batch)
+        self._check_written(batch, keeps_rows=self._keeps_rows)
         check_goals_agree(flat, rewriter)
         goals: Any = [achieved.numpy(force=True)]
         if any(DESIRED in mixture.weights for mixture in self._get_mixtures()):

@@ -144,14 +144,12 @@ class DataCheck:
     Attributes:
         shapes: Observation entries of the base environment, without its transforms, and
             their shapes. None if the environment is unknown.
-        keeps_rows: Whether some rows keep their goal, and so their stored ends.
     """
 
     def __init__(
         self, rewriter: Rewriter, ignored: Sequence[NestedKey], warned: set[str]
     ) -> None:
         self.shapes: dict[NestedKey, torch.Size] | None = None
-        self.keeps_rows = True
         self._rewriter = rewriter
         self._ignored = ignored
         self._warned = warned
@@ -160,8 +158,12 @@ class DataCheck:
         self._unchecked: TensorDictBase | None = None  # rows since the last check
         self._pool: TensorDictBase | None = None  # rows of all checks, thinned out
 
-    def __call__(self, batch: TensorDictBase) -> None:
+    def __call__(self, batch: TensorDictBase, *, keeps_rows: bool) -> None:
         """Checks transitions, of any batch shape.
+
+        Args:
+            batch: The transitions.
+            keeps_rows: Whether some rows keep their goal, and so their stored ends.
 
         Raises:
             ValueError: An entry or the rewards would be wrong after relabelling.
@@ -178,7 +180,8 @@ class DataCheck:
         if (goals != goals[:1]).any():
             self._unchecked, self._pool = None, _append(self._pool, rows)
             self._check_rewards(rows)
-            self._check_ends(rows)
+            if keeps_rows:
+                self._check_ends(rows)
             self._check_copies(self._pool)
             has_enough_goals = self._check_affine(self._pool)
             self._num_checks += 1
@@ -379,7 +382,7 @@ class DataCheck:
         half of the successful rows.
         """
         rewriter = self._rewriter
-        if rewriter.terminated_fn is None or not self.keeps_rows:
+        if rewriter.terminated_fn is None:
             return
         terminated = rows.get(TERMINATED)
         reached = call_goal_function(

@@ -63,8 +63,7 @@ class HindsightRelabel(SampleTimeTransform):
         if goal_parts is not None and (not goal_parts or min(goal_parts) < 1):
             raise ValueError(f"goal_parts must be positive sizes, got {goal_parts!r}")
         self.her_ratio, self.goal_parts = her_ratio, goal_parts
-        self._check_written.keeps_rows = her_ratio < 1
-        self._check_sampled.keeps_rows = her_ratio < 1
+        self._keeps_rows = her_ratio < 1
 
     def _draw(self, serials: Integers, batch: TensorDictBase) -> tuple[Integers, Goals]:
         """Draws which m rows to relabel, (m,), and their goals, (m, *goal)."""

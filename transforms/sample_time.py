@@ -129,7 +129,7 @@ class SampleTimeTransform(BufferTransform):
             if is_first:
                 self._rewriter.check_entries(tensordict)
                 self._warn_of_slices(buffer)
-            self._check_sampled(tensordict)
+            self._check_sampled(tensordict, keeps_rows=self._keeps_rows)
             # A strategy that looks ahead never draws an overwritten step.
             if not all(m.only_looks_ahead for m in self._get_mixtures()):
                 self._memory.forget(oldest)

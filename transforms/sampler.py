@@ -46,6 +46,7 @@ class GoalSampler(SampleTimeTransform):
         ValueError: An argument has a value that is not accepted.
     """
 
+    _keeps_rows = False
     _shown = ("strategies", "discount", "unit")
 
     def __init__(
@@ -75,7 +76,6 @@ class GoalSampler(SampleTimeTransform):
                 f"strategies must not replace {self._rewriter.achieved_goal_key!r}: "
                 "name a new entry"
             )
-        self._check_written.keeps_rows = self._check_sampled.keeps_rows = False
 
     @classmethod
     def from_env(  # type: ignore[override]  # the strategies have no default
