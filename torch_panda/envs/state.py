@@ -97,9 +97,7 @@ class StartState(NamedTuple):
                 )
 
 
-def is_state(
-    entries: Mapping[str, Any] | None, observed_keys: Collection[str] = ()
-) -> bool:
+def is_state(entries: Mapping[str, Any] | None, observed_keys: Collection[str]) -> bool:
     """Whether a reset without ``set_state`` should start from its argument.
 
     A caller may also pass the last observations, so the keys have to show whether the

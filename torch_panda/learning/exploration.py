@@ -76,7 +76,7 @@ class RandomPointModule(TensorDictModuleBase):
         action_scale: float,
         moves_joints: bool,
         num_arm_actions: int,
-        object_columns: Sequence[int] = (),
+        object_columns: Sequence[int],
     ) -> None:
         super().__init__()
         self.in_keys = ["observation", "action"]

@@ -25,7 +25,7 @@ def pretrain(
     updates: int,
     batch_size: int,
     learning_rate: float = 1.0,
-    stop: object = False,
+    stop: object,
 ) -> None:
     """Take the remaining gradient steps of imitation, and save the run.
 
