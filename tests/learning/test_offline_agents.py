@@ -53,7 +53,7 @@ def make_data(env, agent, transitions):
         transitions.clone(), env, agent.goal_strategies, agent.hp.discount
     )
     batch = agent.extend(data.sample(2_000), data)
-    agent.fit(batch["observation"], batch["actor_goal"])
+    agent.normalizer.update(batch["observation"], batch["actor_goal"])
     return data
 
 

@@ -1,9 +1,9 @@
 """Base class of the agents that learn offline, and the losses that several share.
 
-`fit` computes the mean and deviation of the data, `update` takes one gradient step on a
-batch of `OfflineData`, and `policy` acts. Agents differ in their `losses`, and in the
-`goal_strategies` with which `torch_panda.transforms.GoalSampler` draws their goals. The
-docstrings of the losses cite the papers.
+`update` takes one gradient step on a batch of `OfflineData`, and `policy` acts. Agents
+differ in their `losses`, and in the `goal_strategies` with which
+`torch_panda.transforms.GoalSampler` draws their goals. The docstrings of the losses
+cite the papers.
 
 In the papers a goal is a state g. Here a goal is the part of a state that the task
 cares about, such as the position of a cube, because the policy gets ``desired_goal``.
@@ -157,15 +157,6 @@ class OfflineAgent(nn.Module, ABC):
         )
         trained = [p for p in self.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(trained, lr=self.hp.learning_rate, fused=True)
-
-    def fit(self, observation: Tensor, goal: Tensor) -> None:
-        """Compute the mean and deviation that standardise the networks' inputs.
-
-        Args:
-            observation: Observations of the data, (n, observation size).
-            goal: Goals of the data, (n, goal size).
-        """
-        self.normalizer.update(observation, goal)
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
         """Add further entries of the data to a sampled batch; by default none."""

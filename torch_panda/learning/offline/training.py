@@ -55,7 +55,7 @@ class OfflineRun:
             data, self.env, self.agent.goal_strategies, args.discount
         )
         sample = self.sample(min(FIT_ROWS, len(self.data)))
-        self.agent.fit(sample["observation"], sample["actor_goal"])
+        self.agent.normalizer.update(sample["observation"], sample["actor_goal"])
         self.curve = Curve(
             args.env_id,
             self.agent,
