@@ -23,10 +23,10 @@ ALL = Randomization(
 ID = "PandaPickAndPlace-v1"
 
 
-def push(env, steps=25, start=None):
+def push(env, start=None):
     """Move the hand to the cube and push it."""
     td, seen = env.reset() if start is None else start, []
-    for _ in range(steps):
+    for _ in range(25):
         action = torch.zeros(env.action_spec.shape)
         action[..., :3] = (td["achieved_goal"] - td["observation"][..., :3]) * 10
         td = env.step(td.clone().set("action", action))["next"]

@@ -8,35 +8,24 @@ import torch_panda
 from torch_panda import Gripper, PickAndPlace, Reach, Robot, RobotTaskEnv
 from torch_panda.robots import Tool
 
-# A gantry: three slides, a turning hand, and two fingers.
-LINK = """
-  <link name="{name}"><inertial><mass value="{mass}"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>
-    {shape}</link>
-  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{name}"/>
-    <origin xyz="{origin}"/><axis xyz="{axis}"/>
-    <limit lower="{low}" upper="{high}" effort="500" velocity="5"/></joint>
-"""
 FINGER = (
     '<collision><origin xyz="0 0 -0.05"/><geometry><box size="0.02 0.01 0.05"/>'
     "</geometry></collision>"
 )
 
 
-def link(name, parent, axis, low, high, *, kind="prismatic", origin="0 0 0", **more):
-    values = {"mass": 1.0, "shape": ""} | more
-    return LINK.format(
-        name=name,
-        parent=parent,
-        axis=axis,
-        low=low,
-        high=high,
-        kind=kind,
-        origin=origin,
-        **values,
-    )
+def link(name, parent, axis, low, high, *, kind="prismatic", mass=1.0, shape=""):
+    return f"""
+  <link name="{name}"><inertial><mass value="{mass}"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>
+    {shape}</link>
+  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{name}"/>
+    <axis xyz="{axis}"/>
+    <limit lower="{low}" upper="{high}" effort="500" velocity="5"/></joint>
+"""
 
 
+# A gantry: three slides, a turning hand, and two fingers.
 GANTRY = (
     '<robot name="gantry"><link name="base"/>'
     + link("x", "base", "1 0 0", -0.5, 0.5)

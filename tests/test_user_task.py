@@ -92,10 +92,10 @@ def shove(tmp_path):
     yield ID
 
 
-def push_forward(env, steps=12):
-    """Move the hand along x and return the outputs of all steps."""
+def push_forward(env):
+    """Move the hand along x and return the outputs of 12 steps."""
     td, outputs = env.reset(), []
-    for _ in range(steps):
+    for _ in range(12):
         action = torch.zeros(env.action_spec.shape)
         action[..., 0] = 1.0
         td = env.step(td.set("action", action))["next"]

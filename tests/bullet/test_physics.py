@@ -38,11 +38,11 @@ def test_fast_physics_move_the_arm_like_exact_physics():
     assert distance.max() < 5e-3  # [m]
 
 
-def fall(physics, seconds=0.2):
-    """Height by which a body falls [m]."""
+def fall(physics):
+    """Height by which a body falls in 0.2 s [m]."""
     with PhysicsClient(physics=physics) as client:
         body = client.create_sphere(0.1, mass=1.0, position=(0.0, 0.0, 0.0))
-        client.step(round(seconds / physics.timestep))
+        client.step(round(0.2 / physics.timestep))
         return -client.state(body).base_pose[2]
 
 

@@ -76,12 +76,12 @@ def detections(env):
     return [client.num_detections for client in env.episodes.simulation.clients]
 
 
-def observe_two_episodes(env, steps=12, masks=False):
+def observe_two_episodes(env, *, masks):
     """Observations and states; with masks, some environments step at a time."""
     generator, observed = torch.Generator().manual_seed(0), []
     for _episode in range(2):
         td = env.reset()
-        for _ in range(steps):
+        for _ in range(12):
             action = torch.rand(env.action_spec.shape, generator=generator) * 3 - 1.5
             td["action"] = action
             if masks:

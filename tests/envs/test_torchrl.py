@@ -59,9 +59,9 @@ def make_primed():
     return TransformedEnv(make_env(seed=0), primer)
 
 
-def make_with_state(seed=0):
+def make_with_state():
     transforms = Compose(StateTransform(), StepCounter())
-    return TransformedEnv(make_env(seed=seed), transforms)
+    return TransformedEnv(make_env(seed=0), transforms)
 
 
 @pytest.mark.parametrize("make_worker", [make_counted, make_primed])

@@ -16,8 +16,8 @@ from torch_panda.rotations import rotate
 from torch_panda.rotations import rotation_distance as distance
 
 
-def orientations(number, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def orientations(number):
+    generator = torch.Generator().manual_seed(0)
     return normalize(torch.randn(number, 4, generator=generator), dim=-1)
 
 

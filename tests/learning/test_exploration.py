@@ -32,9 +32,9 @@ def make_module(eps, *, moves_joints=False, action_size=4, object_columns=()):
     )
 
 
-def explore(module, steps, action_size=4, hand=(0.0, 0.0, 0.1)):
+def explore(module, steps, action_size=4):
     """Actions (steps, num_envs, action_size) of a hand that does not move."""
-    observation = torch.tensor(hand).expand(NUM_ENVS, 3)
+    observation = torch.tensor((0.0, 0.0, 0.1)).expand(NUM_ENVS, 3)
     actions = []
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(steps):

@@ -38,7 +38,7 @@ class World:
         self.bodies.append(body)
         return body
 
-    def chain(self, num_links, position, *, mass=0.1, base_mass=0.0):
+    def chain(self, num_links, position, *, base_mass=0.0):
         """A chain of hinges whose axes alternate."""
         shape = self.client.createCollisionShape(
             pybullet.GEOM_CAPSULE, radius=0.02, height=0.06
@@ -50,7 +50,7 @@ class World:
             shape,
             -1,
             position,
-            linkMasses=[mass] * n,
+            linkMasses=[0.1] * n,
             linkCollisionShapeIndices=[shape] * n,
             linkVisualShapeIndices=[-1] * n,
             linkPositions=[(0, 0, -0.12)] * n,

@@ -58,8 +58,8 @@ def get_warnings(function):
 # -- copies of the goal ---------------------------------------------------------------
 
 
-def cat(*keys, out="policy_input"):
-    return CatTensors(list(keys), out, del_keys=False)
+def cat(*keys):
+    return CatTensors(list(keys), "policy_input", del_keys=False)
 
 
 def cat_goal():

@@ -417,8 +417,8 @@ def test_multi_process_collector_with_the_buffer_is_refused(ndim):
 # -- strategies and parts -------------------------------------------------------------
 
 
-def goals_data(num_envs=4, steps=40):
-    return name_goals(Envs(num_envs, [5, 8]).chunk(steps)).reshape(-1)
+def goals_data(num_envs=4):
+    return name_goals(Envs(num_envs, [5, 8]).chunk(40)).reshape(-1)
 
 
 def test_desired_goals_are_drawn_uniformly_from_stored_transitions():
