@@ -22,8 +22,8 @@ from tests.transforms.identifiable import (
 )
 from tests.transforms.pipelines import buffer
 from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
+from torch_panda.transforms.strategies import NAMES
 
-NAMES = ["current", "future", "geometric", "final", "episode", "random", "desired"]
 ALL = {f"{name}_goal": name for name in NAMES}
 
 

@@ -8,16 +8,8 @@ from hypothesis import strategies as st
 from tests.transforms.identifiable import Envs, name_goals, reward_fn
 from tests.transforms.pipelines import buffer
 from torch_panda.transforms import HindsightRelabel
+from torch_panda.transforms.strategies import NAMES
 
-NAMES = [
-    "current",
-    "future",
-    "geometric",
-    "final",
-    "episode",
-    "random",
-    "desired",
-]
 SAMPLE = 4000
 
 
