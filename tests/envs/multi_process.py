@@ -1,7 +1,5 @@
 """Environments for spawned workers, which report their numbers of threads."""
 
-import functools
-
 import torch
 from torchrl.data import Unbounded
 from torchrl.envs import Transform, TransformedEnv
@@ -31,12 +29,9 @@ class ReportThreads(Transform):
         return observation_spec
 
 
-def _make(num_threads):
-    env = torch_panda.make("PandaReach-v1", num_envs=NUM_ENVS, num_threads=num_threads)
+def make_env():
+    env = torch_panda.make("PandaReach-v1", num_envs=NUM_ENVS, num_threads=2)
     return TransformedEnv(env, ReportThreads())
-
-
-make_env = functools.partial(_make, num_threads=2)
 
 
 def go_for_the_goal(tensordict):
