@@ -14,7 +14,6 @@ from torch_panda.datasets.demonstrations import read_demos
 from torch_panda.learning import pretraining
 from torch_panda.learning.options import Args
 from torch_panda.learning.policy_files import SavedPolicy
-from torch_panda.learning.pretraining import make_demo_buffer
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -25,10 +24,12 @@ def env():
         yield env
 
 
-def test_demonstrations_keep_their_goals(env, make_demos):
+def test_demonstrations_keep_their_goals(env, make_demos, tmp_path):
     path = make_demos()
     demos = read_demos(path, env)
-    batch = make_demo_buffer(demos).sample(500)
+    run = make_run(small(path), tmp_path)
+    batch = run.demos.sample(500)
+    run.close()
     goal = demos["desired_goal"].unflatten(0, (4, 50))[:, 0]
     assert (batch["desired_goal"] == goal[batch["collector", "traj_ids"]]).all()
     assert len(batch["index"].unique()) > 100

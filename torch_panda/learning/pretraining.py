@@ -2,20 +2,11 @@
 
 import time
 
-from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint
-
-
-def make_demo_buffer(demos: TensorDictBase) -> TensorDictReplayBuffer:
-    """Make a replay buffer that holds demonstrations, without hindsight."""
-    storage = LazyTensorStorage(len(demos), device=demos.device or "cpu")
-    buffer = TensorDictReplayBuffer(storage=storage)
-    buffer.extend(demos)
-    return buffer
 
 
 def pretrain(

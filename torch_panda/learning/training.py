@@ -21,6 +21,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
@@ -37,7 +38,7 @@ from torch_panda.learning.checkpoint import (
 from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.logger import make_logger
 from torch_panda.learning.options import DEMO_RATIO, Args
-from torch_panda.learning.pretraining import make_demo_buffer, pretrain
+from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.starts import StartFrom, states_at_objects
 from torch_panda.registry import make
 
@@ -120,7 +121,8 @@ class Run:
         if demos is not None:
             demos = demos.to(self.env.device)
             self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
-            self.demos = make_demo_buffer(demos)
+            storage = TensorStorage(demos, device=self.env.device)
+            self.demos = TensorDictReplayBuffer(storage=storage)
             self.num_demos = int(DEMO_RATIO * args.batch_size)
         env: EnvBase = self.env
         if args.start_at_object:
