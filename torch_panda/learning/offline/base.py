@@ -10,8 +10,6 @@ cares about, such as the position of a cube, because the policy gets ``desired_g
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -330,17 +328,3 @@ def move_towards(target: nn.Module, online: nn.Module, tau: float) -> None:
     targets: list[Tensor] = [*target.parameters()]
     sources: list[Tensor] = [*online.parameters()]
     torch._foreach_lerp_(targets, sources, tau)
-
-
-@contextmanager
-def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Let gradients flow through modules, but not into their parameters."""
-    parameters = [p for module in modules for p in module.parameters()]
-    required = [p.requires_grad for p in parameters]
-    for parameter in parameters:
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter, requires_grad in zip(parameters, required, strict=True):
-            parameter.requires_grad_(requires_grad)

@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional
+from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.limits import Positive, Weight
 from torch_panda.learning.offline.base import (
@@ -25,7 +26,6 @@ from torch_panda.learning.offline.base import (
     OfflineAgent,
     OfflineHyperparameters,
     ascend_and_imitate,
-    frozen,
     log_prob,
     make_gelu_mlp,
 )
@@ -88,7 +88,7 @@ class CRL(OfflineAgent):
     def actor_loss(self, b: Batch) -> Tensor:
         """Ascend f(s, pi(s, g), g) (section 4.3), and imitate as OGBench does."""
         mean = self.actor(b.s, b.g_actor)
-        with frozen(self.phi, self.psi):
+        with hold_out_net(self.phi), hold_out_net(self.psi):
             phi, psi = self.encode(b.s, mean.clamp(-1.0, 1.0), b.g_actor)
             f = (phi * psi).sum(-1).amin(0) / sqrt(self.hp.latent_size)
         return ascend_and_imitate(f, log_prob(mean, b.a), self.hp.alpha)

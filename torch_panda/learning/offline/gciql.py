@@ -12,6 +12,7 @@ from typing import ClassVar, Literal
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.limits import Ratio, Weight
 from torch_panda.learning.offline.base import (
@@ -22,7 +23,6 @@ from torch_panda.learning.offline.base import (
     OfflineHyperparameters,
     ascend_and_imitate,
     expectile_loss,
-    frozen,
     log_prob,
     make_gelu_mlp,
     move_towards,
@@ -88,7 +88,7 @@ class GCIQL(OfflineAgent):
     def actor_loss(self, b: Batch) -> Tensor:
         """DDPG+BC, instead of the paper's weighted imitation (eq. 7)."""
         mean = self.actor(b.s, b.g_actor)
-        with frozen(self.critic):
+        with hold_out_net(self.critic):
             x = self.normalizer(b.s, b.g_actor)
             q = self.critic(x, mean.clamp(-1.0, 1.0)).amin(0)
         return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.alpha)

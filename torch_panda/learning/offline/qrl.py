@@ -23,6 +23,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional
+from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.limits import Positive, Weight
 from torch_panda.learning.offline.base import (
@@ -31,7 +32,6 @@ from torch_panda.learning.offline.base import (
     OfflineAgent,
     OfflineHyperparameters,
     ascend_and_imitate,
-    frozen,
     log_prob,
     make_gelu_mlp,
     weighted_regression,
@@ -155,7 +155,7 @@ class QRL(OfflineAgent):
         mean = self.actor(b.s, b.g_actor)
         with torch.no_grad():
             z, goal = self.encode_state(b.s), self.encode_goal(b.g_actor)
-        with frozen(self.dynamics, self.quasimetric):
+        with hold_out_net(self.dynamics), hold_out_net(self.quasimetric):
             predicted = z + self.dynamics(z, mean.clamp(-1.0, 1.0))
             q = -self.quasimetric(predicted, goal)
         return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.imitation)
