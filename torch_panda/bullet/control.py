@@ -57,11 +57,6 @@ class MotorControl:
         return self._pose_dim + len(self.forces) - self.num_arm_joints
 
     @property
-    def first_position_joint(self) -> int:
-        """Index of the first joint that is driven to a position."""
-        return 0 if self.arm_mode == "position" else self.num_arm_joints
-
-    @property
     def _pose_dim(self) -> int:
         return 7 if self.ik_orientation is None else 3
 
@@ -109,7 +104,8 @@ class MotorControl:
             orientation = self.ik_orientation or pose[3:].tolist()
             client.inverse_kinematics(body, self.ik_link, pose[:3], orientation, joints)
             joints[self.num_arm_joints :] = setpoint[self._pose_dim :]
-        first = self.first_position_joint
+        # The first joint that is driven to a position.
+        first = 0 if self.arm_mode == "position" else self.num_arm_joints
         velocities = np.zeros(first)
         if self.arm_mode == "velocity":
             velocities = setpoint[:first]

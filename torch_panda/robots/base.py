@@ -186,16 +186,13 @@ class Robot(Configured):
     @property
     def action_dim(self) -> int:
         """Size of an action."""
-        return self._arm_action_dim + self.has_free_gripper
+        arm = {"ee": 3, "ee_pose": 6}.get(self.control_type, self.num_arm_joints)
+        return arm + self.has_free_gripper
 
     @property
     def observation_dim(self) -> int:
         """Size of the robot's part of the observation."""
         return 6 + self.has_free_gripper
-
-    @property
-    def _arm_action_dim(self) -> int:
-        return {"ee": 3, "ee_pose": 6}.get(self.control_type, self.num_arm_joints)
 
     @property
     def has_free_gripper(self) -> bool:
