@@ -194,14 +194,6 @@ def test_too_few_goals_pass():
     store(env, HindsightRelabel.from_env(env), batches=1)
 
 
-def test_computed_in_the_buffer_before_hindsight_is_refused():
-    env = make_short()
-    chain = Compose(normalise("desired_goal", "normalised"))
-    chain.append(HindsightRelabel.from_env(env))
-    with pytest.raises(ValueError, match=STALE.format("normalised")):
-        store(env, chain)
-
-
 @pytest.mark.parametrize("key", COMPUTED)
 def test_without_an_environment_it_is_a_warning(key):
     env = TransformedEnv(make_short(), COMPUTED[key]())
