@@ -78,37 +78,23 @@ def test_demonstrations_of_double_precision(env, make_demos):
     assert demos["observation"].dtype == demos["action"].dtype == torch.float32
 
 
-@pytest.mark.parametrize("key", ["desired_goal", ("next", "reward")])
-def test_demonstrations_without_an_entry(env, make_demos, key):
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda x: x.exclude("desired_goal"), "there is no entry 'desired_goal'"),
+        (lambda x: x.exclude(("next", "reward")), r"no entry \('next', 'reward'\)"),
+        (lambda x: x.set("action", x["action"][:-1]), "does not hold demonstrations"),
+        (lambda x: x.auto_batch_size_(1)[:0], "holds no transitions"),
+        (
+            lambda x: x.set(("next", "reward"), x["next", "reward"].squeeze(-1)),
+            r"shape \[\.\.\., 1\].*got \(200,\) for 200",
+        ),
+    ],
+)
+def test_incomplete_demonstrations_are_refused(env, make_demos, spoil, message):
     path = make_demos()
-    torch.save(TensorDict(torch.load(path)).exclude(key).to_dict(), path)
-    with pytest.raises(ValueError, match=re.escape(f"there is no entry {key!r}")):
-        read_demos(path, env)
-
-
-def test_demonstrations_of_unequal_lengths(env, make_demos):
-    path = make_demos()
-    content = torch.load(path)
-    content["action"] = content["action"][:-1]
-    torch.save(content, path)
-    with pytest.raises(ValueError, match=f"{path} does not hold demonstrations"):
-        read_demos(path, env)
-
-
-def test_demonstrations_without_a_transition(env, make_demos):
-    path = make_demos()
-    content = TensorDict(torch.load(path)).auto_batch_size_(1)
-    torch.save(content[:0].to_dict(), path)
-    with pytest.raises(ValueError, match=f"{path} holds no transitions"):
-        read_demos(path, env)
-
-
-def test_demonstrations_with_rewards_of_another_shape(env, make_demos):
-    path = make_demos()
-    content = torch.load(path)
-    content["next"]["reward"] = content["next"]["reward"].squeeze(-1)
-    torch.save(content, path)
-    with pytest.raises(ValueError, match=r"shape \[\.\.\., 1\].*got \(200,\) for 200"):
+    torch.save(spoil(TensorDict(torch.load(path))).to_dict(), path)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(path))}.*{message}"):
         read_demos(path, env)
 
 
