@@ -35,7 +35,7 @@ def test_a_rebound_environment_is_gone_at_once(no_collection):
     env.get_state(exact=True)
     clients = list(env.episodes.simulation.clients)
     for renderers in env.episodes.renderer._idle.values():
-        clients += [renderer._solids for renderer in renderers]
+        clients += [renderer._solids._connection for renderer in renderers]
     assert len(clients) > 2
     reference = weakref.ref(env)
     env = None

@@ -86,11 +86,6 @@ class VisualClient:
             self.close()
             raise
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether the client was closed."""
-        return self._connection.is_closed
-
     def close(self) -> None:
         """Free the client. Closing again does nothing."""
         self._connection.close()
