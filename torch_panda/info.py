@@ -109,10 +109,12 @@ def stepping() -> str:
 
 def describe() -> str:
     """Text of all sections."""
-    threads = f"default: one per core, here {num_cores()} of {os.cpu_count()}"
     sections = {
         "versions": [f"{name} {number}" for name, number in versions().items()],
-        "threads": [f"{threads}, and at most one per environment"],
+        "threads": [
+            f"default: one per core, here {os.cpu_count()}, and at most one per "
+            f"environment; this process may use {num_cores()} cores"
+        ],
         "stepping": [stepping()],
         "solver": [str(solver.activate())],
         "extras": extras(),
