@@ -13,8 +13,9 @@ NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 def dot(first: Tensor, second: Tensor) -> Tensor:
     """Inner products of vectors (..., n), (..., 1).
 
-    Elementwise operations give the same bits on every processor. torch's reductions do
-    not, because their kernels fuse multiplications and additions on some processors.
+    Elementwise sums and products give the same bits on every processor. torch's
+    reductions do not, because their kernels fuse multiplications and additions on some
+    processors.
     """
     return reduce(torch.add, (first * second).unbind(-1)).unsqueeze(-1)
 

@@ -313,7 +313,11 @@ def test_an_episode_can_start_from_the_last_state_of_another(env_id, end):
         (torch.tensor([[0.0] * 3, [0.0] * 3, [float("inf")] * 3]), 0, "ment 2"),
         (torch.tensor([[-float("inf")] * 3, [0.0] * 3, [0.0] * 3]), 0, "ment 0"),
         (torch.zeros(3, 4), 0, r"shape \(3, 3\), got \(3, 4\)"),
-        (torch.zeros(3, 3, dtype=torch.int64), 1, "float32, got torch.int64"),
+        (
+            torch.zeros(3, 3, dtype=torch.int64),
+            1,
+            "dtype, got torch.int64: pass",
+        ),
         (torch.zeros(3, 3, device="meta"), 0, "device cpu, got meta"),
     ],
 )

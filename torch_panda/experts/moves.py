@@ -1,8 +1,8 @@
 """Moves that the scripted experts combine.
 
 Positions and offsets are in the world frame [m]. An action of 1 displaces the
-end-effector by 5 cm. All arithmetic is elementwise, so that every processor computes
-the same bits and data sets have the same hashes everywhere.
+end-effector by 5 cm. All arithmetic is elementwise, and `sqrt` is ours, so that every
+processor computes the same bits and data sets have the same hashes everywhere.
 """
 
 import torch
@@ -22,7 +22,16 @@ DECELERATION = 0.25 * 9.81
 
 def norm(vector: Tensor) -> Tensor:
     """Lengths (..., 1) of vectors (..., n)."""
-    return dot(vector, vector).sqrt()
+    return sqrt(dot(vector, vector))
+
+
+def sqrt(values: Tensor) -> Tensor:
+    """Square roots with the same bits on every processor.
+
+    In float32, torch leaves roots to MKL, whose last bit depends on the processor. The
+    root in float64, rounded to float32, does not.
+    """
+    return values.double().sqrt().to(values.dtype)
 
 
 def unit(vector: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from math import prod
 import torch
 from torch import Tensor
 
-from torch_panda.experts.moves import go_over, norm, unit
+from torch_panda.experts.moves import go_over, norm, sqrt, unit
 from torch_panda.rotations import dot
 from torch_panda.tasks.slide import PUCK_RADIUS
 
@@ -49,7 +49,7 @@ def strike_terms(
         The terms, (..., number of terms).
     """
     values = {
-        "s": distance.sqrt(),
+        "s": sqrt(distance),
         "x": puck[..., :1],
         "y": puck[..., 1:2] * side,
         "n": aim[..., 1:] * side,
