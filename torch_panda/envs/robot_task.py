@@ -201,7 +201,7 @@ class RobotTaskEnv(EnvBase):
 
     @property
     def on_divergence(self) -> OnDivergence:
-        """What happens when a step leaves an environment in an infinite state."""
+        """Whether a step that diverges raises an error or resets the environment."""
         return self.episodes.on_divergence
 
     @property

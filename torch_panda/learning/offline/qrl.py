@@ -3,9 +3,9 @@
 The cost of going from a state to a goal is a quasimetric: it satisfies the triangle
 inequality, but need not be symmetric. QRL learns the largest quasimetric d in which
 every observed step costs at most 1. This d is the optimal cost: by the triangle
-inequality, d is at most the number of steps of any path. A Lagrange multiplier lambda,
-which is learned too, enforces the bound on steps. d is an interval quasimetric
-embedding, IQE (arXiv 2211.15120).
+inequality, d is at most the number of steps of any path. A Lagrange multiplier
+lambda enforces the bound on steps, and QRL learns lambda together with d. The network
+that represents d is an interval quasimetric embedding, IQE (arXiv 2211.15120).
 
 With ``actor_loss="descend"``, the paper's policy descends d through a learned model of
 the dynamics. This model needs more gradient steps than d. So the default is "imitate":
