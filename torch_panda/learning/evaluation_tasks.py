@@ -3,7 +3,7 @@
 import torch
 from tensordict import TensorDict
 
-from torch_panda.registry import make
+from torch_panda.registry import Registration, find_registration, make
 
 NUM_STARTS = 41  # starts from which the tasks are chosen
 SEED = 0
@@ -16,6 +16,10 @@ QUANTILES = {
     "far": 0.75,
     "very_far": 0.95,
 }
+
+# The states of each id, and its registration. They are chosen only once in a process,
+# because it takes seconds to build the environments from which they are chosen.
+_CHOSEN: dict[str, tuple[Registration, dict[str, TensorDict]]] = {}
 
 
 def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
@@ -34,6 +38,15 @@ def evaluation_tasks(env_id: str) -> dict[str, TensorDict]:
     Raises:
         ValueError: The id is unknown.
     """
+    registration = find_registration(env_id)
+    # An id can be registered again with another task.
+    if env_id not in _CHOSEN or _CHOSEN[env_id][0] is not registration:
+        _CHOSEN[env_id] = registration, _choose_starts(env_id)
+    return {name: state.clone() for name, state in _CHOSEN[env_id][1].items()}
+
+
+def _choose_starts(env_id: str) -> dict[str, TensorDict]:
+    """Choose the states of `evaluation_tasks`."""
     with make(env_id, num_envs=NUM_STARTS, seed=SEED) as env:
         start = env.reset()
         distance = env.task.distance(start["achieved_goal"], start["desired_goal"])
