@@ -1,6 +1,7 @@
 """What all tests need."""
 
 import signal
+from functools import partial
 
 import pytest
 import torch
@@ -49,14 +50,16 @@ def make_demos(tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Evaluate few episodes and draw small videos.
+    """Evaluate few episodes, draw small videos and make few special starts.
 
     Signal handlers and numbers of threads are restored afterwards.
     """
-    from torch_panda.learning import curve, video
+    from torch_panda.learning import curve, starts, training, video
 
-    monkeypatch.setattr(curve, "EPISODES", 8)
-    monkeypatch.setattr(curve, "NUM_ENVS", 8)
+    few_states = partial(starts.states_at_objects, number=8)
+    monkeypatch.setattr(training, "states_at_objects", few_states)
+    monkeypatch.setattr(curve, "EPISODES", 2)
+    monkeypatch.setattr(curve, "NUM_ENVS", 2)
     monkeypatch.setattr(video, "CELL", (64, 80))
     threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     yield

@@ -27,8 +27,8 @@ def read_commands():
 
 def test_from_data_to_the_video_of_a_policy(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(curve, "EPISODES", 5)
-    monkeypatch.setattr(curve, "NUM_ENVS", 5)
+    monkeypatch.setattr(curve, "EPISODES", 2)
+    monkeypatch.setattr(curve, "NUM_ENVS", 2)
     for words in read_commands():
         for option, size in SMALL.items():
             if option in words:

@@ -55,7 +55,7 @@ def crooked(tmp_path):
 
 def success(path: refine.Path) -> float:
     policy = torch_panda.load_policy(path)
-    options = {"episodes": 64, "num_envs": 32, "seed": 5}
+    options = {"episodes": 24, "num_envs": 12, "seed": 5}
     return torch_panda.evaluate(policy, "PandaReach-v1", **options).success_rate
 
 

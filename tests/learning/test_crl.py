@@ -78,7 +78,7 @@ def test_learns_reach(tmp_path):
     """With the seeds 0 to 4, the success rises from 0 to between 86 and 100 %."""
     args = Args(algo="crl", her="geometric", num_envs=8, gamma=0.95, batch_size=128)
     args.relative_inputs, args.network = "coarse", "layer-norm"
-    args.total_steps, args.eval_interval = 1_600, 800
+    args.total_steps = args.eval_interval = 1_600
     run = Run(args, tmp_path)
     assert run.train()
     run.close()

@@ -75,6 +75,7 @@ def test_policies_with_numbers_that_are_not_finite(tmp_path, part, number):
         torch_panda.load_policy(path)
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_state_with_numbers_that_are_not_finite_is_not_resumed(tmp_path):
     args = Args(total_steps=100, num_envs=2, video=False, out=tmp_path / "run")
     args.updates_per_step = 0.02

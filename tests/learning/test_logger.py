@@ -9,6 +9,8 @@ from torch_panda.learning import logger as logger_module
 from torch_panda.learning.options import Args
 from torch_panda.learning.training import Run
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def make_args(out, **options):
     options = {"total_steps": 200, "eval_interval": 200, "num_envs": 2, **options}

@@ -77,6 +77,7 @@ def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(tmp_path, c
     assert message in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("ratio", "steps"), [(0.0, 100), (0.5, 50)])
 def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(
     ratio, steps, tmp_path
@@ -89,9 +90,10 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(
     assert data.shape == (2, steps)
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("continues", [False, True])
 def test_training_episodes_can_go_on_after_success(continues, tmp_path):
-    args = Args(env_id="PandaReach-v3", num_envs=50, continue_after_success=continues)
+    args = Args(env_id="PandaReach-v3", num_envs=16, continue_after_success=continues)
     run = Run(args, tmp_path)
     after = next(iter(run.collector))["next"]
     run.close()
