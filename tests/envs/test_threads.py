@@ -51,19 +51,19 @@ OWN_ENVIRONMENTS = """
 import threading, torch_panda
 
 def work(seed):
-    for _ in range(2):
+    for _ in range(3):
         with torch_panda.make("PandaPush-v1", num_threads=1, seed=seed) as env:
             env.rollout(2)
             env.render(size=8)
         done.append(seed)
 
 done = []
-threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
+threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
 for thread in threads:
     thread.start()
 for thread in threads:
     thread.join()
-assert len(done) == 8
+assert len(done) == 18
 print("fine")
 """
 

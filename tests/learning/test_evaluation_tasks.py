@@ -11,7 +11,7 @@ from torch_panda import evaluation_tasks
 from torch_panda.learning.evaluation_tasks import _CHOSEN, QUANTILES
 
 
-@pytest.mark.parametrize("env_id", PHYSICS_IDS[::8])
+@pytest.mark.parametrize("env_id", PHYSICS_IDS[::4])
 def test_an_environment_starts_from_each_task(env_id):
     tasks = evaluation_tasks(env_id)
     assert list(tasks) == list(QUANTILES)

@@ -140,7 +140,7 @@ def test_share_and_position_of_relabelled_rows(her_ratio):
     rb = make_buffer(500, her_ratio=her_ratio, seed=0, batch_size=50)
     envs = Envs(4, [1, 7, 20])
     mask = []
-    for _ in range(1000):
+    for _ in range(2000):
         rb.extend(envs.chunk(3).reshape(-1))
         if len(rb) >= 50:
             mask.append(relabelled(rb.sample()))
