@@ -5,9 +5,9 @@ import shlex
 from pathlib import Path
 
 import imageio.v3 as iio
+import pytest
 
 from torch_panda import commands
-from torch_panda.learning import curve
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "torch_panda" / "datasets" / "README.md"
@@ -25,10 +25,9 @@ def read_commands():
     return [words[3:] for words in arguments]
 
 
+@pytest.mark.usefixtures("quick")
 def test_from_data_to_the_video_of_a_policy(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(curve, "EPISODES", 2)
-    monkeypatch.setattr(curve, "NUM_ENVS", 2)
     for words in read_commands():
         for option, size in SMALL.items():
             if option in words:
