@@ -4,6 +4,7 @@ The views are valid until the client's next command, so copy the numbers that yo
 to keep. All numbers are float64. Poses and velocities are in the world frame.
 """
 
+import math
 from ctypes import byref, c_double, c_int, c_void_p
 
 import numpy as np
@@ -21,13 +22,11 @@ U_OFFSET = 6
 _DOUBLE = 8  # bytes
 
 
-def _view(address: int | None, first: int, *shape: int) -> Doubles:
+def _view(pointer: c_void_p, first: int, *shape: int) -> Doubles:
     """A view of an array of doubles in Bullet's memory, from index ``first`` on."""
-    assert address is not None  # the status was checked
-    count = shape[0] if len(shape) == 1 else shape[0] * shape[1]
-    array = (c_double * count).from_address(address + _DOUBLE * first)
-    view: Doubles = np.ctypeslib.as_array(array)
-    return view if len(shape) == 1 else view.reshape(shape)
+    assert pointer.value is not None  # the status was checked
+    array = (c_double * math.prod(shape)).from_address(pointer.value + _DOUBLE * first)
+    return np.ctypeslib.as_array(array).reshape(shape)
 
 
 class BodyState:
@@ -38,27 +37,27 @@ class BodyState:
     """
 
     def __init__(self, status: int) -> None:
-        self._status = status
-        q_size = c_int()
-        q, u, poses, velocities = c_void_p(), c_void_p(), c_void_p(), c_void_p()
+        num_links, q_size = c_int(), c_int()
+        self._q, self._u = c_void_p(), c_void_p()
+        self._wrenches, self._motor_forces = c_void_p(), c_void_p()
+        self._poses, self._velocities = c_void_p(), c_void_p()
         capi.state_result(
             status,
             None,
-            None,
+            byref(num_links),
             byref(q_size),
             None,
             None,
-            byref(q),
-            byref(u),
+            byref(self._q),
+            byref(self._u),
+            byref(self._wrenches),
             None,
-            None,
-            None,
-            byref(poses),
-            byref(velocities),
+            byref(self._motor_forces),
+            byref(self._poses),
+            byref(self._velocities),
         )
+        self._num_links = num_links.value
         self._num_joints = q_size.value - Q_OFFSET
-        self._q, self._u = q.value, u.value
-        self._poses, self._velocities = poses.value, velocities.value
 
     @property
     def base_pose(self) -> Doubles:
@@ -91,7 +90,7 @@ class BodyState:
     @property
     def link_poses(self) -> Doubles:
         """Poses of the links' centres of mass (m, 7)."""
-        return _view(self._poses, 0, self._read_forces()[0], 7)
+        return _view(self._poses, 0, self._num_links, 7)
 
     @property
     def wrenches(self) -> Doubles:
@@ -101,28 +100,9 @@ class BodyState:
         links and is given in the child link's frame. It is zero unless the joint has a
         wrench sensor.
         """
-        num_links, wrenches, _ = self._read_forces()
-        return _view(wrenches, 0, num_links, 6)
+        return _view(self._wrenches, 0, self._num_links, 6)
 
     @property
     def motor_forces(self) -> Doubles:
         """Torques [N m] or forces [N] of the motors in the last substep (m,)."""
-        num_links, _, motors = self._read_forces()
-        return _view(motors, 0, num_links)
-
-    def _read_forces(self) -> tuple[int, int | None, int | None]:
-        """Number of links, address of the wrenches, and address of the motor forces."""
-        links, wrenches, motors = c_int(), c_void_p(), c_void_p()
-        unused = (None,) * 5
-        capi.state_result(
-            self._status,
-            None,
-            byref(links),
-            *unused,
-            byref(wrenches),
-            None,
-            byref(motors),
-            None,
-            None,
-        )
-        return links.value, wrenches.value, motors.value
+        return _view(self._motor_forces, 0, self._num_links)
