@@ -300,7 +300,14 @@ class Episodes:
             BulletError: The environment is closed or needs a reset.
         """
         self._check_all_reset()
-        return self._observer.progress(self._starts.goal, self._starts.step_count)
+        achieved_goal = self.task.achieved_goal(self.simulation).float()
+        desired_goal = self._starts.goal.float()
+        return {
+            "step_count": self._starts.step_count,
+            "achieved_goal": achieved_goal,
+            "desired_goal": desired_goal,
+            "success": self.task.is_success(achieved_goal, desired_goal),
+        }
 
     @contextmanager
     def exclusive(self) -> Iterator[None]:

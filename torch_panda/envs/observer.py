@@ -161,17 +161,6 @@ class EpisodeObserver:
         if action is not None:
             observed["reward"] = self._reward(action, *goals)
 
-    def progress(self, goal: Tensor, step_count: Tensor) -> Observed:
-        """Goals, success and number of steps, (n, ...), for a viewer."""
-        achieved_goal = self._task.achieved_goal(self._simulation).float()
-        desired_goal = goal.float()
-        return {
-            "step_count": step_count,
-            "achieved_goal": achieved_goal,
-            "desired_goal": desired_goal,
-            "success": self._task.is_success(achieved_goal, desired_goal),
-        }
-
     def _reward(
         self, action: Tensor, achieved_goal: Tensor, desired_goal: Tensor
     ) -> Tensor:
