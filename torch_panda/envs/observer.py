@@ -155,38 +155,25 @@ class EpisodeObserver:
         self, observed: Observed, step_count: Tensor, action: Tensor | None
     ) -> None:
         """Compute the outcome: success and end flags, and after a step the reward."""
+        task, simulation = self._task, self._simulation
         goals = observed["achieved_goal"], observed["desired_goal"]
-        observed["success"] = self._task.is_success(*goals)
-        observed |= self._ends(observed["success"], step_count)
-        if action is not None:
-            observed["reward"] = self._reward(action, *goals)
-
-    def _reward(
-        self, action: Tensor, achieved_goal: Tensor, desired_goal: Tensor
-    ) -> Tensor:
-        """The reward of a step, (n, 1) float32."""
-        if not self._has_reward:
-            return self._task.compute_reward(achieved_goal, desired_goal).float()
-        reward = self._task.reward(
-            self._simulation, action.clone(), achieved_goal, desired_goal
-        )
-        return reward.to(torch.float32, copy=True)
-
-    def _ends(self, success: Tensor, step_count: Tensor) -> Observed:
-        """``terminated``, ``truncated`` and ``done``, (n, 1) bool."""
-        terminated = torch.zeros_like(success)
-        if self._terminate_on_success:
-            # No episode ends before its first step.
-            terminated = success & (step_count > 0)
+        success = task.is_success(*goals)
+        ends = success if self._terminate_on_success else torch.zeros_like(success)
         if self._has_failure:
-            failure = self._task.failure(self._simulation)
-            terminated = terminated | failure & (step_count > 0)
+            ends = ends | task.failure(simulation)
+        terminated = ends & (step_count > 0)  # no episode ends before its first step
         truncated = step_count >= self._max_episode_steps
-        return {
+        observed |= {
+            "success": success,
             "terminated": terminated,
             "truncated": truncated,
             "done": terminated | truncated,
         }
+        if action is not None and self._has_reward:
+            reward = task.reward(simulation, action.clone(), *goals)
+            observed["reward"] = reward.to(torch.float32, copy=True)
+        elif action is not None:
+            observed["reward"] = task.compute_reward(*goals).float()
 
     def _check_entries(self, observer: Observer, values: Observed) -> None:
         """Check the tensors that an observer returned; see `observe`."""
