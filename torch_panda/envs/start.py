@@ -1,11 +1,8 @@
 """Draws the starts of episodes and holds the tensors of the state."""
 
 import math
-from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -45,6 +42,8 @@ class EpisodeStarts:
         n = simulation.num_envs
         self.goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
         self.step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
+        # Arrays of the same memory: indexing a tensor takes three times as long.
+        self._arrays = {key: value.numpy() for key, value in self.state().items()}
 
     def state(self) -> dict[str, Tensor]:
         """The tensors of the state, (n, ...) by key, not copied."""
@@ -62,14 +61,6 @@ class EpisodeStarts:
             state["object_joint_position"] = simulation.object_joint_position
             state["object_joint_velocity"] = simulation.object_joint_velocity
         return state
-
-    @cached_property
-    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """The tensors of `state` as arrays of the same memory.
-
-        Indexing a tensor takes three times as long.
-        """
-        return {key: value.numpy() for key, value in self.state().items()}
 
     def draw(self, env: int) -> None:
         """Write the start of an environment's next episode into the state tensors.
