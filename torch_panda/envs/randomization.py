@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -105,10 +104,6 @@ class Randomization:
     def names(self) -> tuple[str, ...]:
         """Names of the drawn factors, in the order of ``physics_parameters``."""
         return tuple(name for name in PARAMETERS if getattr(self, name) is not None)
-
-    def bounds(self) -> npt.NDArray[np.float64]:
-        """The lowest and the highest factors, (2, k)."""
-        return np.array([getattr(self, name) for name in self.names]).T
 
 
 class _Target(NamedTuple):
@@ -234,7 +229,8 @@ class DomainRandomizer:
             )
         if names:
             k = len(names)
-            self._bounds = self._randomization.bounds()
+            ranges = [getattr(self._randomization, name) for name in names]
+            self._bounds = np.array(ranges).T  # lowest and highest factors, (2, k)
             self._is_mass = torch.tensor(
                 [name == "object_mass" for name in names], device="cpu"
             )
@@ -283,9 +279,7 @@ class DomainRandomizer:
 
     def observe(self) -> dict[str, Tensor]:
         """The observed entries of all environments, (n, ...), in new tensors."""
-        if not self.entries:
-            return {}
-        return {PHYSICS_PARAMETERS: self.state[PHYSICS_PARAMETERS].float()}
+        return {key: self.state[key].float() for key in self.entries}
 
     def check_state(self, values: dict[str, Tensor], envs: Sequence[int]) -> None:
         """Check the factors (len(envs), k) in a state to start from.
