@@ -3,8 +3,7 @@
 from typing import NamedTuple
 
 from torch_panda.bullet import capi
-
-Vector = tuple[float, float, float]
+from torch_panda.bullet.blueprint import Vector
 
 
 class ContactPoint(NamedTuple):

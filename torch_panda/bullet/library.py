@@ -33,7 +33,7 @@ def wrong_pybullet(reason: str) -> ImportError:
 
 
 def library_path(module: str = "pybullet") -> str:
-    """Path of an extension module, without importing it.
+    """Path of a module that pybullet installs, without importing it.
 
     Raises:
         ImportError: pybullet is not installed.

@@ -5,6 +5,8 @@ import operator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from torch_panda.checks import check_not_negative
+
 PhysicsName = Literal["exact", "fast"]
 
 
@@ -57,11 +59,7 @@ class PhysicsParams:
             raise ValueError(
                 f"timestep must be positive and finite [s], got {self.timestep}"
             )
-        if not 0 <= self.residual_threshold < math.inf:
-            raise ValueError(
-                f"residual_threshold must be finite and at least 0, "
-                f"got {self.residual_threshold}"
-            )
+        check_not_negative(residual_threshold=self.residual_threshold)
         if not 0 < self.position_gain <= 1:
             raise ValueError(
                 f"position_gain must lie in (0, 1], got {self.position_gain}"

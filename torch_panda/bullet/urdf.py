@@ -1,13 +1,14 @@
 """URDF files: finding them, checking them, and adding a link to them."""
 
 import functools
-import importlib.util
 import re
 import tempfile
 import threading
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
+
+from torch_panda.bullet.library import library_path
 
 _JOINT_TYPES = (
     "revolute",
@@ -53,9 +54,7 @@ def find_urdf(path: str | Path) -> str:
     Raises:
         FileNotFoundError: The file is in neither place.
     """
-    spec = importlib.util.find_spec("pybullet_data")
-    assert spec is not None and spec.origin is not None  # part of pybullet's wheel
-    shipped = Path(spec.origin).parent
+    shipped = Path(library_path("pybullet_data")).parent
     for candidate in (Path(path), shipped / path):
         if candidate.is_file():
             return str(candidate.absolute())
