@@ -273,20 +273,13 @@ load_set_snapshot = _cheap("b3LoadStateSetStateId", c_int, _command, c_int)
 
 # Motors
 motor_init = _cheap("b3JointControlCommandInit2", _command, _client, c_int, c_int)
-motor_set_position = _cheap(
-    "b3JointControlSetDesiredPosition", c_int, _command, c_int, c_double
-)
-motor_set_velocity = _cheap(
-    "b3JointControlSetDesiredVelocity", c_int, _command, c_int, c_double
-)
-motor_set_torque = _cheap(
-    "b3JointControlSetDesiredForceTorque", c_int, _command, c_int, c_double
-)
-motor_set_kp = _cheap("b3JointControlSetKp", c_int, _command, c_int, c_double)
-motor_set_kd = _cheap("b3JointControlSetKd", c_int, _command, c_int, c_double)
-motor_set_force = _cheap(
-    "b3JointControlSetMaximumForce", c_int, _command, c_int, c_double
-)
+_set_motor = (c_int, _command, c_int, c_double)  # index in q or u, value
+motor_set_position = _cheap("b3JointControlSetDesiredPosition", *_set_motor)
+motor_set_velocity = _cheap("b3JointControlSetDesiredVelocity", *_set_motor)
+motor_set_torque = _cheap("b3JointControlSetDesiredForceTorque", *_set_motor)
+motor_set_kp = _cheap("b3JointControlSetKp", *_set_motor)
+motor_set_kd = _cheap("b3JointControlSetKd", *_set_motor)
+motor_set_force = _cheap("b3JointControlSetMaximumForce", *_set_motor)
 
 # Inverse kinematics
 ik_init = _cheap("b3CalculateInverseKinematicsCommandInit", _command, _client, c_int)
