@@ -1,7 +1,7 @@
 """Euler angles, in Python and in C, equal pybullet's."""
 
 import math
-from ctypes import c_double
+from ctypes import CDLL, c_double
 
 import numpy as np
 import pybullet
@@ -17,7 +17,7 @@ angle = st.floats(-math.pi, math.pi)
 
 def native_angles(*quaternion):
     angles = (c_double * 3)()
-    native.LIBRARY.euler_angles((c_double * 4)(*quaternion), angles)
+    CDLL(native.LIBRARY.path).euler_angles((c_double * 4)(*quaternion), angles)
     return list(angles)
 
 

@@ -265,8 +265,6 @@ class Library:
         self.reset = bind(work, "loop_reset", c_int, c_void_p, integers, c_int)
         self.reset_one = bind(work, "client_reset", c_int, POINTER(Batch), c_int)
         self.destroy = bind(work, "loop_destroy", None, c_void_p)
-        doubles = POINTER(c_double)
-        self.euler_angles = bind(work, "euler_angles", None, doubles, doubles)
         self.environment_begin_step = bind(
             cheap,
             "environment_begin_step",
