@@ -61,8 +61,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
     ) -> None:
         check_render_mode(render_mode)
-        camera, arguments = take_camera(render_camera, arguments)
-        self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
+        self._camera, arguments = take_camera(render_camera, arguments)
         if isinstance(env, str):
             env = make(env, **{"max_episode_steps": sys.maxsize, **arguments})
         else:
@@ -118,7 +117,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         """A picture (height, width, 3) if the render mode is "rgb_array", else None."""
         if self.render_mode is None:
             return None
-        return self.torch_env.render(**self._view).cpu().numpy()
+        return self.torch_env.render(camera=self._camera).cpu().numpy()
 
     def close(self) -> None:
         """Free the client. Closing again does nothing."""

@@ -67,8 +67,7 @@ class GoalVectorEnv(
         self.closed = True  # nothing needs closing until everything is built
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         check_render_mode(render_mode)
-        camera, arguments = take_camera(render_camera, arguments)
-        self._view: dict[str, Any] = {} if camera is None else {"camera": camera}
+        self._camera, arguments = take_camera(render_camera, arguments)
         if isinstance(env, str):
             env = make(env, num_envs=1 if num_envs is None else num_envs, **arguments)
         else:
@@ -174,7 +173,7 @@ class GoalVectorEnv(
         """Pictures (height, width, 3) if the render mode is "rgb_array", else None."""
         if self.render_mode is None:
             return None
-        return tuple(self.torch_env.render(**self._view).cpu().numpy())
+        return tuple(self.torch_env.render(camera=self._camera).cpu().numpy())
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ANN401 (Gymnasium's)
         """Free all clients and threads."""
