@@ -45,10 +45,9 @@ _ARM_MODES: dict[ControlType, ArmMode] = {
 
 Workspace = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest (x, y, z) of a box, world frame [m]."""
-_FAR = math.inf
 # A neutral position this far outside a joint's limits [rad] or [m] is a rounding error.
 _LIMIT_TOLERANCE = 0.01
-ABOVE_THE_TABLE: Workspace = ((-_FAR, -_FAR, 0.0), (_FAR, _FAR, _FAR))
+ABOVE_THE_TABLE: Workspace = ((-math.inf, -math.inf, 0.0), (math.inf,) * 3)
 
 
 class Robot(Configured):
@@ -155,15 +154,13 @@ class Robot(Configured):
                 f"{len(joint_forces)}, got {num_arm_joints}"
             )
         self.num_arm_joints = num_arm_joints
-        if gripper is not None and self.num_arm_joints + num_fingers != len(
-            joint_forces
-        ):
+        if gripper is not None and num_arm_joints + num_fingers != len(joint_forces):
             raise ValueError(
-                f"a robot with this gripper must have {self.num_arm_joints} joints of "
-                f"the arm and {num_fingers} of the gripper, got {len(joint_forces)} "
+                f"a robot with this gripper must have {num_arm_joints} joints of the "
+                f"arm and {num_fingers} of the gripper, got {len(joint_forces)} "
                 f"joint_forces"
             )
-        others = self.neutral_joint_position[self.num_arm_joints :]
+        others = self.neutral_joint_position[num_arm_joints:]
         self._other_joints = torch.tensor(others, dtype=torch.float64, device="cpu")
         self.control_type: ControlType = control_type
         self.action_scale = action_scale
