@@ -350,7 +350,9 @@ class Episodes:
         self._history.begin(envs)
         if self._goal_observer is not None:
             self._goal_observer.update(envs, self._starts.goal)
-        self._starts.reset_simulation(envs)
+        randomizer = self._randomizer
+        randomize = randomizer.apply if randomizer.changes_physics else None
+        self.simulation.reset(envs, randomize)
         self._observer.after_reset(envs)
 
     @property

@@ -17,7 +17,7 @@ from torch_panda.tasks import Task
 
 
 class EpisodeStarts:
-    """Draws the starts of n environments' episodes and resets the simulation to them.
+    """Draws the starts of n environments' episodes into the tensors of the state.
 
     The robot starts in its neutral pose. The task draws the goal, the objects and their
     joints. The randomizer draws the physics, and offsets of the robot's joints.
@@ -119,13 +119,6 @@ class EpisodeStarts:
         for env in envs:
             poses[env, :, :3] = goals[env].reshape(-1, 3)
             poses[env, :, 3:] = NO_ROTATION
-
-    def reset_simulation(self, envs: list[int]) -> None:
-        """Reset the clients of some environments to the state tensors."""
-        randomizer = self._randomizer
-        self._simulation.reset(
-            envs, randomizer.apply if randomizer.changes_physics else None
-        )
 
     def _error_name(self, name: str) -> str:
         """``sample_start`` if the task overrides it, otherwise ``name``; for errors."""
