@@ -61,7 +61,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
     ) -> None:
         check_render_mode(render_mode)
-        self._camera, arguments = take_camera(render_camera, arguments)
+        self._camera = take_camera(render_camera, arguments)
         if isinstance(env, str):
             env = make(env, **{"max_episode_steps": sys.maxsize, **arguments})
         else:

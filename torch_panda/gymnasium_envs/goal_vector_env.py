@@ -67,7 +67,7 @@ class GoalVectorEnv(
         self.closed = True  # nothing needs closing until everything is built
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         check_render_mode(render_mode)
-        self._camera, arguments = take_camera(render_camera, arguments)
+        self._camera = take_camera(render_camera, arguments)
         if isinstance(env, str):
             env = make(env, num_envs=1 if num_envs is None else num_envs, **arguments)
         else:

@@ -32,34 +32,26 @@ def check_render_mode(render_mode: str | None) -> None:
         )
 
 
-def take_camera(
-    camera: Camera | None, arguments: dict[str, Any]
-) -> tuple[Camera | None, dict[str, Any]]:
-    """Separate the camera arguments of panda-gym from other arguments.
+def take_camera(camera: Camera | None, arguments: dict[str, Any]) -> Camera | None:
+    """Change a camera by panda-gym's camera arguments.
 
     Args:
-        camera: The camera that these arguments change; None means a `Camera` with
-            panda-gym's defaults.
-        arguments: Keyword arguments of a Gymnasium environment.
+        camera: The camera; None means a `Camera` with panda-gym's defaults.
+        arguments: Keyword arguments of a Gymnasium environment. The call removes
+            panda-gym's camera arguments from this dict.
 
     Returns:
-        The changed camera, or ``camera`` itself if there are no such arguments; and the
-        other arguments.
+        The changed camera, or ``camera`` itself if there are no such arguments.
 
     Raises:
         ValueError: A camera argument is out of range.
     """
     changes = {
-        _CAMERA_FIELDS[name]: value
-        for name, value in arguments.items()
-        if name in _CAMERA_FIELDS
+        field: arguments.pop(name)
+        for name, field in _CAMERA_FIELDS.items()
+        if name in arguments
     }
     if "target" in changes:
         x, y, z = changes["target"]
         changes["target"] = (float(x), float(y), float(z))
-    others = {
-        name: value for name, value in arguments.items() if name not in _CAMERA_FIELDS
-    }
-    if changes:
-        camera = dataclasses.replace(camera or Camera(), **changes)
-    return camera, others
+    return dataclasses.replace(camera or Camera(), **changes) if changes else camera
