@@ -242,17 +242,13 @@ class RobotTaskEnv(EnvBase):
     def __repr__(self) -> str:
         """The class, the arguments that are not the defaults, and Bullet's solver."""
         args, kwargs = self._arguments
-        defaults = {
-            name: parameter.default
-            for name, parameter in inspect.signature(
-                type(self).__init__
-            ).parameters.items()
-        }
+        parameters = inspect.signature(type(self).__init__).parameters
+        defaults = {name: parameter.default for name, parameter in parameters.items()}
         arguments = [repr(value) for value in args]
         arguments += [
             f"{name}={value!r}"
             for name, value in kwargs.items()
-            if value is not defaults.get(name) and value != defaults.get(name)
+            if value != defaults.get(name)
         ]
         call = f"{type(self).__name__}({', '.join(arguments)})"
         from torch_panda.bullet import solver  # already imported by the clients
