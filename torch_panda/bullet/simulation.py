@@ -63,7 +63,7 @@ class VectorSimulation:
         self._physics = physics
         self._scene_builder = build
         self._clients: list[PhysicsClient] = []
-        self._broad_phases: list[BroadPhase] = []
+        self._broad_phases: dict[int, BroadPhase] = {}
         self._pool = WorkerPool(min(num_threads, num_envs))
         self._indices = frozenset(range(num_envs))
         self._native: NativeLoop | None = None
@@ -73,10 +73,13 @@ class VectorSimulation:
             self.scene = _build_scene(build, client)
             self._check_joints()
             self._blueprint = client.blueprint
-            self._broad_phases.append(BroadPhase(client))
             for _ in range(1, num_envs):
                 self._clients.append(PhysicsClient(physics=physics))
-                self._broad_phases.append(self._build_same_scene(self._clients[-1]))
+                self._build_same_scene(self._clients[-1])
+            # This is half of the work of building a client, so use all threads. The
+            # scenes above are built one by one, because users write that code.
+            self._pool.run(self._plan_resets, range(num_envs))
+            self._pool.close()  # the compiled loop has its own threads
             self.state = state = SimulationState(self.scene, num_envs)
             # Tasks, robots and sensors read these tensors as attributes of the
             # simulation.
@@ -238,7 +241,8 @@ class VectorSimulation:
         """Replace a diverged client by a new one: no reset removes NaN from Bullet."""
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
-        self._broad_phases[env] = self._build_same_scene(client)
+        self._build_same_scene(client)
+        self._plan_resets(env)
         if self._native is not None:
             self._native.replace(env, client)
 
@@ -250,7 +254,7 @@ class VectorSimulation:
         for client in self._clients:
             client.close()
 
-    def _build_same_scene(self, client: PhysicsClient) -> BroadPhase:
+    def _build_same_scene(self, client: PhysicsClient) -> None:
         """Build the scene in a later client; raise if it differs from the first."""
         scene = _build_scene(self._scene_builder, client)
         first, other = (self.scene, *self._blueprint), (scene, *client.blueprint)
@@ -267,7 +271,10 @@ class VectorSimulation:
                 f"commands built it in the first client, and {len(other) - 1} in a "
                 f"later one"
             )
-        return BroadPhase(client)
+
+    def _plan_resets(self, env: int) -> None:
+        """Find out how to restore the broad phase of a client that was just built."""
+        self._broad_phases[env] = BroadPhase(self._clients[env])
 
     def _check_indices(self, envs: Sequence[int]) -> None:
         """Refuse indices with which threads of C would crash the interpreter.
