@@ -215,7 +215,7 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     for prefix in ("package://", "model://", "file://"):
         name = name.removeprefix(prefix)
     folders = (*urdf.absolute().parents, Path(), Path(".."), Path("../.."))
-    candidates = [folder / name for folder in folders]
+    candidates = (folder / name for folder in folders)
     return next((path.absolute() for path in candidates if path.is_file()), None)
 
 
