@@ -1,6 +1,6 @@
-"""Faster dynamics, kinematics and broad phase for Bullet, equal bit for bit.
+"""Faster dynamics, kinematics, broad phase and snapshots, equal bit for bit.
 
-`activate` replaces eight of Bullet's functions in this process if all conditions of
+`activate` replaces nine of Bullet's functions in this process if all conditions of
 ``gate.py`` hold. From then on, all clients of the process run the replacements, also
 clients that a user opened with pybullet. Each C file lists which of Bullet's functions
 it reimplements, and explains why its results are the same.

@@ -419,7 +419,11 @@ struct status {
 };
 
 /* enum EnumSharedMemoryClientCommand and EnumSharedMemoryServerStatus */
-enum { CALCULATE_INVERSE_KINEMATICS = 27, INVERSE_KINEMATICS_COMPLETED = 43 };
+enum {
+    CALCULATE_INVERSE_KINEMATICS = 27,
+    SAVE_STATE = 60,
+    INVERSE_KINEMATICS_COMPLETED = 43,
+};
 
 /* enum EnumCalculateInverseKinematicsFlags */
 enum {

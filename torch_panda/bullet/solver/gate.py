@@ -87,6 +87,10 @@ _REPLACED = (
         "_ZN16btDbvtBroadphase7setAabbEP17btBroadphaseProxyRK9btVector3S4_"
         "P12btDispatcher",
     ),
+    (
+        _WORLD,
+        "_ZN24btMultiBodyDynamicsWorld20serializeMultiBodiesEP12btSerializer",
+    ),
 )
 # ctypes knows the address of this exported function. That address minus the function's
 # address in the file is where pybullet's extension module was loaded.

@@ -22,11 +22,11 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-enum { VERSION = 7 }; /* native.py refuses a library of another version */
+enum { VERSION = 8 }; /* native.py refuses a library of another version */
 
 /* The functions that are replaced, in the order of gate.py. */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, EXTERNAL_FORCES,
-       COMMAND, UPDATE_AABBS, SET_AABB, NUM_FUNCTIONS };
+       COMMAND, UPDATE_AABBS, SET_AABB, SERIALIZE_BODIES, NUM_FUNCTIONS };
 
 enum { MAX_BODIES = 16 }; /* of a world; Bullet accelerates further bodies */
 
@@ -54,6 +54,9 @@ typedef void update_function(struct world *);
 typedef void aabb_function(struct broad_phase *, struct proxy *, const struct vector3 *,
                            const struct vector3 *, void *);
 
+/* btMultiBodyDynamicsWorld::serializeMultiBodies */
+typedef void serialize_function(struct world *, void *);
+
 /* Whether a thread runs Bullet's functions or the replacements. */
 enum mode {
     FOLLOW, /* the ones that solver_enable chose for the whole process */
@@ -76,6 +79,8 @@ struct counts {
     int bullet_answers;   /* for inverse kinematics, by Bullet */
     int aabbs;            /* that `move_aabb` moved */
     int bullet_aabbs;     /* that Bullet moved instead */
+    int snapshots;        /* without shapes */
+    int bullet_snapshots; /* with shapes */
     int joint_rows;       /* that were probed */
     int contact_rows;     /* that were probed */
     int spinning_rows;    /* that were probed */
@@ -95,6 +100,16 @@ static __thread struct responses **responses;
 
 /* The AABBs of a world while Bullet updates them in this thread, otherwise NULL. */
 static __thread struct aabbs *aabbs;
+
+/* A world whose objects are hidden while Bullet takes a snapshot of it, and their number.
+   The world is NULL if no objects are hidden. */
+struct snapshot {
+    struct world *world;
+    int num_objects;
+};
+
+/* The snapshot that Bullet takes in this thread, otherwise NULL. */
+static __thread struct snapshot *snapshot;
 
 static int is_active(void) {
     const enum mode own = mode;
@@ -249,8 +264,12 @@ static char process_command(struct server *server, const struct command *command
         if (mode == SOLVE) *(answered ? &counts.answers : &counts.bullet_answers) += 1;
         if (answered) return 1;
     }
+    struct snapshot taken = {NULL, 0};
+    if (command->type == SAVE_STATE && is_active()) snapshot = &taken;
     const char has_status = ((command_function *)bullet[COMMAND])(
         server, command, status, buffer, buffer_size);
+    snapshot = NULL;
+    if (taken.world != NULL) taken.world->objects.size = taken.num_objects;
     if (is_known && mode == PROBE && counts.mismatch == NULL)
         counts.mismatch =
             probe_command(server, command, status, probed_world, &expectation);
@@ -286,6 +305,31 @@ static void set_aabb(struct broad_phase *broad_phase, struct proxy *proxy,
     if (list != NULL) follow_bullet(list, broad_phase, proxy);
 }
 
+static int has_only_links(const struct world *world) {
+    struct collision_object *const *objects = world->objects.data;
+    for (int i = 0; i < world->objects.size; i++)
+        if (objects[i]->internal_type != LINK_COLLIDER) return 0;
+    return 1;
+}
+
+/*
+ * Serializes the bodies of a world.
+ *
+ * Afterwards, Bullet serializes the collision shapes of the world's objects. Loading a
+ * snapshot does not use the shapes, but Bullet scans the snapshot byte by byte, and with
+ * a Panda three quarters of the bytes are shapes. Hide the objects of a snapshot, so that
+ * it has no shapes.
+ */
+static void serialize_bodies(struct world *world, void *serializer) {
+    ((serialize_function *)bullet[SERIALIZE_BODIES])(world, serializer);
+    if (snapshot == NULL) return;
+    const int hides = has_only_links(world);
+    if (mode == SOLVE) *(hides ? &counts.snapshots : &counts.bullet_snapshots) += 1;
+    if (!hides) return;
+    *snapshot = (struct snapshot){world, world->objects.size};
+    world->objects.size = 0;
+}
+
 /* Stores a function in a slot of a vtable. Returns 0, or 1 if the system does not make
    the page writable. */
 static int store(void **slot, void *function) {
@@ -311,7 +355,8 @@ int solver_install(void **const *new_slots, void *const *functions) {
     void *const replacements[] = {(void *)iterations, (void *)convert,
                                   (void *)motor_rows, (void *)limit_rows,
                                   (void *)external_forces, (void *)process_command,
-                                  (void *)update_aabbs, (void *)set_aabb};
+                                  (void *)update_aabbs, (void *)set_aabb,
+                                  (void *)serialize_bodies};
     for (int i = 0; i < NUM_FUNCTIONS; i++) {
         slots[i] = new_slots[i];
         bullet[i] = functions[i];

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 # Version of the C sources, as in hook.c: the library must have been compiled from
 # sources of this version.
-VERSION = 7
+VERSION = 8
 
 # ``enum mode`` in hook.c. A thread in the mode FOLLOW runs Bullet's functions or the
 # replacements, as `SolverLibrary.enable` chose. PROBE checks Bullet's layout, SOLVE
@@ -83,6 +83,8 @@ class Counts(Structure):
         ("bullet_answers", c_int),
         ("aabbs", c_int),
         ("bullet_aabbs", c_int),
+        ("snapshots", c_int),
+        ("bullet_snapshots", c_int),
         ("joint_rows", c_int),
         ("contact_rows", c_int),
         ("spinning_rows", c_int),

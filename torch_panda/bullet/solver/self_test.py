@@ -51,6 +51,7 @@ _JOINT_TARGET = 0.8  # lies beyond the limits of all joints
 _TARGET = (0.3, 0.1, 0.2, 0.5, 0.5, 0.1, 0.7)  # pose for the inverse kinematics
 _IK_DAMPING = 0.02
 _IK_ITERATIONS = 6
+_SAVE_STEP, _LOAD_STEP = 20, 40  # before which a snapshot is taken and loaded
 
 
 def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) -> None:
@@ -121,6 +122,8 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         raise GateError(
             "the packed solver did not compute the inverse kinematics of the self-test"
         )
+    if (counts.snapshots, counts.bullet_snapshots) != (1, 0):
+        raise GateError("the snapshot of the self-test has collision shapes")
     if not counts.aabbs:
         raise GateError("the packed solver did not move the AABBs of the self-test")
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
@@ -136,6 +139,10 @@ def _simulate() -> list[bytes]:
             arm, *boxes = _build(connection)
             states = []
             for step in range(_NUM_STEPS):
+                if step == _SAVE_STEP:
+                    snapshot = _save(connection)
+                if step == _LOAD_STEP:
+                    _load(connection, snapshot)
                 _drive(connection, arm, step)
                 connection.submit(
                     capi.step_init(connection.handle),
@@ -214,6 +221,21 @@ def _drive(connection: Connection, arm: int, step: int) -> None:
     connection.submit(
         command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
     )
+
+
+def _save(connection: Connection) -> int:
+    status = connection.submit(
+        capi.save_init(connection.handle),
+        capi.CMD_SAVE_STATE_COMPLETED,
+        "save a state",
+    )
+    return int(capi.status_snapshot(status))
+
+
+def _load(connection: Connection, snapshot: int) -> None:
+    command = capi.load_init(connection.handle)
+    capi.load_set_snapshot(command, snapshot)
+    connection.submit(command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state")
 
 
 def _reach(connection: Connection, arm: int, link: int) -> bytes:
