@@ -167,7 +167,7 @@ struct actuation {
 };
 
 enum { WIDTH = -1 }; /* the column of the distance between the fingers */
-struct observation { /* what EpisodeObserver of observer.py observes */
+struct observation { /* the entries that EpisodeObserver of observer.py observes */
     int row_size, size, goal_size;
     const int *columns, *goal_columns; /* of entries in the row of a client */
     struct gripper gripper;

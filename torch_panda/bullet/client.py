@@ -650,11 +650,11 @@ class PhysicsClient:
         """Contacts of the last substep.
 
         Args:
-            body_a: Only contacts of this body, with the two bodies swapped where
-                necessary, so that this one is ``body_a``. None means all contacts,
-                unswapped.
-            body_b: Only contacts whose body b is this one (after swapping). None means
-                any body b.
+            body_a: Only contacts of this body. Where Bullet reports it as the second
+                body, the two bodies of the contact are swapped. None means all
+                contacts, unswapped.
+            body_b: Only contacts whose second body (after swapping) is this body. None
+                means any second body.
         """
         from torch_panda.bullet.contacts import read_contact
 

@@ -75,8 +75,8 @@ def parse_urdf(file: str | Path) -> ElementTree.Element:
         raise ValueError(f"{file} is not a URDF: it has no <robot> element")
     last = text.rfind(end) + len(end) if end in text else None
     try:
-        # Replace the text before the element by as many empty lines, so that line
-        # numbers in errors are those of the file.
+        # Replace each line before the element by an empty line, so that errors have the
+        # line numbers of the file.
         empty_lines = "\n" * text.count("\n", 0, first.start())
         return ElementTree.fromstring(empty_lines + text[first.start() : last])
     except ElementTree.ParseError as error:

@@ -266,7 +266,8 @@ class Episodes:
                 ended = [goal[diverged] for goal in self._goals]
                 self._recover(diverged)
                 started = [goal[diverged] for goal in self._goals]
-                # Observe the next episodes with the goals that the policy pursued.
+                # The observations show the next episodes, but with the goals of the
+                # ended ones, which the policy pursued.
                 self._set_goals(diverged, ended)
             self._observer.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe(action)

@@ -102,8 +102,8 @@ class RobotTaskEnv(EnvBase):
             is not finite. In any case, the environment starts its next episode.
             "raise": the step raises `BulletError`. "reset": the step returns the first
             observation of the next episode, but with the ``desired_goal`` of the ended
-            episode, and the reward of both; ``success`` is False and ``truncated`` is
-            True.
+            episode. The reward is computed from these two, ``success`` is False and
+            ``truncated`` is True.
         randomize: Ranges from which the physics of every episode are drawn; None keeps
             the physics of the task.
         goal: "task" observes the task's goals. "observation" makes ``achieved_goal``

@@ -118,8 +118,9 @@ class VectorRenderer:
 def mesh_cell(camera: Camera) -> float:
     """Mesh cell that suits a camera's pictures [m].
 
-    It is half the size of a pixel at the camera's target, rounded to millimetres. It is
-    0, which draws all details, if such small cells would not save time.
+    It is half the size of a pixel at the camera's target, rounded to millimetres. Cells
+    below `_FINEST_CELL` would not save time. The result is then 0, which draws all
+    details.
     """
     pixel = 2 * camera.distance * math.tan(math.radians(camera.fov) / 2) / camera.height
     cell = round(pixel / 2, 3)

@@ -2,9 +2,9 @@
 
 Any web page that a browser shows may open connections to a server on the same machine.
 Two headers of a request tell whether it comes from the viewer's own page. ``Origin``
-names the page that opened the connection. ``Host`` names the server as the page knows
-it. It reveals a page of another site whose domain name was made to resolve to this
-machine (DNS rebinding).
+names the page that opened the connection. ``Host`` is the name by which the page knows
+the server. If another site makes its own domain name resolve to this machine (DNS
+rebinding), ``Host`` is that name.
 """
 
 import contextlib

@@ -221,8 +221,8 @@ def read_forces(
 ) -> npt.NDArray[np.float64]:
     """Contact points [m] and forces [N] of the last step, (n, 2, 3).
 
-    The force of a contact is the one on the object, if the contact has an object, and
-    otherwise the one on the robot. Other contacts are left out.
+    The force acts on the object if the contact has one, otherwise on the robot.
+    Contacts of neither are left out.
     """
     scene = simulation.scene
     rank = {body: 2 for body in scene.objects} | {scene.robot: 1}

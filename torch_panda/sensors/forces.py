@@ -1,8 +1,8 @@
 """Force sensors.
 
 They report the values of the last substep of a step, not averages over the step. After
-a reset all values are zero, because no time has passed. Only a reset to an exact state
-has the values of its last step.
+a reset all values are zero, because no time has passed. After a reset to an exact
+state, which repeats the steps up to this state, they are the values of its last step.
 """
 
 from abc import abstractmethod

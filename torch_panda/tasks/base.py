@@ -148,8 +148,8 @@ class Task(Configured, ABC):
     The position of each object must precede its other quantities."""
     sampled_goal_height: ClassVar[float | None] = None
     """Height of all sampled goals [m], in a task whose objects come to rest below this
-    height, as in Slide. None in all other tasks. Relative inputs in training use it for
-    achieved goals too."""
+    height, as in Slide. None in all other tasks. In training, relative inputs replace
+    the height of achieved goals by this height."""
 
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
@@ -220,10 +220,10 @@ class Task(Configured, ABC):
         """Change the physics of an environment before each of its episodes.
 
         Optional. It runs in the thread that resets the environment. Its changes may
-        depend on ``rng`` only. They last until the next change, so if it sets a
-        property in one episode, it must set this property in every episode. It runs
-        after a `Randomization` of the environment. If both set the same property, the
-        ``physics_parameters`` that the `Randomization` observes are wrong.
+        depend on ``rng`` only. A change lasts until the next one, so a property that
+        the hook sets in one episode must be set in every episode. The hook runs after
+        the environment's `Randomization`. If both set the same property, the observed
+        ``physics_parameters`` are wrong.
 
         Args:
             client: Client of the environment; see `PhysicsClient.set_dynamics`.
