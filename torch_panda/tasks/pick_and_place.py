@@ -27,6 +27,8 @@ class PickAndPlace(Push):
         table_friction: Lateral friction of the table.
     """
 
+    marker_height = 0.05
+
     goal_z_range: float = 0.2
     object_friction: float = 5.0
 

@@ -43,6 +43,8 @@ class Push(Task):
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = OBJECT_LAYOUT
+    # Height at which panda-gym creates the marker, before it draws a goal [m].
+    marker_height = CUBE_SIZE / 2
 
     goal_xy_range: float = 0.3
     obj_xy_range: float = 0.3
@@ -54,8 +56,10 @@ class Push(Task):
         """Build the table, the cube and the marker."""
         create_table(client, friction=self.table_friction)
         cube = create_cube(client, mass=self.object_mass, friction=self.object_friction)
-        marker = client.create_marker((0.0, 0.0, CUBE_SIZE / 2), CUBE)
-        return Bodies(objects=(cube,), markers=(marker,))
+        return Bodies(
+            objects=(cube,),
+            markers=(client.create_marker((0.0, 0.0, self.marker_height), CUBE),),
+        )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a position of the cube on the table, (3,)."""
