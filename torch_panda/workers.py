@@ -25,24 +25,15 @@ def name_dead_workers(processes: Iterable[BaseProcess]) -> Iterator[None]:
     Raises:
         RuntimeError: A worker died. The error names the worker and its exit code.
     """
-    workers = [(process, _pid(process)) for process in processes]
     try:
         yield
     except (RuntimeError, ValueError) as error:
-        for index, (process, pid) in enumerate(workers):
+        for index, process in enumerate(processes):
             if (code := _exit_code(process)) is not None:
                 raise RuntimeError(
-                    f"worker {index} (process {pid}) died with exit code {code}"
+                    f"worker {index} (process {process.pid}) died with exit code {code}"
                 ) from error
         raise
-
-
-def _pid(process: BaseProcess) -> int | None:
-    """Process id, or None if torchrl has closed the process."""
-    try:
-        return process.pid
-    except ValueError:
-        return None
 
 
 def _exit_code(process: BaseProcess) -> int | None:
