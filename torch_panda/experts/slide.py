@@ -1,6 +1,5 @@
 """The scripted expert for Slide: one strike, whose strength is a fitted polynomial."""
 
-from collections.abc import Iterable
 from math import prod
 
 import torch
@@ -33,74 +32,46 @@ DEVIATION = {
 OVERSHOOT = 0.006  # median distance by which these strikes go too far [m]
 
 
-def strike_terms(
-    terms: Iterable[str], puck: Tensor, distance: Tensor, aim: Tensor, side: Tensor
-) -> Tensor:
-    """Compute the terms of a polynomial, after mirroring all strikes to the left.
-
-    Args:
-        terms: Variables of each term; see `STRENGTH`.
-        puck: Position of the puck, (..., 3).
-        distance: Distance that the puck should slide [m], (..., 1).
-        aim: Direction of the strike, (..., 2).
-        side: 1 for strikes to the left, -1 to the right, (..., 1).
-
-    Returns:
-        The terms, (..., number of terms).
-    """
-    values = {
-        "s": sqrt(distance),
-        "x": puck[..., :1],
-        "y": puck[..., 1:2] * side,
-        "n": aim[..., 1:] * side,
-    }
-    one = torch.ones_like(side)
-    return torch.cat([prod((values[v] for v in term), start=one) for term in terms], -1)
-
-
-def strike(
-    observation: Tensor, puck: Tensor, aim: Tensor, side: Tensor, strength: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Move the hand to the start of a strike and, once it is there, strike.
-
-    A corner of the closed fingers strikes along ``aim``. The hand starts from rest at a
-    fixed distance, so the speed at the puck depends on ``strength`` alone. After the
-    strike, while the puck moves, the action is 0.
-
-    Args:
-        observation: Observations, (..., 18).
-        puck: Position of the puck, (..., 3).
-        aim: Direction of the strike, (..., 2).
-        side: 1 for strikes to the left, -1 to the right, (..., 1).
-        strength: Length of the action that strikes, (..., 1).
-
-    Returns:
-        The action, and whether it is the strike, (..., 1).
-    """
-    ee, ee_velocity = observation[..., :3], observation[..., 3:6]
-    corner = torch.cat((FINGERS_X + 0 * side, FINGERS_Y * side), -1)
-    behind = puck[..., :2] - corner - (PUCK_RADIUS + STRIKE_GAP) * aim
-    ready = torch.cat((behind, torch.full_like(side, STRIKE_HEIGHT)), -1)
-    set_up = (norm(ready - ee) < 0.001) & (norm(ee_velocity) < 0.05)
-    hit = torch.cat((aim * strength, (ready - ee)[..., 2:] / 0.05), -1)
-    action = torch.where(set_up, hit, go_over(ee, ready, 0.05))
-    moving = norm(observation[..., 12:14]) > 0.05
-    return torch.where(moving, 0.0, action), set_up & ~moving
-
-
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-    """Strike the puck once so that it stops at the goal, with a corner of the hand."""
+    """Strike the puck once so that it stops at the goal, with a corner of the hand.
+
+    The hand starts from rest at a fixed distance behind the puck, so the speed at the
+    puck depends on the strength of the action alone. While the puck moves, the action
+    is 0.
+    """
     puck, offset = achieved_goal, (desired_goal - achieved_goal)[..., :2]
     direction = unit(offset)
     distance = (norm(offset) - OVERSHOOT).clamp(min=0.01)
+    # 1 for a strike to the left, and -1 for a strike to the right, for which the
+    # polynomials get the values of the mirrored strike.
     side = torch.where(direction[..., 1:] < 0, -1.0, 1.0)
     left = torch.cat((-direction[..., 1:], direction[..., :1]), -1)
 
     def evaluate(polynomial: dict[str, float], aim: Tensor) -> Tensor:
-        terms = strike_terms(polynomial, puck, distance, aim, side)
+        values = {
+            "s": sqrt(distance),
+            "x": puck[..., :1],
+            "y": puck[..., 1:2] * side,
+            "n": aim[..., 1:] * side,
+        }
+        one = torch.ones_like(side)
+        terms = torch.cat(
+            [prod((values[v] for v in term), start=one) for term in polynomial], -1
+        )
         return dot(terms, terms.new_tensor([*polynomial.values()]))
 
     aim = direction
     for _ in range(3):  # a fixed-point iteration: aim against the deviation
         aim = unit(direction - evaluate(DEVIATION, aim) * side * left)
-    return strike(observation, puck, aim, side, evaluate(STRENGTH, aim))[0]
+
+    ee, ee_velocity = observation[..., :3], observation[..., 3:6]
+    corner = torch.cat((FINGERS_X + 0 * side, FINGERS_Y * side), -1)
+    behind = puck[..., :2] - corner - (PUCK_RADIUS + STRIKE_GAP) * aim
+    ready = torch.cat((behind, torch.full_like(side, STRIKE_HEIGHT)), -1)
+    set_up = (norm(ready - ee) < 0.001) & (norm(ee_velocity) < 0.05)
+    strike = torch.cat(
+        (aim * evaluate(STRENGTH, aim), (ready - ee)[..., 2:] / 0.05), -1
+    )
+    action = torch.where(set_up, strike, go_over(ee, ready, 0.05))
+    is_moving = norm(observation[..., 12:14]) > 0.05
+    return torch.where(is_moving, 0.0, action)
