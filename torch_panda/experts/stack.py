@@ -46,12 +46,9 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     # Aim 3 cm too far, because `push_to` may stop the cube 3 cm before its target.
     sign = torch.where(apart < 0, -1.0, 1.0)
     side = crowded_point[..., :2] + sign * apart.new_tensor((0.1, 0.125))
-    x, y, z = upper.split(1, -1)
-    x, y = (
-        torch.where(along_x, side[..., :1], x),
-        torch.where(along_x, y, side[..., 1:]),
-    )
-    aside = torch.cat((x, y, z), -1)
+    moves = torch.cat((along_x, ~along_x), -1)
+    aside = torch.where(moves, side, upper[..., :2])
+    aside = torch.cat((aside, upper[..., 2:]), -1)
     push_aside = push_to(ee, upper, observation[..., 25:27], aside)
     push_aside = torch.cat((push_aside, 0 * width - 1), -1)
     on_top = upper[..., 2:] > 0.03
