@@ -85,7 +85,7 @@ class HindsightAugment(BufferTransform):
         device = copies.get(SERIAL_KEY).device
         goals = torch.from_numpy(drawn).to(device)
         rows = torch.arange(len(copies), device=device)
-        copies = self._rewriter.rewrite(copies, rows, goals, inplace=True)
+        self._rewriter.rewrite(copies, rows, goals)
         return TensorDict.cat([ended, copies]).exclude(SERIAL_KEY)
 
     def _take_ended(self, batch: TensorDictBase) -> TensorDictBase | None:

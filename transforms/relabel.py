@@ -70,8 +70,7 @@ class HindsightRelabel(SampleTimeTransform):
         last_serials, units = self._find_units(serials)
         if self.goal_parts is None:
             return self._draw_once(serials, last_serials, units)
-        stored_goals = batch.get(self._rewriter.goal_key)
-        goals = stored_goals.reshape(len(serials), -1).numpy(force=True).copy()
+        goals = batch.get(self._rewriter.goal_key).numpy(force=True).copy()
         is_relabelled = np.zeros(len(goals), dtype=bool)
         for end, size in zip(np.cumsum(self.goal_parts), self.goal_parts, strict=True):
             part = slice(end - size, end)
@@ -111,15 +110,8 @@ class HindsightRelabel(SampleTimeTransform):
         goal_index = is_chosen.cumsum() - 1
         return rows, goals[goal_index[units[rows]]]
 
-    def _write(
-        self,
-        batch: TensorDictBase,
-        drawn: tuple[Integers, Goals],
-        *,
-        inplace: bool,
-    ) -> TensorDictBase:
+    def _write(self, batch: TensorDictBase, drawn: tuple[Integers, Goals]) -> None:
         device = batch.get(self._rewriter.goal_key).device
         rows, goals = (torch.from_numpy(array).to(device) for array in drawn)
-        if not len(rows):
-            return batch
-        return self._rewriter.rewrite(batch, rows, goals, inplace=inplace)
+        if len(rows):
+            self._rewriter.rewrite(batch, rows, goals)

@@ -66,28 +66,19 @@ class Rewriter:
                 f"hindsight needs {missing} in the data, which has {entries}{hint}"
             )
 
-    def rewrite(
-        self, batch: TensorDictBase, rows: Tensor, goals: Tensor, *, inplace: bool
-    ) -> TensorDictBase:
-        """Gives some rows of a batch other goals.
+    def rewrite(self, batch: TensorDictBase, rows: Tensor, goals: Tensor) -> None:
+        """Gives some rows of a batch other goals, in place.
 
         Args:
-            batch: Transitions, of any batch shape.
-            rows: Indices into the flattened batch, (n,).
+            batch: Transitions, (m,).
+            rows: Indices into the batch, (n,).
             goals: New goals of these rows, (n, *goal).
-            inplace: Whether to change `batch`, which must be one-dimensional. Otherwise
-                a copy is changed.
-
-        Returns:
-            The changed batch.
         """
-        flat = batch if inplace else batch.reshape(-1).to_tensordict()
-        goals = goals.to(flat.get(self.goal_key).dtype)
-        values = self.evaluate(flat, rows, goals)
+        goals = goals.to(batch.get(self.goal_key).dtype)
+        values = self.evaluate(batch, rows, goals)
         values |= {self.goal_key: goals, self.next_goal_key: goals}
         for key, new in values.items():
-            flat.get(key).index_copy_(0, rows, new)
-        return flat.reshape(batch.shape)
+            batch.get(key).index_copy_(0, rows, new)
 
     def evaluate(
         self, batch: TensorDictBase, rows: Tensor, goals: Tensor

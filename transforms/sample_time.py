@@ -120,32 +120,31 @@ class SampleTimeTransform(BufferTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Gives sampled transitions other goals."""
         buffer, method = find_buffer()
-        tags = tensordict.get(SERIAL_KEY, None)
+        batch = tensordict.reshape(-1)
+        # The buffer's `_sample` returns a copy, which may be changed in place. Other
+        # methods of the buffer may return the storage itself, or a lazy stack.
+        if method != "_sample" or type(tensordict) is not TensorDict:
+            batch = batch.to_tensordict()
+        tags = batch.get(SERIAL_KEY, None)
         with self._lock:
             oldest = self._find_oldest(buffer)
             if tags is None or oldest < 0:
                 raise self._explain_unknown_rows(has_tags=tags is not None)
             is_first, self._is_first_sample = self._is_first_sample, False
             if is_first:
-                self._rewriter.check_entries(tensordict)
+                self._rewriter.check_entries(batch)
                 self._warn_of_slices(buffer)
-            self._check_sampled(tensordict, keeps_rows=self._keeps_rows)
+            self._check_sampled(batch, keeps_rows=self._keeps_rows)
             # A strategy that looks ahead never draws an overwritten step.
             if not all(m.only_looks_ahead for m in self._get_mixtures()):
                 self._memory.forget(oldest)
-            serials = tags.numpy(force=True).reshape(-1)
+            serials = tags.numpy(force=True)
             # One buffer of an ensemble may hold rows of another transform.
             if is_first or isinstance(buffer, ReplayBufferEnsemble):
-                self._check_tags(serials, tensordict)
-            drawn = self._draw(serials, tensordict)
-        # The buffer's `_sample` returns a copy, which may be changed in place. Other
-        # methods of the buffer may return the storage itself, or a lazy stack.
-        is_copy = method == "_sample" and type(tensordict) is TensorDict
-        inplace = is_copy and tensordict.ndim == 1
-        batch = self._write(tensordict, drawn, inplace=inplace)
-        if batch is tensordict and not inplace:
-            return batch.exclude(SERIAL_KEY)
-        return batch.del_(SERIAL_KEY)
+                self._check_tags(serials, batch)
+            drawn = self._draw(serials, batch)
+        self._write(batch, drawn)
+        return batch.del_(SERIAL_KEY).reshape(tensordict.shape)
 
     def _check_tags(self, serials: Integers, batch: TensorDictBase) -> None:
         """Checks that this transform has tagged the sampled rows.
@@ -156,7 +155,6 @@ class SampleTimeTransform(BufferTransform):
         """
         known = serials >= self._memory.oldest
         achieved = batch.get(self._rewriter.next_achieved_key)
-        achieved = achieved.reshape(len(serials), *achieved.shape[batch.ndim :])
         achieved = achieved[torch.from_numpy(known).to(achieved.device)]
         remembered = torch.from_numpy(self._memory.get_achieved(serials[known]))
         differs = achieved != remembered.to(achieved)
@@ -170,17 +168,11 @@ class SampleTimeTransform(BufferTransform):
 
     @abstractmethod
     def _draw(self, serials: Integers, batch: TensorDictBase) -> Any:  # noqa: ANN401
-        """Draws goals for the transitions of a batch. The caller holds the lock."""
+        """Draws goals for a batch (n,). The caller holds the lock."""
 
     @abstractmethod
-    def _write(
-        self,
-        batch: TensorDictBase,
-        drawn: Any,  # noqa: ANN401
-        *,
-        inplace: bool,
-    ) -> TensorDictBase:
-        """Writes the goals that `_draw` returned into the batch, or into a copy."""
+    def _write(self, batch: TensorDictBase, drawn: Any) -> None:  # noqa: ANN401
+        """Writes the goals that `_draw` returned into a batch (n,)."""
 
     def _find_oldest(self, buffer: ReplayBuffer | None) -> int:
         """Returns the serial number of the oldest transition that the buffer holds.

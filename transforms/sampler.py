@@ -128,26 +128,20 @@ class GoalSampler(SampleTimeTransform):
         is_forgotten = serials < oldest
         if is_forgotten.any():
             achieved = batch.get(self._rewriter.next_achieved_key)
-            achieved = achieved.reshape(len(serials), *achieved.shape[batch.ndim :])
             for goals in drawn.values():
                 goals[is_forgotten] = achieved.numpy(force=True)[is_forgotten]
         return drawn
 
-    def _write(
-        self, batch: TensorDictBase, drawn: dict[NestedKey, Goals], *, inplace: bool
-    ) -> TensorDictBase:
-        # A batch that may be changed in place has one dimension already.
-        flat = batch if inplace else batch.reshape(-1).to_tensordict()
-        stored_goals = flat.get(self._rewriter.goal_key)
+    def _write(self, batch: TensorDictBase, drawn: dict[NestedKey, Goals]) -> None:
+        stored_goals = batch.get(self._rewriter.goal_key)
         goals = {
             key: torch.from_numpy(values).to(stored_goals)
             for key, values in drawn.items()
         }
-        rows = torch.arange(len(flat), device=stored_goals.device)
+        rows = torch.arange(len(batch), device=stored_goals.device)
         first_goals = next(iter(goals.values()))
-        values = self._rewriter.evaluate(flat, rows, first_goals)
+        values = self._rewriter.evaluate(batch, rows, first_goals)
         for key, new in goals.items():
             values |= {key: new, unravel_key(("next", key)): new.clone()}
         for key, new in values.items():
-            flat.set(key, new)
-        return flat.reshape(batch.shape)
+            batch.set(key, new)
