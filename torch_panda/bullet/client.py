@@ -31,12 +31,7 @@ from torch_panda.bullet.connection import (
 )
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
-from torch_panda.bullet.urdf import (
-    Tool,
-    check_urdf,
-    find_urdf,
-    urdf_with_tool,
-)
+from torch_panda.bullet.urdf import Tool, check_urdf, find_urdf, urdf_with_tool
 from torch_panda.checks import check_not_negative, check_quaternion
 from torch_panda.rotations import NO_ROTATION
 

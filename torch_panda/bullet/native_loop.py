@@ -7,12 +7,7 @@ from ctypes import POINTER, Array, c_int, pointer
 from torch_panda.bullet import native
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
-from torch_panda.bullet.connection import (
-    BulletError,
-    client_closed,
-    doubles,
-    refusal,
-)
+from torch_panda.bullet.connection import BulletError, client_closed, doubles, refusal
 from torch_panda.bullet.control import MotorControl
 from torch_panda.bullet.physics import PhysicsParams
 from torch_panda.bullet.pool import WorkerError
@@ -92,10 +87,7 @@ class NativeLoop:
         self._clients[env] = pointer(client.native)
 
     def step(
-        self,
-        control: MotorControl,
-        setpoint: Doubles,
-        envs: Sequence[int] | None,
+        self, control: MotorControl, setpoint: Doubles, envs: Sequence[int] | None
     ) -> list[int]:
         """Set the motors, advance time and read the state; see `VectorSimulation.step`.
 

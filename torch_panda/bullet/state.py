@@ -53,13 +53,7 @@ class SimulationState:
                 self._jointed_objects.append((body, joints, columns))
                 n_object_joints += len(joints)
         arm = (n_joints, n_joints, 3, 3, 4)
-        sizes = (
-            *arm,
-            7 * n_objects,
-            n_object_joints,
-            n_object_joints,
-            12 * n_objects,
-        )
+        sizes = (*arm, 7 * n_objects, n_object_joints, n_object_joints, 12 * n_objects)
         # One tensor, so that one operation checks whether all numbers are finite.
         self.rows = torch.zeros(num_envs, sum(sizes), dtype=torch.float64, device="cpu")
         (

@@ -27,11 +27,7 @@ from torch_panda.checks import (
     check_positive,
 )
 from torch_panda.envs.builder import build_scene
-from torch_panda.envs.goal_observation import (
-    GoalName,
-    GoalObserver,
-    find_goal_indices,
-)
+from torch_panda.envs.goal_observation import GoalName, GoalObserver, find_goal_indices
 from torch_panda.envs.history import History
 from torch_panda.envs.observer import EpisodeObserver, Observed
 from torch_panda.envs.randomization import DomainRandomizer, Randomization
@@ -152,12 +148,7 @@ class Episodes:
             if goal == "observation" and self.goal_indices is not None:
                 self.goal_dim = robot.observation_dim + task.observation_dim
                 self._goal_observer = GoalObserver(
-                    robot,
-                    task,
-                    self.simulation,
-                    build,
-                    self.physics,
-                    self.goal_indices,
+                    robot, task, self.simulation, build, self.physics, self.goal_indices
                 )
             self._observer = EpisodeObserver(
                 robot,

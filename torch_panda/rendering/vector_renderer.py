@@ -33,12 +33,7 @@ class VectorRenderer:
             thread.
     """
 
-    def __init__(
-        self,
-        simulation: VectorSimulation,
-        *,
-        renderer: RendererName,
-    ) -> None:
+    def __init__(self, simulation: VectorSimulation, *, renderer: RendererName) -> None:
         self._simulation = simulation
         self._renderer: RendererName = renderer
         # Idle renderers by mesh cell. Threads share these lists without a lock, because
@@ -99,11 +94,7 @@ class VectorRenderer:
 
         def make(_: int) -> None:
             renderers.append(
-                EnvRenderer(
-                    self._simulation,
-                    renderer=self._renderer,
-                    mesh_cell=cell,
-                )
+                EnvRenderer(self._simulation, renderer=self._renderer, mesh_cell=cell)
             )
 
         missing = range(len(renderers), count)

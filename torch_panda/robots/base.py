@@ -11,12 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.arguments import Configured
-from torch_panda.bullet import (
-    Control,
-    MotorControl,
-    PhysicsClient,
-    VectorSimulation,
-)
+from torch_panda.bullet import Control, MotorControl, PhysicsClient, VectorSimulation
 from torch_panda.bullet.control import ArmMode
 from torch_panda.bullet.urdf import Tool
 from torch_panda.checks import check_choice, check_integer, check_quaternion
