@@ -63,13 +63,14 @@ KEYS = (*("args", "agent", "optimizer", "updates", "buffer", "random", "progress
 INCOMPLETE = dict.fromkeys(KEYS, 0)
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("content", [b"hello", {"args": {}}, INCOMPLETE])
 def test_damaged_state_of_a_run(tmp_path, content):
     save(tmp_path / "resume.pt", content)
     before = (tmp_path / "resume.pt").read_bytes()
     message = "resume.pt does not hold the state of a run, or is damaged"
     with pytest.raises(SystemExit, match=message):
-        train.main(train.Args(resume=True, out=tmp_path))
+        train.main(train.Args(resume=True, out=tmp_path, num_envs=1))
     assert (tmp_path / "resume.pt").read_bytes() == before
 
 
@@ -84,4 +85,4 @@ def test_outputs_that_cannot_be_written(tmp_path, monkeypatch, script, name, mes
     (tmp_path / "file").touch()
     (tmp_path / "folder.gif").mkdir()
     with pytest.raises(SystemExit, match=message):
-        script.main(script.Args(out=tmp_path / name))
+        script.main(script.Args(out=tmp_path / name, num_envs=1))

@@ -116,10 +116,11 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, name):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_training_on_a_full_disk_ends_with_one_line(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("quick")
+def test_a_training_on_a_full_disk_ends_with_one_line(tmp_path):
     out = tmp_path / "run"
     with full_disk(10_000), pytest.raises(SystemExit) as stop:
-        train.main(Args(total_steps=100, out=out))
+        train.main(Args(total_steps=100, num_envs=1, out=out))
     assert str(stop.value).startswith(f"cannot write resume.pt into {out}: ")
     assert "\n" not in str(stop.value)
     # Nothing is left that would keep the next training from this folder.
