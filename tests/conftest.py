@@ -23,6 +23,14 @@ def signals():
         signal.signal(number, handler)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def few_starts():
+    """Choose the fixed evaluation tasks of every id from few starts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torch_panda.learning.evaluation_tasks.NUM_STARTS", 11)
+        yield
+
+
 @pytest.fixture(params=["native", "ctypes"])
 def loop(request, monkeypatch):
     """Steps through either loop: whatever a test finds must hold for both."""
