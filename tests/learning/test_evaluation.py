@@ -12,7 +12,8 @@ from torch_panda.learning.evaluation import wilson_interval
 
 def test_a_policy_that_succeeds():
     policy = torch_panda.load_policy("PandaReach-v1")
-    result = torch_panda.evaluate(policy, "PandaReach-v1", episodes=40, seed=1)
+    options = {"episodes": 40, "num_envs": 8, "seed": 1}
+    result = torch_panda.evaluate(policy, "PandaReach-v1", **options)
     assert result.success.shape == (40,)
     assert result.success.dtype == torch.bool
     assert result.success_rate == 1.0
@@ -47,9 +48,9 @@ def test_episodes_of_v3_end_at_success():
 
 
 def test_a_seed_fixes_the_episodes():
-    expert = make_expert("PandaPush-v1")
+    policy = torch_panda.load_policy("PandaReach-v1")
     first, again, other = (
-        torch_panda.evaluate(expert, "PandaPush-v1", episodes=8, seed=seed)
+        torch_panda.evaluate(policy, "PandaReachDense-v1", episodes=2, seed=seed)
         for seed in (1, 1, 2)
     )
     assert torch.equal(first.returns, again.returns)
@@ -138,6 +139,6 @@ def test_episodes_of_a_fixed_task_differ_and_depend_on_the_seed_alone():
     ],
 )
 def test_bad_arguments(arguments, error, message):
-    arguments = {"policy": RandomPolicy(None), "env_id": "PandaReach-v1", **arguments}
+    accepted = {"policy": RandomPolicy(None), "env_id": "PandaReach-v1", "episodes": 1}
     with pytest.raises(error, match=message):
-        torch_panda.evaluate(**arguments)
+        torch_panda.evaluate(**(accepted | arguments))
