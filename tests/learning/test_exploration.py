@@ -21,9 +21,11 @@ from torch_panda.learning.exploration import (
 NUM_ENVS = 64
 
 
-def make_module(eps, *, moves_joints=False, action_size=4, object_columns=()):
+def make_module(
+    eps, *, num_envs=NUM_ENVS, moves_joints=False, action_size=4, object_columns=()
+):
     return RandomPointModule(
-        torch.as_tensor(eps).expand(NUM_ENVS).clone(),
+        torch.as_tensor(eps).expand(num_envs).clone(),
         action_size=action_size,
         action_scale=0.05,
         moves_joints=moves_joints,
@@ -76,15 +78,16 @@ def test_a_point_and_the_gripper_are_kept_for_several_steps():
 def test_the_hand_reaches_points_of_the_region():
     """The real hand ends near the point, wherever the region has it."""
     torch.manual_seed(0)
-    module = make_module(1.0, action_size=3)
+    num_envs = 8
+    module = make_module(1.0, num_envs=num_envs, action_size=3)
     with (
-        torch_panda.make("PandaReach-v1", num_envs=NUM_ENVS, seed=0) as env,
+        torch_panda.make("PandaReach-v1", num_envs=num_envs, seed=0) as env,
         set_exploration_type(ExplorationType.RANDOM),
     ):
         td = env.reset()
         distances = []
         for _ in range(30):
-            td["action"] = torch.zeros(NUM_ENVS, 3)
+            td["action"] = torch.zeros(num_envs, 3)
             td = module(td)
             arrives = module.steps_left == 0
             td = env.step(td)["next"]
