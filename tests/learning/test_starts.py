@@ -1,5 +1,7 @@
 """Training episodes that start with the hand at an object."""
 
+import functools
+
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
@@ -10,9 +12,16 @@ from torch_panda.learning.starts import PLACED_KEYS, StartFrom, states_at_object
 NUM_ENVS = 8
 
 
-@pytest.fixture(scope="module")
+@functools.cache
+def make_states(task):
+    """The states of a task, which all tests share."""
+    number = 32 if task == "Stack" else 16
+    return states_at_objects(f"Panda{task}-v1", seed=0, number=number)
+
+
+@pytest.fixture
 def states():
-    return states_at_objects("PandaPush-v1", seed=3, number=12)
+    return make_states("Push")
 
 
 def start_in(states, env):
@@ -22,7 +31,7 @@ def start_in(states, env):
 
 @pytest.mark.parametrize("task", ["Push", "Slide"])
 def test_hand_beside_an_object_at_rest(task):
-    states = states_at_objects(f"Panda{task}-v1", seed=0, number=16)
+    states = make_states(task)
     assert len(states) >= 12
     with torch_panda.make(f"Panda{task}-v1", num_envs=12) as env:
         td = start_in(states, env)
@@ -38,7 +47,7 @@ def test_hand_beside_an_object_at_rest(task):
 
 @pytest.mark.parametrize(("task", "number"), [("PickAndPlace", 1), ("Stack", 2)])
 def test_hand_holds_an_object(task, number):
-    states = states_at_objects(f"Panda{task}-v1", seed=0, number=16)
+    states = make_states(task)
     assert len(states) >= 12
     with torch_panda.make(f"Panda{task}-v1", num_envs=12) as env:
         td = start_in(states, env)
@@ -60,7 +69,7 @@ def test_hand_holds_an_object(task, number):
 
 def test_lower_cube_of_a_stack_can_be_at_its_goal():
     """The lower cube is at its goal in half of the states, and it stays there."""
-    states = states_at_objects("PandaStack-v1", seed=0, number=32)
+    states = make_states("Stack")
     with_goal = states[states["first_to_goal"][:, 0]]
     assert 0.4 < len(with_goal) / len(states) < 0.6
     torch.manual_seed(0)
@@ -85,7 +94,7 @@ def test_lower_cube_of_a_stack_can_be_at_its_goal():
 
 
 def test_without_room_for_the_object_an_episode_starts_as_usual():
-    states = states_at_objects("PandaStack-v1", seed=0, number=8)
+    states = make_states("Stack")
     last_lies = states["object_pose"][:, -1, 2] < 0.1
     lies = states["first_to_goal"][:, 0] & last_lies
     with torch_panda.make("PandaStack-v1", num_envs=1, seed=0) as base:
