@@ -13,8 +13,8 @@ pytestmark = pytest.mark.usefixtures("quick")
 
 
 def make_args(out, **options):
-    options = {"total_steps": 200, "eval_interval": 200, "num_envs": 2, **options}
-    return Args(out=out, video=False, **options)
+    options = {"total_steps": 100, "eval_interval": 100, "num_envs": 2, **options}
+    return Args(out=out, video=False, updates_per_step=0.05, **options)
 
 
 class Recorder:
@@ -75,7 +75,7 @@ def test_a_resumed_run_continues_its_log(tmp_path, loggers):
     assert first.values
     assert first.values + second.values == read_curve(out)
     assert first.options["id"] == second.options["id"]
-    assert second.options["config"]["total_steps"] == "200"
+    assert second.options["config"]["total_steps"] == "100"
 
 
 def test_a_missing_library_is_one_line(tmp_path, monkeypatch):
@@ -94,4 +94,4 @@ def test_tensorboard_reads_the_log(tmp_path):
     out = tmp_path / "run"
     train.main(make_args(out, logger="tensorboard"))
     log = reader.EventAccumulator(str(out / "tensorboard")).Reload()
-    assert [event.step for event in log.Scalars("success")] == [0, 200]
+    assert [event.step for event in log.Scalars("success")] == [0, 100]
