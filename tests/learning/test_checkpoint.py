@@ -1,9 +1,9 @@
 """Folders of runs: killed runs can be resumed, and two runs do not share a folder."""
 
+import multiprocessing
 import os
 import socket
-import subprocess
-import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -48,26 +48,23 @@ def test_a_run_killed_in_its_first_evaluation_can_be_resumed(
     torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
 
 
-HOLD = """
-import sys, time
-from pathlib import Path
-from torch_panda.learning.checkpoint import lock_folder
-with lock_folder(Path(sys.argv[1])):
-    print("locked", flush=True)
-    time.sleep(100)
-"""
+def hold(folder, sender):
+    with lock_folder(folder):
+        sender.send("locked")
+        time.sleep(100)
 
 
 @pytest.fixture
 def other_process(tmp_path):
     """A process that writes into the folder."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout.readline() == "locked\n"
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    fork = multiprocessing.get_context("fork")
+    process = fork.Process(target=hold, args=(tmp_path, sender))
+    process.start()
+    assert receiver.poll(60)
     yield process
     process.kill()
-    process.wait()
+    process.join()
 
 
 @pytest.mark.parametrize("resume", [False, True])
@@ -80,7 +77,7 @@ def test_a_folder_that_another_process_uses_is_refused(tmp_path, other_process, 
 
 def test_the_lock_ends_with_its_process(tmp_path, other_process):
     other_process.kill()
-    other_process.wait()
+    other_process.join()
     with lock_folder(tmp_path):
         text = (tmp_path / "process.txt").read_text()
         assert text == f"process {os.getpid()} on {socket.gethostname()}"
