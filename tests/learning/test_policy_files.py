@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 import torch
@@ -92,8 +93,8 @@ def test_shipped_policies_act_on_batches_of_any_shape(env_id):
 @pytest.mark.parametrize("env_id", shipped_policies())
 def test_shipped_policies_have_the_spaces_of_their_environment(env_id):
     spaces = torch_panda.load_policy(env_id).spaces
-    with torch_panda.make(env_id, num_envs=spaces.num_envs) as env:
-        assert spaces == read_spaces(env)
+    with torch_panda.make(env_id, num_envs=1) as env:
+        assert replace(spaces, num_envs=1) == read_spaces(env)
 
 
 def test_a_policy_of_an_unregistered_id_loads(tmp_path):
@@ -113,7 +114,7 @@ for name in ("tyro", "matplotlib", "imageio", "viser", "minari"):
     sys.modules[name] = None  # importing it raises
 import torch_panda
 policy = torch_panda.load_policy("PandaReach-v1")
-print(torch_panda.evaluate(policy, "PandaReach-v1", episodes=4).success_rate)
+print(torch_panda.evaluate(policy, "PandaReach-v1", episodes=1).success_rate)
 """
 
 
