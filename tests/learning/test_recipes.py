@@ -47,6 +47,7 @@ def test_every_task_has_a_recipe():
     assert find_recipe("PandaSlide-v3") == {**slide, **changes} != slide
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     "env_id", ["PandaPickAndPlaceJoints-v1", "PandaFlipJointsDense-v3"]
 )
