@@ -1,5 +1,6 @@
 """What all tests need."""
 
+import multiprocessing
 import signal
 from functools import partial
 
@@ -8,6 +9,15 @@ import torch
 
 import torch_panda
 from torch_panda.bullet import native
+
+
+def pytest_configure():
+    """Fork worker processes from a server that has imported torchrl once.
+
+    As torchrl's default, "spawn", this sends each worker its functions as pickles.
+    """
+    multiprocessing.set_start_method("forkserver", force=True)
+    multiprocessing.set_forkserver_preload(["torchrl.collectors", "torch_panda.envs"])
 
 
 @pytest.fixture(autouse=True)
