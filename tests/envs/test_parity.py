@@ -6,6 +6,7 @@ compared here.
 """
 
 import copy
+import functools
 
 import gymnasium
 import numpy as np
@@ -22,6 +23,7 @@ from tests.panda_gym_reference import make_reference, start
 V3_IDS = [env_id for env_id in PHYSICS_IDS if env_id in gymnasium.registry]
 pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
+EPISODES = 4
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -123,61 +125,68 @@ def set_table_friction(reference, friction):
     sim.physics_client.changeDynamics(table, -1, lateralFriction=friction)
 
 
+@functools.cache
+def play_reference(env_id):
+    """Play panda-gym's episodes, with which both loops are compared.
+
+    Returns:
+        The start as a state, the results of all steps, and the number of contacts.
+    """
+    references = [make_reference(env_id.replace("-v1", "-v3")) for _ in range(EPISODES)]
+    if env_id.endswith("-v1"):
+        for reference in references:
+            set_table_friction(reference, 0.1)
+    rngs = [np.random.default_rng(k) for k in range(EPISODES)]
+    starts = [start(reference, seed=k) for k, reference in enumerate(references)]
+    observations, poses, goals = zip(*starts, strict=True)
+    state = {"object_pose": np.stack(poses), "desired_goal": np.stack(goals)}
+    size = references[0].action_space.shape[0]
+    steps, contacts = [(observations, {})], 0
+    for _ in range(STEPS):
+        actions = [
+            choose_action(env_id, observation["observation"], rng, size)
+            for observation, rng in zip(observations, rngs, strict=True)
+        ]
+        results = [
+            r.step(action) for r, action in zip(references, actions, strict=True)
+        ]
+        observations = [result[0] for result in results]
+        numbers = {
+            "action": torch.from_numpy(np.stack(actions)),
+            "reward": torch.tensor([[result[1]] for result in results]).float(),
+            "dense": torch.tensor([[dense_reward(r)] for r in references]).float(),
+            "terminated": torch.tensor([[result[2]] for result in results]),
+        }
+        steps.append((observations, numbers))
+        contacts += sum(map(had_contact, references))
+    for reference in references:
+        reference.close()
+    return TensorDict(state, [EPISODES]), steps, contacts
+
+
 # Flip came after 1.1.0: its -v1 has the cube of 3.0.7 on the table of 1.1.0.
 @pytest.mark.parametrize("env_id", [*V3_IDS, "PandaFlip-v1", "PandaFlipJoints-v1"])
 def test_equals_panda_gym(env_id):
-    episodes = 4
-    contacts = 0
-    with torch_panda.make(env_id, num_envs=episodes, seed=3) as env:
-        references = [
-            make_reference(env_id.replace("-v1", "-v3")) for _ in range(episodes)
-        ]
-        if env_id.endswith("-v1"):
-            for reference in references:
-                set_table_friction(reference, 0.1)
+    state, steps, contacts = play_reference(env_id)
+    with torch_panda.make(env_id, num_envs=EPISODES, seed=3) as env:
         dense_task = copy.copy(env.task)
         dense_task.reward_type = "dense"
-        rngs = [np.random.default_rng(k) for k in range(episodes)]
-        starts = [start(references[k], seed=k) for k in range(episodes)]
-        theirs = [observation for observation, _, _ in starts]
-        state = TensorDict(
-            {
-                "object_pose": np.stack([poses for _, poses, _ in starts]),
-                "desired_goal": np.stack([goal for _, _, goal in starts]),
-            },
-            batch_size=[episodes],
-        )
-        ours = env.reset(state, set_state=True)
-        for step in range(STEPS):
+        ours = env.reset(state.clone(), set_state=True)
+        for step, (observations, theirs) in enumerate(steps):
+            if theirs:
+                ours = env.step(ours.set("action", theirs["action"]))["next"]
+                assert torch.equal(ours["reward"], theirs["reward"])
+                goals = ours["achieved_goal"], ours["desired_goal"]
+                # panda-gym computes the distance to the float64 goal, and we to the
+                # float32 goal that both return: a dense reward may differ in its last
+                # bits.
+                dense = dense_task.compute_reward(*goals)
+                torch.testing.assert_close(dense, theirs["dense"], rtol=0.0, atol=1e-6)
+                if env_id.endswith("-v3"):
+                    assert torch.equal(ours["terminated"], theirs["terminated"])
+                assert torch.equal(ours["success"], theirs["terminated"])
             for key in KEYS:
-                expected = np.stack([observation[key] for observation in theirs])
+                expected = np.stack([observation[key] for observation in observations])
                 assert np.array_equal(ours[key].numpy(), expected), (key, step)
-            size = env.action_spec.shape[-1]
-            actions = np.stack(
-                [
-                    choose_action(env_id, theirs[k]["observation"], rngs[k], size)
-                    for k in range(episodes)
-                ]
-            )
-            results = [references[k].step(actions[k]) for k in range(episodes)]
-            ours.set("action", torch.from_numpy(actions))
-            ours = env.step(ours)["next"]
-            theirs = [result[0] for result in results]
-            rewards = torch.tensor([[result[1]] for result in results])
-            assert torch.equal(ours["reward"], rewards.float())
-            goals = ours["achieved_goal"], ours["desired_goal"]
-            rewards = torch.tensor([[dense_reward(r)] for r in references])
-            # panda-gym computes the distance to the float64 goal, and we to the float32
-            # goal that both return: a dense reward may differ in its last bits.
-            torch.testing.assert_close(
-                dense_task.compute_reward(*goals), rewards.float(), rtol=0.0, atol=1e-6
-            )
-            terminated = torch.tensor([[result[2]] for result in results])
-            if env_id.endswith("-v3"):
-                assert torch.equal(ours["terminated"], terminated)
-            assert torch.equal(ours["success"], terminated)
-            contacts += sum(had_contact(reference) for reference in references)
-        for reference in references:
-            reference.close()
     if env_id != "PandaReach-v3":
         assert contacts > 10, "the test must touch something"
