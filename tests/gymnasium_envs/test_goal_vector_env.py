@@ -103,6 +103,20 @@ def test_the_default_device_changes_nothing(mode):
     assert observation["observation"].shape == (2, 6)
 
 
+def test_a_step_before_the_first_reset_is_refused():
+    env = GoalVectorEnv("PandaReach-v1", num_envs=2)
+    with pytest.raises(ResetNeeded, match=r"reset environments \[0, 1\]"):
+        env.step(np.zeros((2, 3)))
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = GoalVectorEnv("PandaReach-v1", num_envs=3)
+    yield env
+    env.close()
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -122,15 +136,11 @@ def test_the_default_device_changes_nothing(mode):
         ({"options": {"reset_mask": np.ones(2, bool)}}, ValueError, r"shape \(3,\)"),
     ],
 )
-def test_bad_resets_are_refused(arguments, error, message):
-    env = GoalVectorEnv("PandaReach-v1", num_envs=3)
-    with pytest.raises(ResetNeeded, match=r"reset environments \[0, 1, 2\]"):
-        env.step(np.zeros((3, 3)))
+def test_bad_resets_are_refused(env, arguments, error, message):
     with pytest.raises(error, match=message):
         env.reset(**arguments)
     env.reset()
     env.step(np.zeros((3, 3)))
-    env.close()
 
 
 @pytest.mark.filterwarnings("error")
