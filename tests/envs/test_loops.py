@@ -268,36 +268,43 @@ def test_a_reset_that_fails(env):
             step(env)
 
 
-def test_a_setpoint_of_another_shape(env):
-    control = env.robot.motor_control
+# Both loops have the same checks of arguments.
+@pytest.fixture(scope="module")
+def checked():
+    with make() as env:
+        yield env
+
+
+def test_a_setpoint_of_another_shape(checked):
+    control = checked.robot.motor_control
     with pytest.raises(ValueError, match=r"must have shape \(3, 5\), got \(3, 4\)"):
-        env.episodes.simulation.step(control, np.zeros((N, 4)))
+        checked.episodes.simulation.step(control, np.zeros((N, 4)))
 
 
-def test_forces_of_another_robot(env):
+def test_forces_of_another_robot(checked):
     with pytest.raises(ValueError, match="a force for each of 9 movable joints, got 4"):
-        env.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
+        checked.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
 
 
-def test_inverse_kinematics_without_an_arm(env):
+def test_inverse_kinematics_without_an_arm(checked):
     control = MotorControl((1.0,) * 9, ik_link=11, ik_orientation=(1.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="ik_link needs num_arm_joints"):
-        env.episodes.simulation.step(control, np.zeros((N, 12)))
+        checked.episodes.simulation.step(control, np.zeros((N, 12)))
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [("num_arm_joints", 12), ("num_arm_joints", -3), ("ik_link", -1)],
 )
-def test_a_control_whose_fields_are_out_of_range(env, field, value):
-    control = dataclasses.replace(env.robot.motor_control, **{field: value})
+def test_a_control_whose_fields_are_out_of_range(checked, field, value):
+    control = dataclasses.replace(checked.robot.motor_control, **{field: value})
     with pytest.raises(ValueError, match=f"{field} must be .* got {value}"):
-        env.episodes.simulation.step(control, np.zeros((N, control.setpoint_dim)))
+        checked.episodes.simulation.step(control, np.zeros((N, control.setpoint_dim)))
 
 
 @pytest.mark.parametrize("envs", [[N], [-1], [0, 1, 0]])
-def test_clients_that_do_not_exist_or_are_named_twice(env, envs):
-    simulation, control = env.episodes.simulation, env.robot.motor_control
+def test_clients_that_do_not_exist_or_are_named_twice(checked, envs):
+    simulation, control = checked.episodes.simulation, checked.robot.motor_control
     setpoint = np.zeros((N, control.setpoint_dim))
     for call in (
         lambda: simulation.step(control, setpoint, envs),
