@@ -31,7 +31,7 @@ def test_solves_its_task(env_id, episodes, least):
         experts.make_expert(env_id),
         env_id,
         episodes=episodes,
-        num_envs=episodes,
+        num_envs=8,
         seed=11,
     )
     assert result.success.sum() >= least
