@@ -163,7 +163,7 @@ def test_a_run_is_drawn(address, tmp_path):
     written = json.loads((args.out / "args.json").read_text())
     assert (written["env_id"], written["total_steps"]) == ("PandaReach-v1", 40)
     runs = plot.read_runs([tmp_path])
-    (line,) = runs["PandaReach-v1"]["DDPG"]
-    assert line == "distributed, num envs 4, steps per batch 5, updates per step 0.25"
-    (drawn,) = runs["PandaReach-v1"]["DDPG"][line]
+    ((line, (drawn,)),) = runs["PandaReach-v1"].items()
+    label = "distributed, num envs 4, steps per batch 5, updates per step 0.25"
+    assert line == ("DDPG", label)
     assert [row["step"] for row in drawn] == [0, 40]

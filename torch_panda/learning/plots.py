@@ -25,7 +25,7 @@ from torch_panda.learning import files
 
 Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
-LINES = 4  # largest number of lines in a panel
+MAX_LINES = 4  # largest number of lines in a panel
 COLUMNS = 3  # largest number of panels side by side
 OFFLINE = ", offline"  # suffix of a title if the steps of the panel are gradient steps
 LABEL_WIDTH = 56  # characters after which a label is wrapped
@@ -35,13 +35,9 @@ DASHES = ("-", "--", ":", "-.")
 # Markers of the algorithms in alphabetical order. The first algorithm has none.
 MARKERS = ("", "s", "^", "D", "v", "P", "X", "*")
 
-Curves = dict[str, list[Curve]]
-"""The curves of all seeds, by the label of the options."""
-Runs = dict[str, dict[str, Curves]]
-"""Curves by task, then by algorithm."""
 Line = tuple[str, str]
 """Algorithm and label of the options."""
-Panel = dict[Line, list[Curve]]
+Lines = dict[Line, list[Curve]]
 """The curves of all seeds, by line."""
 
 
@@ -65,11 +61,11 @@ def save(figure: Figure, path: Path) -> None:
     files.replace(path, lambda file: figure.savefig(file, dpi=120, format=format))
 
 
-def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
+def plot_panels(runs: dict[str, Lines], metric: Metric, path: Path) -> None:
     """Draw median and interquartile range over seeds.
 
     Args:
-        runs: Curves of the runs.
+        runs: Lines of each task.
         metric: Column of the curves to draw.
         path: Picture to write.
 
@@ -99,36 +95,29 @@ def plot_panels(runs: Runs, metric: Metric, path: Path) -> None:
     save(figure, path)
 
 
-def split(task: str, algorithms: dict[str, Curves]) -> list[tuple[str, Panel]]:
+def split(task: str, lines: Lines) -> list[tuple[str, Lines]]:
     """Distribute the lines of a task over panels.
 
-    All algorithms share a panel if it has at most `LINES` lines. Otherwise each
+    All algorithms share a panel if it has at most `MAX_LINES` lines. Otherwise each
     algorithm has its own panels.
 
     Returns:
         Title and lines of each panel.
     """
-    by_algorithm = {
-        algo: {(algo, way): curves for way, curves in sorted(ways.items())}
-        for algo, ways in sorted(algorithms.items())
-    }
-    together = {
-        line: curves
-        for lines in by_algorithm.values()
-        for line, curves in lines.items()
-    }
-    if len(together) <= LINES:
-        return [(task, together)]
-    return [
-        (f"{task}, {algo}", dict(list(lines.items())[first : first + LINES]))
-        for algo, lines in by_algorithm.items()
-        for first in range(0, len(lines), LINES)
-    ]
+    ordered = sorted(lines.items())
+    if len(ordered) <= MAX_LINES:
+        return [(task, dict(ordered))]
+    panels = []
+    for algo, group in itertools.groupby(ordered, lambda item: item[0][0]):
+        of_algo = list(group)
+        for first in range(0, len(of_algo), MAX_LINES):
+            panels.append((f"{task}, {algo}", dict(of_algo[first : first + MAX_LINES])))
+    return panels
 
 
 def draw_panel(
     axes: Axes,
-    panel: Panel,
+    panel: Lines,
     metric: Metric,
     ways: dict[str, tuple[str, str]],
     markers: dict[str, str],
@@ -166,13 +155,13 @@ def draw_panel(
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
-def read_runs(folders: list[Path]) -> Runs:
-    """Read the curves of all runs below some folders.
+def read_runs(folders: list[Path]) -> dict[str, Lines]:
+    """Read the curves of all runs below some folders, by task.
 
     Raises:
         ValueError: There is no run, or a run cannot be read.
     """
-    runs: Runs = {}
+    runs: dict[str, Lines] = {}
     for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
         if not (path.parent / "args.json").exists():
             continue
@@ -182,7 +171,7 @@ def read_runs(folders: list[Path]) -> Runs:
             if args["preset"] == "offline":
                 task += OFFLINE
             changed = args.get("changed", {})
-            line = str(args.get("label") or line_label(str(args["preset"]), changed))
+            label = str(args.get("label") or line_label(str(args["preset"]), changed))
             with path.open() as file:
                 curve = [
                     {key: float(value) for key, value in row.items() if value}
@@ -191,8 +180,7 @@ def read_runs(folders: list[Path]) -> Runs:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"cannot read the run {path.parent}: {error!r}") from None
         if curve:
-            lines = runs.setdefault(task, {}).setdefault(algo, {})
-            lines.setdefault(line, []).append(curve)
+            runs.setdefault(task, {}).setdefault((algo, label), []).append(curve)
     if not runs:
         names = ", ".join(map(str, folders))
         raise ValueError(
