@@ -102,9 +102,8 @@ class Refinement:
         self.buffer = make_buffer(self.env, args.steps + iteration, her="none")
         self.curve = Curve(args.env_id, self.agent, args.out, device="cpu")
         self.progress = Progress()
-        state = args.out / "resume.pt"
         self.checkpoint = Checkpoint(
-            state, args, self.agent, self.buffer, self.progress
+            args.out, args, self.agent, self.buffer, self.progress
         )
         if args.resume:
             self.checkpoint.load()

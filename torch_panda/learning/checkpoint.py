@@ -59,14 +59,14 @@ class Progress:
 class Checkpoint:
     """The complete state of a run between two iterations.
 
-    The file ``path``, which is called resume.pt, holds this state. The file
-    checkpoint.pt beside it holds the policy alone, for `load_policy`.
+    The file resume.pt in the folder ``out`` holds this state. The file checkpoint.pt
+    beside it holds the policy alone, for `load_policy`.
 
     Demonstrations, and the data of offline learning, are not saved, only their hash. So
     a resumed run can check that they are the same.
     """
 
-    path: Path
+    out: Path
     args: Any  # options of the run, a dataclass
     agent: AnyAgent
     buffer: ReplayBuffer | None  # None in offline learning
@@ -90,9 +90,8 @@ class Checkpoint:
             "cuda_random": torch.cuda.get_rng_state_all(),
             "progress": asdict(self.progress),
         }
-        files.save(self.path, state)
-        policy = self.path.with_name("checkpoint.pt")
-        save_policy(policy, self.agent, self.args.env_id)
+        files.save(self.out / "resume.pt", state)
+        save_policy(self.out / "checkpoint.pt", self.agent, self.args.env_id)
 
     def load(self) -> None:
         """Restore the state that `save` wrote.
@@ -108,12 +107,13 @@ class Checkpoint:
             *("random", "cuda_random", "progress"),
         )
         finite = ("agent", "optimizer")
-        state = files.read(self.path, "the state of a run", keys, finite=finite)
+        path = self.out / "resume.pt"
+        state = files.read(path, "the state of a run", keys, finite=finite)
         saved, options = state["args"], fixed_options(self.args)
         steps = options.get("total_steps", 0)
         if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps
-        check_same(self.path.parent, saved, options)
+        check_same(self.out, saved, options)
         # Runs of earlier versions saved no hash under this key.
         data_hash = state.get("data_hash", self.data_hash)
         if data_hash != self.data_hash:

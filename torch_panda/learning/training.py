@@ -152,12 +152,7 @@ class Run:
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
-            out / "resume.pt",
-            args,
-            self.agent,
-            self.buffer,
-            self.progress,
-            demos_hash,
+            out, args, self.agent, self.buffer, self.progress, demos_hash
         )
         if args.resume:
             self.checkpoint.load()

@@ -66,7 +66,7 @@ class OfflineRun:
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
-            out / "resume.pt", args, self.agent, None, self.progress, data_hash
+            out, args, self.agent, None, self.progress, data_hash
         )
         if args.resume:
             self.checkpoint.load()
