@@ -75,7 +75,7 @@ class Run:
         demos: TensorDictBase | None = None,
         demos_hash: str = "",
     ) -> None:
-        self.args, self.out = args, out
+        self.args = args
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         # With "medium", PyTorch leaves products of float32 matrices to oneDNN. On CPUs
         # with AVX-512, they are up to twice as fast as with "highest", but may be

@@ -42,7 +42,7 @@ class OfflineRun:
     def __init__(
         self, args: OfflineArgs, out: Path, data: TensorDictBase, data_hash: str
     ) -> None:
-        self.args, self.out = args, out
+        self.args = args
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         torch.set_float32_matmul_precision("medium")  # as in `training.Run`
         torch.manual_seed(args.seed)
