@@ -32,18 +32,18 @@ class Parts:
         self.folder, self._recipe = folder, recipe
         self._is_new = not resume
         file = folder / RECIPE
-        if not resume and file.exists():
+        if resume:
+            if not file.exists():
+                raise ValueError(
+                    f"there is no data set to resume in {folder}: start without "
+                    "--resume"
+                )
+            check_same(folder, json.loads(file.read_text()), recipe)
+        elif file.exists():
             raise ValueError(
                 f"{folder} holds a part of a data set: continue with --resume, or "
                 "remove the folder"
             )
-        if not resume:
-            return
-        if not file.exists():
-            raise ValueError(
-                f"there is no data set to resume in {folder}: start without --resume"
-            )
-        check_same(folder, json.loads(file.read_text()), recipe)
 
     @property
     def num_episodes(self) -> int:
