@@ -63,8 +63,7 @@ class OfflineData:
             terminated_fn=env.is_success,
             discount=discount,
         )
-        rows = transform.prepare(data)
-        self.rows: TensorDictBase = rows
+        self.rows = transform.prepare(data)
         self._buffer = TensorDictReplayBuffer(
             storage=TensorStorage(self.rows, device=env.device), transform=transform
         )

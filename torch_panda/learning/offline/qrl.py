@@ -103,13 +103,11 @@ class QRL(OfflineAgent):
 
     def encode_state(self, s: Tensor) -> Tensor:
         """Latent of observations, (n, latent size)."""
-        z: Tensor = self.state_encoder(self.normalizer.state(s))
-        return z
+        return self.state_encoder(self.normalizer.state(s))
 
     def encode_goal(self, g: Tensor) -> Tensor:
         """Latent of goals, (n, latent size)."""
-        z: Tensor = self.goal_encoder(self.normalizer.goal(g))
-        return z
+        return self.goal_encoder(self.normalizer.goal(g))
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """The losses of quasimetric, multiplier, dynamics and policy."""
