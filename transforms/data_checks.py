@@ -213,7 +213,7 @@ class DataCheck:
         """Returns the entries that may have been computed from the desired goal."""
         rewriter = self._rewriter
         others = rows.exclude("next", rewriter.goal_key, rewriter.achieved_goal_key)
-        return {key: entry for key, entry in others.items(True, True)}
+        return dict(others.items(True, True))
 
     def _get_goals(self, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Returns achieved and desired goals, (n, goal_dim) each."""
@@ -257,10 +257,10 @@ class DataCheck:
         """Refuses entries that are affine functions of achieved and desired goal.
 
         An affine function has 2 * goal_dim + 1 coefficients per column. With too few
-        equations, it also fits columns that do not depend on the goals. Until an
-        object moves, all rows of an episode have the same achieved and the same desired
-        goal, so together they give one equation. Therefore the check waits
-        until there are more distinct desired goals than coefficients.
+        equations, it also fits columns that do not depend on the goals. Until an object
+        moves, all rows of an episode have the same achieved and the same desired goal,
+        so together they give one equation. Therefore the check waits until there are
+        more distinct desired goals than coefficients.
 
         Then the check refuses a column if an affine function fits it, with three
         exceptions:

@@ -59,8 +59,8 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
         raise ValueError(f"{path} holds no transitions")
     demos = demos.reshape(-1).apply(lambda x: x.float() if x.is_floating_point() else x)
     for key in ("observation", "action", "desired_goal"):
-        expected = env.full_observation_spec.get(key, None)
-        size = (env.action_spec if expected is None else expected).shape[-1]
+        spec = env.action_spec if key == "action" else env.observation_spec[key]
+        size = spec.shape[-1]
         if demos[key].shape[-1] != size:
             raise ValueError(
                 f"{path} is for another task: its {key} has size "
