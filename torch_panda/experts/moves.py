@@ -1,8 +1,8 @@
 """Moves that the scripted experts combine.
 
 Positions and offsets are in the world frame [m]. An action of 1 displaces the
-end-effector by 5 cm. All arithmetic is elementwise, and `sqrt` below computes all
-square roots, so that data sets should have the same hashes on every processor.
+end-effector by 5 cm. Data sets should have the same hashes on every processor. So all
+arithmetic is elementwise, and `sqrt` below computes all square roots.
 """
 
 import torch

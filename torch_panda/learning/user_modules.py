@@ -84,7 +84,7 @@ def _run_file(file: str, source: str) -> None:
         if loaded is None or Path(loaded).resolve() != Path(file).resolve():
             raise ValueError(
                 f"cannot import the file {file}: another module named {name!r} is "
-                f"loaded; rename the file"
+                "loaded; rename the file"
             )
     module = ModuleType(name)
     module.__file__ = file
