@@ -101,14 +101,15 @@ static __thread struct responses **responses;
 /* The AABBs of a world while Bullet updates them in this thread, otherwise NULL. */
 static __thread struct aabbs *aabbs;
 
-/* A world whose objects are hidden while Bullet takes a snapshot of it, and their number.
-   The world is NULL if no objects are hidden. */
+/* A world whose objects serialize_bodies has hidden, and the number of these objects. The
+   world is NULL if no objects are hidden. */
 struct snapshot {
     struct world *world;
     int num_objects;
 };
 
-/* The snapshot that Bullet takes in this thread, otherwise NULL. */
+/* While Bullet takes a snapshot in this thread, serialize_bodies stores the hidden objects
+   here. At all other times, the pointer is NULL. */
 static __thread struct snapshot *snapshot;
 
 static int is_active(void) {
