@@ -27,7 +27,9 @@ def make_buffer(
 @pytest.mark.parametrize("layout", ["env_first", "time_first", "rows", "no_ids"])
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])
 @pytest.mark.parametrize("buffer", [TensorDictReplayBuffer, ReplayBuffer])
-def test_every_transition_of_ended_episodes_and_k_copies(layout, strategy, buffer):
+def test_each_transition_of_an_ended_episode_is_stored_with_k_copies(
+    layout, strategy, buffer
+):
     k = 3
     rb = make_buffer(buffer=buffer, strategy=strategy, k=k)
     envs, written = Envs(4, [1, 5, 12]), []
@@ -53,7 +55,7 @@ def test_every_transition_of_ended_episodes_and_k_copies(layout, strategy, buffe
 
 @pytest.mark.parametrize("data_device", DEVICES)
 @pytest.mark.parametrize("storage_device", DEVICES)
-def test_devices(data_device, storage_device):
+def test_copies_are_on_the_device_of_the_storage(data_device, storage_device):
     rb = make_buffer(device=storage_device, strategy="future")
     envs = Envs(3, [5, 9])
     for _ in range(2):
@@ -79,7 +81,7 @@ def test_k_may_be_a_float_that_is_whole():
     assert len(rb) == 2 * 6 * 3
 
 
-def test_what_is_held_back_takes_the_room_of_open_episodes():
+def test_held_rows_take_no_more_room_than_open_episodes():
     rb, envs = make_buffer(k=1), Envs(4, [30])
     for _ in range(200):
         rb.extend(envs.chunk(1))
@@ -117,7 +119,7 @@ def test_held_episodes_are_saved(how, tmp_path):
     assert (rb.storage[:] == new.storage[:]).all()
 
 
-def test_empty_drops_what_is_held():
+def test_empty_drops_the_held_episodes():
     rb, envs = make_buffer(), Envs(1, [6])
     rb.extend(envs.chunk(3))
     rb.empty()
@@ -128,7 +130,7 @@ def test_empty_drops_what_is_held():
 
 @pytest.mark.parametrize("layout", ["rows", "no_ids"])
 @pytest.mark.parametrize("rooted", [True, False])
-def test_ids_that_begin_anew(layout, rooted):
+def test_augmentation_keeps_trajectories_with_equal_ids_apart(layout, rooted):
     """Collectors in turn, each of which leaves episodes unfinished."""
     rb, written = make_buffer(k=2, strategy="episode"), []
     for i in range(4):
@@ -156,7 +158,7 @@ def test_adding_one_by_one_raises():
     assert len(rb) == 3 * 4
 
 
-def test_default_device():
+def test_augmentation_ignores_the_default_device():
     data = Envs(3, [5]).chunk(10)
     with torch.device("meta"):
         stored = HindsightAugment(reward_fn, seed=0)._inv_call(data)

@@ -45,7 +45,7 @@ def check(make_collector, frames, batches, *, ndim=1, **options):
 
 @pytest.mark.parametrize("reset_at_each_iter", [True, False])
 @pytest.mark.parametrize(("ndim", "steps"), [(1, 1), (1, 5), (2, 5), (2, 17)])
-def test_single_process(ndim, steps, reset_at_each_iter):
+def test_batches_of_a_single_process_are_relabelled(ndim, steps, reset_at_each_iter):
     check(SINGLE, 3 * steps, 40, ndim=ndim, reset_at_each_iter=reset_at_each_iter)
 
 
@@ -58,12 +58,12 @@ def test_single_process(ndim, steps, reset_at_each_iter):
         pytest.param("asynchronous ParallelEnv", marks=pytest.mark.slow),
     ],
 )
-def test_worker_processes(collector):
+def test_batches_of_worker_processes_are_relabelled(collector):
     check(COLLECTORS[collector], 6 * 4, 20)
 
 
 @pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
-def test_collectors_in_turn(hindsight):
+def test_collectors_in_turn_do_not_mix_their_trajectories(hindsight):
     """Each numbers its trajectories from 0 and leaves some unfinished."""
     rb = buffer(hindsight(reward_fn), capacity=5000, batch_size=256)
     for make in (*WORKERS, toy.make_env):

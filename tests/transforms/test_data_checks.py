@@ -195,7 +195,7 @@ def test_too_few_goals_pass():
 
 
 @pytest.mark.parametrize("key", COMPUTED)
-def test_without_an_environment_it_is_a_warning(key):
+def test_without_an_environment_a_computed_entry_is_a_warning(key):
     env = TransformedEnv(make_short(), COMPUTED[key]())
     transform = HindsightRelabel(env.base_env.compute_reward)
     messages = get_warnings(lambda: store(env, transform))
@@ -228,7 +228,7 @@ PASSING = {
 
 @BOTH
 @pytest.mark.parametrize("case", PASSING)
-def test_what_is_not_computed_from_the_goal_passes(hindsight, case):
+def test_entries_that_are_not_computed_from_the_goal_pass(hindsight, case):
     env = PASSING[case]()
     transform = hindsight.from_env(env)
     messages = get_warnings(lambda: store(env, transform, batches=8))
@@ -449,7 +449,7 @@ def test_a_mask_without_padding_changes_nothing():
     assert len(rb) == 30
 
 
-def test_split_trajectories_of_a_collector():
+def test_split_trajectories_of_a_collector_are_relabelled():
     rb = buffer(HindsightRelabel(reward_fn, her_ratio=1.0))
     for data in Collector(
         toy.make_env, frames_per_batch=60, total_frames=240, split_trajs=True

@@ -45,7 +45,9 @@ def check_sample(batch, stored):
     capacity=st.integers(60, 300),
     layout=st.sampled_from(["flat", "time first", "two-dimensional", "no ids"]),
 )
-def test_no_goal_is_wrong(num_envs, lengths, steps, capacity, layout):
+def test_each_key_has_goals_that_its_strategy_may_draw(
+    num_envs, lengths, steps, capacity, layout
+):
     ndim = 1 if layout in ("flat", "time first") else 2
     rb = buffer(GoalSampler(ALL, reward_fn), capacity=capacity, ndim=ndim)
     envs = Envs(num_envs, lengths)
@@ -61,7 +63,7 @@ def test_no_goal_is_wrong(num_envs, lengths, steps, capacity, layout):
 
 @pytest.mark.parametrize("cls", [ReplayBuffer, TensorDictReplayBuffer])
 @pytest.mark.parametrize("prefetch", [None, 2])
-def test_storages_on_disk_and_prefetching(cls, prefetch, tmp_path):
+def test_goals_are_right_on_disk_and_with_prefetching(cls, prefetch, tmp_path):
     rb = cls(
         storage=LazyMemmapStorage(60, scratch_dir=tmp_path),
         transform=GoalSampler(ALL, reward_fn),
@@ -79,7 +81,7 @@ def test_storages_on_disk_and_prefetching(cls, prefetch, tmp_path):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_storage_on_a_device(device):
+def test_goals_are_drawn_on_the_device_of_the_storage(device):
     storage = LazyTensorStorage(60, device=device)
     rb = buffer(GoalSampler(ALL, reward_fn), storage=storage)
     envs = Envs(3, [5, 9])
@@ -127,7 +129,7 @@ def test_keys_draw_independently():
     assert (batch["a"] == batch["b"]).all(1).float().mean() < 0.03  # 1 in 100
 
 
-def test_slices_share_goals():
+def test_slices_share_the_goal_of_each_key():
     sampler = SliceSampler(slice_len=4, traj_key=("collector", "traj_ids"))
     rb = buffer(GoalSampler(ALL, reward_fn, unit="slice"), sampler=sampler)
     # Slices of 4 start at steps 0 to 2 and end at steps 3 to 5 of 6, so no slice begins
@@ -162,7 +164,7 @@ def test_rows_that_were_overwritten_get_their_own_goal(capacity):
         ({"goal": "future"}, {"discount": 1.5}, r"discount must be within \[0, 1\]"),
     ],
 )
-def test_bad_values_are_refused(strategies, options, message):
+def test_bad_options_of_a_goal_sampler_are_refused(strategies, options, message):
     with pytest.raises(ValueError, match=message):
         GoalSampler(strategies, reward_fn, **options)
 
@@ -236,7 +238,7 @@ def draw(hindsight, strategy, discount, n=4000):
         *(("future", 0.5), ("episode", 0.5)),
     ],
 )
-def test_goals_have_their_distribution(hindsight, strategy, discount):
+def test_goals_have_the_distribution_of_their_strategy(hindsight, strategy, discount):
     steps, goal_steps = draw(hindsight, strategy, discount)
     chi2, freedom = 0.0, 0
     for step in range(1, LENGTH + 1):

@@ -48,7 +48,7 @@ def success_worker():
 
 
 @pytest.mark.parametrize("nested", ["none", "transformed", "serial", "parallel"])
-def test_from_env_reads_what_belongs_together(nested):
+def test_from_env_takes_reward_success_and_ends_of_the_environment(nested):
     env = {
         "none": lambda: make("PandaReach-v3"),
         "transformed": lambda: TransformedEnv(
@@ -104,7 +104,7 @@ def test_from_env_of_another_environment_raises(hindsight):
         (HindsightAugment, {"xyz": 0}, "no argument 'xyz'; accepted are reward_fn, k"),
     ],
 )
-def test_unknown_arguments_are_translated(hindsight, options, message):
+def test_unknown_arguments_are_refused_with_the_right_ones(hindsight, options, message):
     env = make("PandaReach-v1", None)
     for make_transform in (
         lambda: hindsight(reward_fn, **options),
@@ -194,7 +194,7 @@ def test_slices_with_goals_per_row_warn_once(unit):
         (HindsightRelabel, {"ndim": 3}, r"\[2, 8\] for ndim=3.*reshape.*ndim=1"),
     ],
 )
-def test_layouts_that_are_refused_at_once(hindsight, options, message):
+def test_layouts_that_do_not_fit_are_refused_at_once(hindsight, options, message):
     rb, data = buffer(hindsight(reward_fn), **options), Envs(2, [4]).chunk(8)
     with pytest.raises(RuntimeError, match=message):
         rb.extend(data.reshape(-1) if "sampler" in options else data)
@@ -263,7 +263,7 @@ def test_adding_several_steps_as_one_is_refused():
 
 
 @pytest.mark.parametrize("cls", [TensorDictReplayBuffer, ReplayBuffer])
-def test_max_value_writer_is_refused(cls):
+def test_a_max_value_writer_is_refused(cls):
     writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
     rb = buffer(HindsightRelabel(reward_fn), cls=cls, writer=writer)
     with pytest.raises(RuntimeError, match=r"round-robin.*TensorDictMaxValueWriter"):
@@ -372,7 +372,7 @@ def test_the_representation_names_the_options():
 # -- collectors that extend the buffer themselves -------------------------------------
 
 
-def test_collector_with_the_buffer():
+def test_a_collector_may_write_into_a_two_dimensional_buffer():
     rb = buffer(HindsightRelabel(reward_fn), ndim=2)
     collector = Collector(
         toy.make_env,
@@ -389,7 +389,7 @@ def test_collector_with_the_buffer():
     assert rb.write_count > len(rb.storage) // 3  # it was written over
 
 
-def test_collector_with_a_flat_buffer_is_refused():
+def test_a_collector_that_writes_into_a_flat_buffer_is_refused():
     rb = buffer(HindsightRelabel(reward_fn))
     collector = Collector(
         toy.make_env, None, frames_per_batch=15, total_frames=30, replay_buffer=rb
@@ -400,7 +400,7 @@ def test_collector_with_a_flat_buffer_is_refused():
 
 
 @pytest.mark.parametrize("ndim", [1, 2])
-def test_multi_process_collector_with_the_buffer_is_refused(ndim):
+def test_a_multi_process_collector_with_the_buffer_is_refused(ndim):
     # A TensorDictReplayBuffer of ndim=2 fails at the first [num_envs, 1] by itself.
     rb = buffer(HindsightRelabel(reward_fn), ndim=ndim, cls=ReplayBuffer)
     message = "multi-process collector" if ndim == 2 else "replay_buffer="
@@ -484,7 +484,7 @@ def test_shuffled_data_are_refused():
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
 @pytest.mark.parametrize("layout", EXISTING)
-def test_data_that_exist_already(storage, layout, tmp_path):
+def test_existing_data_are_relabelled_and_not_changed(storage, layout, tmp_path):
     data = EXISTING[layout]()
     if storage == "memmap":
         data.memmap(tmp_path)

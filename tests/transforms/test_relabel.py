@@ -72,7 +72,7 @@ def is_mixed(batch):
     every=st.integers(1, 5),
     restart=st.sampled_from([None, 1, 2, 7]),
 )
-def test_no_goal_is_wrong(
+def test_relabelled_goals_are_where_their_strategy_may_draw_them(
     num_envs,
     lengths,
     steps,
@@ -136,7 +136,7 @@ def test_no_mixed_goals_where_her_buffer_has_them(layout, steps):
 
 
 @pytest.mark.parametrize("her_ratio", [0.0, 0.3, 0.8, 1.0])
-def test_share_and_position_of_relabelled_rows(her_ratio):
+def test_the_share_of_relabelled_rows_is_her_ratio_at_every_position(her_ratio):
     rb = make_buffer(500, her_ratio=her_ratio, seed=0, batch_size=50)
     envs = Envs(4, [1, 7, 20])
     mask = []
@@ -160,7 +160,7 @@ def test_share_and_position_of_relabelled_rows(her_ratio):
         (lambda step, first, end, rng: step.numpy(), "a tensor of integer.*array"),
     ],
 )
-def test_bad_strategy_of_the_user_raises(strategy, message):
+def test_a_users_strategy_with_wrong_steps_raises(strategy, message):
     rb = make_buffer(strategy=strategy)
     rb.extend(Envs(3, [6]).chunk(6).reshape(-1))
     with pytest.raises(ValueError, match=message):
@@ -196,7 +196,7 @@ BAD_VALUES = [
 
 
 @pytest.mark.parametrize(("hindsight", "options", "message"), BAD_VALUES)
-def test_bad_values_are_refused(hindsight, options, message):
+def test_bad_options_of_hindsight_are_refused(hindsight, options, message):
     with pytest.raises(ValueError, match=message):
         hindsight(reward_fn, **options)
 
@@ -221,7 +221,7 @@ def test_functions_that_return_no_column_raise(name, values, got):
         rb.sample()
 
 
-def test_other_types_are_cast():
+def test_relabelled_entries_keep_the_types_of_the_data():
     transform = HindsightRelabel(
         lambda achieved, desired: reward_fn(achieved, desired).double(),
         terminated_fn=lambda achieved, desired: terminated_fn(achieved, desired).int(),
@@ -297,7 +297,7 @@ def test_rows_stored_without_the_transform_raise(tmp_path):
 
 @pytest.mark.parametrize("layout", ["env_first", "time_first", "no_ids"])
 @pytest.mark.parametrize("rooted", [True, False])
-def test_ids_that_begin_anew(layout, rooted):
+def test_relabelling_keeps_trajectories_with_equal_ids_apart(layout, rooted):
     """Collectors in turn, each of which leaves episodes unfinished."""
     rb = make_buffer(ndim=2 if layout == "no_ids" else 1, strategy="episode")
     for i in range(4):
@@ -316,8 +316,8 @@ def test_ids_that_begin_anew(layout, rooted):
 @pytest.mark.parametrize(
     ("layout", "steps"), [("env_first", 1), ("env_first", 2), ("no_ids", 2)]
 )
-def test_root_goals_that_tell_nothing(layout, steps):
-    """As in made-up data: then the ids alone decide."""
+def test_ids_alone_decide_if_root_goals_tell_nothing(layout, steps):
+    """As in made-up data."""
     rb = make_buffer(
         ndim=2 if layout == "no_ids" else 1, strategy="final", her_ratio=1.0
     )
@@ -330,7 +330,7 @@ def test_root_goals_that_tell_nothing(layout, steps):
     assert (batch["desired_goal"][:, 2] == 7).all()  # the last step of the episode
 
 
-def test_root_goals_that_come_and_go():
+def test_batches_may_come_with_or_without_root_goals():
     rb = make_buffer()
     for i, rooted in enumerate([True, False, True]):
         data = Envs(3, [7], first_env=10 * i).chunk(5).reshape(-1)
@@ -339,7 +339,7 @@ def test_root_goals_that_come_and_go():
 
 
 @pytest.mark.parametrize("one_by_one", [True, False])
-def test_single_env(one_by_one):
+def test_single_env_needs_no_trajectory_ids(one_by_one):
     rb = make_buffer(30, single_env=True, her_ratio=1.0)
     envs = Envs(1, [1, 4, 9])
     for _ in range(30):
@@ -352,7 +352,7 @@ def test_single_env(one_by_one):
         check_batch(rb.sample(), rb.storage[:], "future")
 
 
-def test_add_with_ids():
+def test_added_transitions_are_relabelled_by_their_ids():
     rb = make_buffer(30)
     envs = Envs(3, [1, 4, 9])
     for _ in range(40):
@@ -361,7 +361,7 @@ def test_add_with_ids():
         check_batch(rb.sample(), rb.storage[:], "future")
 
 
-def test_own_trajectory_key():
+def test_trajectories_are_told_apart_by_the_given_key():
     rb = make_buffer(trajectory_key="episode")
     data = Envs(3, [4]).chunk(12).reshape(-1)
     data["episode"] = data.pop(("collector", "traj_ids"))[:, None]
@@ -379,7 +379,7 @@ def test_done_ends_a_trajectory_whose_id_stays():
     check_batch(rb.sample(), rb.storage[:], "final")
 
 
-def test_three_dimensional_data():
+def test_data_of_three_dimensions_are_relabelled():
     envs = Envs(6, [1, 5, 12])
     rb = make_buffer(120, ndim=3)
     for _ in range(40):
@@ -392,7 +392,7 @@ def test_three_dimensional_data():
 # -- storages, samplers, buffers ------------------------------------------------------
 
 
-def test_memmap_storage_and_reading_it_all(tmp_path):
+def test_a_memmap_storage_is_relabelled_and_not_written_into(tmp_path):
     rb = buffer(
         HindsightRelabel(reward_fn),
         storage=LazyMemmapStorage(60, scratch_dir=tmp_path),
@@ -407,7 +407,7 @@ def test_memmap_storage_and_reading_it_all(tmp_path):
         assert (rb.storage[:] == before).all(), "the storage was written into"
 
 
-def test_reading_one_row_or_all_of_two_dimensions():
+def test_rows_read_by_index_are_relabelled():
     rb = make_buffer(60, ndim=2)
     rb.extend(Envs(3, [5, 9]).chunk(20))
     batch = rb[:]
@@ -454,7 +454,7 @@ def test_slices_share_a_goal(strategy, strict):
     assert abs(share.mean() - 0.8) <= 6 * 0.4 / len(share) ** 0.5
 
 
-def test_padded_slices():
+def test_padded_slices_share_a_goal():
     sampler = SliceSampler(
         slice_len=6,
         traj_key=("collector", "traj_ids"),
@@ -503,7 +503,7 @@ def trees(monkeypatch):
 
 
 @pytest.mark.usefixtures("trees")
-def test_prioritized_sampler():
+def test_relabelling_changes_no_draw_of_a_prioritized_sampler():
     def make(transform):
         return buffer(
             transform,
@@ -532,7 +532,7 @@ def test_prioritized_sampler():
     assert batch["priority_weight"].unique().numel() > 1
 
 
-def test_prefetch_beside_writing():
+def test_prefetched_goals_are_right_while_another_thread_writes():
     rb = buffer(HindsightRelabel(reward_fn), capacity=100, prefetch=3)
     envs = Envs(3, [5, 9, 30])
     failures = []
@@ -563,7 +563,7 @@ def test_prefetch_beside_writing():
 @pytest.mark.parametrize("how", ["state_dict", "dumps"])
 @pytest.mark.parametrize("seed", [None, 3])
 @pytest.mark.parametrize("strategy", ["future", "random"])
-def test_reloaded_buffer_draws_the_same_goals(how, seed, strategy, tmp_path):
+def test_a_reloaded_buffer_draws_the_same_goals(how, seed, strategy, tmp_path):
     def sample(rb, envs):
         torch.manual_seed(5)
         batches = []
@@ -594,7 +594,7 @@ def test_reloaded_buffer_draws_the_same_goals(how, seed, strategy, tmp_path):
 
 @pytest.mark.parametrize("how", ["state_dict", "dumps"])
 @pytest.mark.parametrize("rooted", [True, False])
-def test_new_collector_after_a_reload(how, rooted, tmp_path):
+def test_a_new_collector_after_a_reload_joins_no_old_trajectory(how, rooted, tmp_path):
     def chunk(envs):
         data = envs.chunk(5).reshape(-1)
         return data if rooted else data.exclude("achieved_goal")
@@ -623,7 +623,7 @@ def test_an_earlier_checkpoint_is_loaded_into_the_same_buffer(tmp_path):
 
 
 @pytest.mark.parametrize("forgets", [False, True])
-def test_emptied_buffer(forgets):
+def test_an_emptied_buffer_forgets_its_old_goals(forgets):
     rb, envs = make_buffer(100, strategy="random"), Envs(3, [5, 9, 40])
     for _ in range(33):
         rb.extend(envs.chunk(4).reshape(-1))
@@ -668,7 +668,7 @@ def test_seed_does_not_touch_torchs_generator():
 
 @pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("late", [False, True])
-def test_multi_step_raises(nested, late):
+def test_a_multi_step_transform_raises(nested, late):
     relabel = HindsightRelabel(reward_fn)
     multi_step = MultiStepTransform(n_steps=3, gamma=0.9)
     if nested:
@@ -697,7 +697,7 @@ def test_a_second_hindsight_transform_raises(second):
 
 
 @pytest.mark.parametrize("nested", [False, True])
-def test_environment_raises(nested):
+def test_hindsight_in_an_environment_raises(nested):
     transform = HindsightRelabel(reward_fn)
     with pytest.raises(ValueError, match="replay buffers"):
         TransformedEnv(
@@ -710,7 +710,7 @@ def test_environment_raises(nested):
 
 @pytest.mark.parametrize("seed", [None, 0])
 @pytest.mark.parametrize("layout", ["env_first", "no_ids"])
-def test_default_device(seed, layout):
+def test_relabelling_ignores_the_default_device(seed, layout):
     """torchrl's buffers themselves do without one."""
     transform = HindsightRelabel(reward_fn, seed=seed, strategy="episode")
     data = Envs(3, [5]).chunk(10)
@@ -723,7 +723,7 @@ def test_default_device(seed, layout):
 
 @pytest.mark.parametrize("data_device", DEVICES)
 @pytest.mark.parametrize("storage_device", DEVICES)
-def test_devices(data_device, storage_device):
+def test_goals_are_relabelled_on_the_device_of_the_storage(data_device, storage_device):
     rb = buffer(
         HindsightRelabel(reward_fn),
         storage=LazyTensorStorage(100, device=storage_device),
@@ -737,7 +737,7 @@ def test_devices(data_device, storage_device):
     assert isinstance(batch, TensorDict)
 
 
-def test_nested_goal_keys():
+def test_goals_under_nested_keys_are_relabelled():
     transform = HindsightRelabel(
         reward_fn,
         her_ratio=1.0,

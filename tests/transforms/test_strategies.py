@@ -111,7 +111,7 @@ def test_parts_are_kept_or_achieved_at_allowed_steps(
         assert is_near(masks[0] & masks[1], her_ratio**2)
 
 
-def test_the_users_own_strategy_in_a_mixture():
+def test_a_mixture_may_hold_a_users_own_strategy():
     def own_step(step, first, end, generator):
         return step
 

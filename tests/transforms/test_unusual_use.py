@@ -39,7 +39,7 @@ def test_scaled_rewards_are_noticed_when_they_are_sampled():
         rb.sample()
 
 
-def test_done_says_what_was_truncated():
+def test_done_rather_than_truncated_marks_the_ends():
     """torchrl's trainers set truncated on every row."""
     rb = buffer(HindsightRelabel(reward_fn, terminated_fn=terminated_fn))
     data = play()
@@ -58,7 +58,7 @@ class SlowStorage(LazyTensorStorage):
 
 
 @pytest.mark.parametrize("strategy", ["episode", "random"])
-def test_nothing_is_forgotten_while_it_is_written(strategy):
+def test_no_row_is_forgotten_while_it_is_written(strategy):
     rb = buffer(
         HindsightRelabel(reward_fn, strategy=strategy, her_ratio=1.0),
         storage=SlowStorage(100_000),
