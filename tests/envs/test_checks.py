@@ -77,13 +77,13 @@ def test_links_and_joints_that_the_urdf_lacks_are_refused(options):
         {"joint_forces": (-200.0,) * 7},
     ],
 )
-def test_numbers_out_of_range_are_refused(options):
+def test_robot_numbers_out_of_range_are_refused(options):
     (name,) = options
     with pytest.raises(ValueError, match=f"{name} must be"):
         make_kuka(**options)
 
 
-def test_the_name_of_a_link_is_refused():
+def test_a_link_given_by_its_name_is_refused():
     with pytest.raises(TypeError, match="ee_link must be an integer, got 'hand'"):
         make_kuka(ee_link="hand")
 

@@ -106,7 +106,7 @@ def test_distances_near_the_threshold_are_left_to_torch():
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1e-30, 0.04, 1.0, 1e30, math.inf])
-def test_thresholds_of_any_size_that_change_later(threshold):
+def test_success_follows_a_threshold_of_any_size_that_changes_later(threshold):
     with torch_panda.make("PandaPush-v3", num_envs=N, seed=0) as env:
         env.task.distance_threshold = threshold
         for td in act(env, 3)[1:]:
@@ -144,7 +144,7 @@ def make(task=None, robot=None):
     return RobotTaskEnv(robot=robot, task=task, num_envs=N, seed=0)
 
 
-def test_functions_of_the_user_are_called():
+def test_c_does_not_replace_functions_of_a_users_task():
     action = torch.ones(N, 3)
     with make() as env, make(FarPush()) as far:
         step, step_far = (
@@ -155,7 +155,7 @@ def test_functions_of_the_user_are_called():
         assert step_far["success"].equal(step["success"])
 
 
-def test_setpoints_and_observations_of_a_users_robot():
+def test_c_does_not_replace_functions_of_a_users_robot():
     action = torch.ones(N, 3)
     with make() as env, make(robot=OwnRobot(block_gripper=True)) as own:
         step = env.step(env.reset().set("action", action))["next"]
@@ -165,7 +165,7 @@ def test_setpoints_and_observations_of_a_users_robot():
         assert other["observation"].equal(expected)
 
 
-def test_a_wrong_declaration_is_refused():
+def test_a_wrong_selects_state_is_refused():
     class Doubled(Push):
         @selects_state
         def observation(self, simulation):

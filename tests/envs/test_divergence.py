@@ -93,7 +93,7 @@ def test_a_step_that_diverges_leaves_the_other_environments_untouched(body):
 
 
 @pytest.mark.parametrize("goal", ["task", "observation"])
-def test_the_last_transition_keeps_its_goal(goal):
+def test_the_transition_that_diverges_keeps_its_goal(goal):
     with make("reset", goal=goal) as env:
         start = env.reset()
         step(env)
@@ -109,7 +109,7 @@ def test_the_last_transition_keeps_its_goal(goal):
         assert is_new.tolist() == [False, True, False]
 
 
-def test_a_step_returns_only_stepped_clients():
+def test_a_step_returns_the_stepped_clients_that_diverged():
     with make("raise") as env:
         env.reset()
         simulation, control = env.episodes.simulation, env.robot.controller
@@ -120,7 +120,7 @@ def test_a_step_returns_only_stepped_clients():
         assert simulation.step(control, setpoint, [0, 2]) == [0]
 
 
-def test_unknown_option():
+def test_an_unknown_reaction_to_divergence_is_refused():
     with pytest.raises(ValueError, match="on_divergence must be one of"):
         torch_panda.make("PandaReach-v1", on_divergence="ignore")
 

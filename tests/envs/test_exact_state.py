@@ -57,7 +57,7 @@ def test_an_episode_continues_bit_for_bit(env_id):
         assert (follow(other, again, actions) == expected).all()
 
 
-def test_without_actions_and_unbatched():
+def test_an_exact_state_may_have_no_actions_and_no_batch():
     with torch_panda.make("PandaPush-v1", seed=0, sensors=("joint_torque",)) as env:
         first = env.reset()
         state = env.get_state(exact=True)
@@ -73,7 +73,7 @@ def test_without_actions_and_unbatched():
         assert torch.equal(again["joint_torque"], expected["joint_torque"])
 
 
-def test_a_partial_reset_restores_only_its_own():
+def test_a_partial_reset_to_an_exact_state_restores_only_its_own():
     with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
         torch.manual_seed(0)
         td = env.rollout(5)[:, -1]["next"].exclude("reward")

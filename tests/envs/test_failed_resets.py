@@ -120,8 +120,7 @@ def test_a_reset_of_others_leaves_a_divergence_to_be_found():
             env.step(env.rand_action())
 
 
-def test_divergence_beside_another_failure():
-    """The next reset rebuilds the client that the error did not name."""
+def test_a_reset_rebuilds_a_diverged_client_that_no_error_named():
     with make_driven() as env, make_driven() as fresh:
         env.reset(), fresh.reset()
         fail_and_diverge(env)

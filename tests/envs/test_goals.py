@@ -64,7 +64,7 @@ def test_a_declaration_holds_for_the_functions_that_it_describes():
         assert env.goal_indices is None
 
 
-def test_a_wrong_declaration_is_refused():
+def test_wrong_goal_entries_are_refused():
     with (
         RobotTaskEnv(robot=Panda(), task=Wrong()) as env,
         pytest.raises(ValueError, match=r"Wrong.goal_entries says, but they differ"),
@@ -155,7 +155,7 @@ def test_states_keep_the_goal_of_the_task():
         assert not env.reset(only_goal)["desired_goal"][:, 6:].any()
 
 
-def test_the_specs_are_right():
+def test_specs_fit_goals_that_are_observations():
     with make(num_envs=2) as env:
         check_env_specs(env)
     with make(num_envs=None, from_pixels=True, pixels_only=True) as env:
@@ -175,7 +175,7 @@ def test_partial_resets_keep_the_other_goals():
         assert changed.tolist() == [False, True, False]
 
 
-def test_the_functions_are_pure_and_pickle():
+def test_reward_functions_of_full_observations_pickle():
     with make() as env:
         functions = env.compute_reward, env.is_success
     reward, success = pickle.loads(pickle.dumps(functions))
@@ -204,7 +204,7 @@ def test_hindsight_relabels_full_observations():
         assert (batch["next", "reward"] == 0).any()
 
 
-def test_tasks_without_entries_refuse_it():
+def test_tasks_without_goal_entries_refuse_observations_as_goals():
     with pytest.raises(ValueError, match="but Undeclared has no goal_entries"):
         RobotTaskEnv(robot=Panda(), task=Undeclared(), goal="observation")
     with pytest.raises(ValueError, match="goal must be one of"):

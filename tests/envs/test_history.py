@@ -44,7 +44,7 @@ def count_differences(env_id, episodes):
     return int(differ.flatten(1).any(dim=1).sum())
 
 
-def test_hard_contacts_after_another_history():
+def test_hard_contacts_do_not_depend_on_earlier_episodes():
     assert count_differences("PandaStack-v3", 16) == 0
 
 
@@ -53,5 +53,5 @@ def test_hard_contacts_after_another_history():
     ("task", "episodes"),
     [("Push", 30), ("Slide", 30), ("PickAndPlace", 100), ("Stack", 100), ("Flip", 100)],
 )
-def test_many_hard_contacts_after_another_history(task, episodes):
+def test_many_hard_contacts_do_not_depend_on_earlier_episodes(task, episodes):
     assert count_differences(f"Panda{task}-v3", episodes) == 0

@@ -69,7 +69,7 @@ def test_a_subclass_with_arguments_pickles():
                 assert second.friction == 0.7
 
 
-def test_made_under_inference_mode():
+def test_an_environment_made_in_inference_mode_works_outside_it():
     with torch.inference_mode():
         env = torch_panda.make(
             "PandaPickAndPlace-v1",
@@ -95,7 +95,7 @@ def make(**options):
     return torch_panda.make("PandaReach-v1", num_envs=2, num_threads=1, **options)
 
 
-def test_a_run_is_resumed():
+def test_a_loaded_state_dict_continues_seeds_and_episodes():
     with make(seed=3) as env, make() as resumed:
         env.set_env_seed(1, 8)
         for _ in range(3):
@@ -118,7 +118,7 @@ def test_a_state_dict_is_a_file_without_code(tmp_path, seed):
         assert torch.equal(env.reset()["desired_goal"], goal)
 
 
-def test_a_resumed_collector_goes_on():
+def test_a_resumed_collector_continues_with_the_next_goals():
     def collect(env):
         policy = TensorDictModule(
             torch.nn.LazyLinear(3), in_keys=["observation"], out_keys=["action"]
@@ -155,7 +155,7 @@ def test_environments_of_an_env_creator_have_their_own_seeds():
         assert (env.reset() == same.reset()).all()
 
 
-def test_a_state_dict_of_other_environments():
+def test_a_state_dict_of_another_number_of_environments_is_refused():
     with (
         make() as env,
         torch_panda.make("PandaReach-v1", num_envs=3) as other,

@@ -139,7 +139,7 @@ def test_as_many_threads_as_environments_give_the_same_numbers(loop):
 # Fewer substeps than in a piece, and a number that is not a multiple of a piece.
 @needs_native
 @pytest.mark.parametrize("n_substeps", [1, 7])
-def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
+def test_clients_stepped_whole_or_in_pieces_give_the_same_numbers(n_substeps):
     def rollout(num_threads):
         physics = PhysicsParams(n_substeps=n_substeps)
         with make(num_envs=6, num_threads=num_threads, physics=physics) as env:
@@ -152,7 +152,7 @@ def test_some_clients_are_drawn_whole_and_some_in_pieces(n_substeps):
 
 
 @needs_native
-def test_an_arm_alone(monkeypatch):
+def test_both_loops_step_an_arm_alone_alike(monkeypatch):
     """With a single body, the broad phase has no pair that resets its cursor."""
 
     def build(client):
@@ -234,14 +234,14 @@ def test_after_ctrl_c_in_close_a_second_close_frees_the_rest(monkeypatch):
     assert all(client.is_closed for client in env.episodes.simulation.clients)
 
 
-def test_a_closed_client(env):
+def test_a_step_names_the_environment_of_a_closed_client(env):
     env.reset()
     env.episodes.simulation.clients[1].close()
     with pytest.raises(WorkerError, match=r"environment 1: BulletError: .* is closed"):
         step(env)
 
 
-def test_a_reset_that_fails(env):
+def test_a_failed_reset_names_its_environment_and_blocks_steps(env):
     with make() as other:
         env.reset()
         other.reset()
@@ -275,18 +275,18 @@ def checked():
         yield env
 
 
-def test_a_setpoint_of_another_shape(checked):
+def test_a_setpoint_of_another_shape_is_refused(checked):
     control = checked.robot.motor_control
     with pytest.raises(ValueError, match=r"must have shape \(3, 5\), got \(3, 4\)"):
         checked.episodes.simulation.step(control, np.zeros((N, 4)))
 
 
-def test_forces_of_another_robot(checked):
+def test_forces_of_another_robot_are_refused(checked):
     with pytest.raises(ValueError, match="a force for each of 9 movable joints, got 4"):
         checked.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
 
 
-def test_inverse_kinematics_without_an_arm(checked):
+def test_inverse_kinematics_without_an_arm_are_refused(checked):
     control = MotorControl((1.0,) * 9, ik_link=11, ik_orientation=(1.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="ik_link needs num_arm_joints"):
         checked.episodes.simulation.step(control, np.zeros((N, 12)))
@@ -296,14 +296,14 @@ def test_inverse_kinematics_without_an_arm(checked):
     ("field", "value"),
     [("num_arm_joints", 12), ("num_arm_joints", -3), ("ik_link", -1)],
 )
-def test_a_control_whose_fields_are_out_of_range(checked, field, value):
+def test_a_control_whose_fields_are_out_of_range_is_refused(checked, field, value):
     control = dataclasses.replace(checked.robot.motor_control, **{field: value})
     with pytest.raises(ValueError, match=f"{field} must be .* got {value}"):
         checked.episodes.simulation.step(control, np.zeros((N, control.setpoint_dim)))
 
 
 @pytest.mark.parametrize("envs", [[N], [-1], [0, 1, 0]])
-def test_clients_that_do_not_exist_or_are_named_twice(checked, envs):
+def test_clients_that_do_not_exist_or_are_named_twice_are_refused(checked, envs):
     simulation, control = checked.episodes.simulation, checked.robot.motor_control
     setpoint = np.zeros((N, control.setpoint_dim))
     for call in (
@@ -368,7 +368,7 @@ def test_a_forked_child_has_threads_of_its_own(env):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
-def test_no_thread_is_left(loop):
+def test_no_thread_is_left_after_close(loop):
     before = own_threads()
     with make() as env:
         env.rollout(3)
@@ -412,7 +412,7 @@ class OwnControl(Panda):
         super().control(client, body, setpoint)
 
 
-def test_own_control_is_called(loop):
+def test_a_robots_own_control_is_called(loop):
     robots = OwnControl(block_gripper=True), Panda(block_gripper=True)
     states = []
     for robot in robots:

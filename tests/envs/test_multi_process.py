@@ -30,7 +30,7 @@ def goals(data):
     return {tuple(goal) for goal in data["desired_goal"].reshape(-1, 3).tolist()}
 
 
-def test_parallel_env():
+def test_parallel_env_keeps_seeds_and_threads_and_names_a_dead_worker():
     env = ParallelEnv(2, make_env, mp_start_method="spawn")
     serial = SerialEnv(2, make_env)
     rollouts = []
@@ -54,7 +54,7 @@ def test_parallel_env():
 
 
 @pytest.mark.parametrize("collector_class", [MultiSyncCollector, MultiAsyncCollector])
-def test_collectors(collector_class):
+def test_collectors_keep_seeds_and_threads_and_name_a_dead_worker(collector_class):
     frames = 2 * NUM_ENVS * STEPS
     expected = first_goals(seed=0, num_workers=2)
     assert len(expected) == 2 * NUM_ENVS

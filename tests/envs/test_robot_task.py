@@ -51,7 +51,7 @@ def test_episodes_do_not_depend_on_the_number_of_environments():
             assert (td["next"] == others["next"][:3]).all()
 
 
-def test_seed_restarts_the_episodes(env):
+def test_a_seed_restarts_the_episodes(env):
     env.set_seed(5)
     first = [env.reset()["desired_goal"] for _ in range(3)]
     env.set_seed(5)
@@ -135,7 +135,7 @@ def test_unknown_options_of_a_reset_are_refused(env):
         env.reset(env.get_state(), set_sate=True)
 
 
-def test_partial_reset_leaves_the_others_alone(env):
+def test_a_partial_reset_changes_no_bit_of_the_other_environments(env):
     with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as other:
         td, untouched = env.reset(), other.reset()
         generator = torch.Generator().manual_seed(0)
@@ -169,7 +169,7 @@ def test_a_partial_reset_returns_the_entries_of_all_environments(env):
     assert torch.equal(from_state["desired_goal"][0], state["desired_goal"][0].float())
 
 
-def test_partial_step_leaves_the_others_alone(env):
+def test_a_partial_step_leaves_the_other_environments_alone(env):
     td = env.reset()
     before = env.get_state()
     td["action"] = torch.ones(3, 3)
@@ -222,7 +222,7 @@ def test_a_rollout_equals_torchrls_own_rollout(env):
         assert (played == ours).all()
 
 
-def test_state_round_trip_keeps_float64(env):
+def test_a_state_that_is_set_and_read_keeps_float64(env):
     run(env, 20)
     state = env.get_state()
     assert state["object_pose"].dtype == torch.float64
@@ -235,7 +235,7 @@ def test_state_round_trip_keeps_float64(env):
         torch.testing.assert_close(again[key], value, rtol=0.0, atol=tolerance)
 
 
-def test_partial_state_leaves_the_rest_neutral_or_sampled(env):
+def test_a_partial_state_leaves_the_rest_neutral_or_sampled(env):
     pose = torch.tensor([0.1, 0.0, 0.02, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     partial_state = TensorDict({"object_pose": pose.expand(3, 1, 7)}, batch_size=[3])
     td = env.reset(partial_state, set_state=True)
@@ -276,7 +276,7 @@ def test_starting_from_a_missing_state_is_refused(env, state):
         ("step_count", lambda x: x - 1, r"step_count of environment 0"),
     ],
 )
-def test_bad_state_changes_nothing(env, key, change, message):
+def test_a_bad_state_is_refused_and_changes_nothing(env, key, change, message):
     env.reset()
     state = env.get_state()
     bad = state.clone().exclude(key)
@@ -321,7 +321,7 @@ def test_an_episode_can_start_from_the_last_state_of_another(env_id, end):
         (torch.zeros(3, 3, device="meta"), 0, "device cpu, got meta"),
     ],
 )
-def test_bad_action_changes_nothing(env, action, error, message):
+def test_a_bad_action_is_refused_and_changes_nothing(env, action, error, message):
     td = env.reset()
     state = env.get_state(exact=True)
     with pytest.raises((ValueError, TypeError)[error], match=message):
@@ -341,7 +341,7 @@ def test_bad_action_changes_nothing(env, action, error, message):
         ({"camera": torch_panda.Camera()}, ValueError),
     ],
 )
-def test_bad_arguments_are_refused(arguments, error):
+def test_bad_arguments_of_make_are_refused_by_name(arguments, error):
     (name,) = arguments
     with pytest.raises(error, match=name):
         torch_panda.make("PandaReach-v1", **arguments)
@@ -411,7 +411,7 @@ def test_use_after_close_is_refused():
             use()
 
 
-def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):
+def test_clients_are_closed_if_an_environment_cannot_be_built(monkeypatch):
     clients = []
     connect = PhysicsClient.__init__
     monkeypatch.setattr(
@@ -430,14 +430,14 @@ def test_nothing_is_left_of_what_cannot_be_built(monkeypatch):
 
 
 @on_gpu
-def test_outputs_on_cuda():
+def test_outputs_and_states_are_on_the_given_cuda_device():
     with torch_panda.make("PandaPush-v1", num_envs=2, device="cuda") as env:
         td = env.rollout(3)
         assert td.device.type == td["next", "observation"].device.type == "cuda"
         assert env.get_state()["object_pose"].device.type == "cuda"
 
 
-def test_a_repr_shows_the_arguments():
+def test_the_repr_of_an_environment_shows_its_parts_and_solver():
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=3) as env:
         text = repr(env)
     assert text.startswith("RobotTaskEnv(robot=Panda(")

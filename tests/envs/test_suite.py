@@ -51,7 +51,7 @@ def env(made):
         ("PegInsertion", "", "v1"),
     ],
 )
-def test_sizes_of_the_contract(task, control, version):
+def test_sizes_and_step_limits_are_those_of_the_contract(task, control, version):
     env_id = f"Panda{task}{control}-{version}"
     observation, goal, action, steps = SIZES[task]
     assert {env_id, dense(env_id)} <= set(torch_panda.ENV_IDS)
@@ -88,7 +88,7 @@ def test_an_id_names_its_robot_its_task_and_its_version():
         assert env_id == f"{name}{control}{reward}-{version}"
 
 
-def test_specs(env):
+def test_resets_and_steps_agree_with_the_specs(env):
     check_env_specs(env)
 
 
@@ -123,7 +123,7 @@ def test_reward_types_share_their_physics(env, env_id):
     assert (rewarded.exclude("reward") == sparse.exclude("reward")).all()
 
 
-def test_episode_is_truncated(env):
+def test_an_episode_is_truncated_at_its_step_limit(env):
     limit = env.max_episode_steps
     assert limit == env.task.max_episode_steps
     # Start two steps before the end, to save the time of a whole episode.
@@ -147,7 +147,7 @@ def test_no_output_aliases_another(env):
     assert (td == before).all()
 
 
-def test_starts_differ(env):
+def test_goals_differ_between_environments_and_episodes(env):
     first, second = env.reset(), env.reset()
     assert not torch.equal(first["desired_goal"], second["desired_goal"])
     for td in (first, second):

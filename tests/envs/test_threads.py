@@ -78,7 +78,7 @@ def run(code):
     return done.stderr
 
 
-def test_three_threads_that_step():
+def test_threads_that_step_at_once_get_errors_and_do_no_harm():
     run(THREE_THREADS)
 
 

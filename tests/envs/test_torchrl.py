@@ -28,7 +28,7 @@ make_env = functools.partial(
 )
 
 
-def test_transforms():
+def test_torchrls_transforms_see_the_episodes():
     env = TransformedEnv(
         make_env(seed=0),
         Compose(
