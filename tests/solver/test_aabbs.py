@@ -41,12 +41,12 @@ def test_a_crowd_has_the_same_tree():
     assert counts.aabbs > counts.bullet_aabbs > 0
 
 
-def test_a_world_of_many_objects_is_left_to_bullet():
+def test_aabbs_of_a_world_of_65_bodies_are_left_to_bullet():
     counts = assert_same(scene(lambda world: crowd(world, 64)), 60)
     assert counts.aabbs == counts.bullet_aabbs == 0
 
 
-def test_the_largest_world_whose_aabbs_are_moved_here():
+def test_aabbs_of_a_world_of_64_bodies_are_moved_here():
     assert assert_same(scene(lambda world: crowd(world, 63)), 60).aabbs > 0
 
 
@@ -70,7 +70,7 @@ def test_pairs_that_are_filtered_out_are_left_to_bullet():
     assert counts.bullet_aabbs > 120
 
 
-def test_bodies_that_jump_come_and_go():
+def test_bodies_that_jump_come_and_go_have_the_same_tree():
     def fill(world):
         crowd(world, 12)
         client = world.client
@@ -91,7 +91,7 @@ def test_bodies_that_jump_come_and_go():
     assert counts.aabbs > counts.bullet_aabbs > 0
 
 
-def test_bodies_that_fall_asleep():
+def test_bodies_that_fall_asleep_move_no_aabbs():
     def fill(world):
         world.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         crowd(world, 4)

@@ -39,13 +39,13 @@ def stand(world, **dynamics):
         {"localInertiaDiagonal": (1e-5, 2e-4, 3e-3)},
     ],
 )
-def test_dynamics_of_links(dynamics):
+def test_links_of_any_dynamics_accelerate_alike(dynamics):
     counts = assert_same(scene(lambda world: stand(world, **dynamics)), STEPS)
     assert (counts.bodies, counts.bullet_bodies) == (STEPS, 0)
 
 
 @pytest.mark.parametrize("gravity", [(0, 0, 0), (1.0, -2.0, 3.0)])
-def test_gravity(gravity):
+def test_gravity_of_any_direction_acts_alike(gravity):
     def fill(world):
         stand(world)
         world.client.setGravity(*gravity)
@@ -54,7 +54,7 @@ def test_gravity(gravity):
 
 
 @pytest.mark.parametrize("frame", [pybullet.WORLD_FRAME, pybullet.LINK_FRAME])
-def test_forces_on_links_and_torques_of_joints(frame):
+def test_forces_on_links_and_torques_of_joints_act_alike(frame):
     def fill(world):
         chain = stand(world)
         client = world.client
@@ -88,7 +88,7 @@ def test_sixteen_bodies_of_a_world_are_accelerated_here():
     assert assert_same(scene(fill), 30).bodies == 16 * 30
 
 
-def test_a_chain_that_falls_asleep_and_wakes():
+def test_a_chain_falls_asleep_and_wakes_alike():
     def fill(world):
         world.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         world.ground()
@@ -118,7 +118,7 @@ def test_a_body_with_joint_feedback_is_left_to_bullet(joint):
     assert assert_same(scene(fill), STEPS).bodies == 0
 
 
-def test_joint_feedback_that_is_switched_off_again():
+def test_a_body_is_accelerated_here_once_joint_feedback_is_off():
     def fill(world):
         chain = stand(world)
 
@@ -139,7 +139,7 @@ def test_a_fixed_base_with_a_velocity_is_left_to_bullet():
     assert assert_same(scene(fill), STEPS, leaves_groups=None).bodies == 0
 
 
-def test_a_floating_base_is_left_to_bullet():
+def test_accelerations_of_a_floating_base_are_left_to_bullet():
     def fill(world):
         world.ground()
         world.chain(3, (0, 0, 0.6), base_mass=0.2)
@@ -148,9 +148,7 @@ def test_a_floating_base_is_left_to_bullet():
 
 
 @pytest.mark.parametrize("force", [1e300, math.inf, math.nan])
-def test_a_body_whose_acceleration_is_not_finite(force):
-    """Bullet's function computes it again."""
-
+def test_bullet_computes_accelerations_that_are_not_finite_again(force):
     def fill(world):
         chain = stand(world)
 

@@ -41,18 +41,18 @@ def reason():
     return status.reason
 
 
-def test_variable_switches_it_off(closed, monkeypatch):
+def test_the_variable_switches_the_packed_solver_off(closed, monkeypatch):
     monkeypatch.setenv(SOLVER_VARIABLE, "bullet")
     assert reason() == "TORCH_PANDA_SOLVER=bullet"
 
 
-def test_unknown_solver_is_refused(closed, monkeypatch):
+def test_an_unknown_solver_is_refused(closed, monkeypatch):
     monkeypatch.setenv(SOLVER_VARIABLE, "fast")
     with pytest.raises(ValueError, match='must be "packed" or "bullet", got "fast"'):
         gate.activate()
 
 
-def test_packed_can_be_demanded(closed, monkeypatch):
+def test_a_demanded_packed_solver_that_cannot_run_is_an_error(closed, monkeypatch):
     monkeypatch.setenv(SOLVER_VARIABLE, "packed")
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     with pytest.raises(
@@ -65,7 +65,9 @@ def test_packed_can_be_demanded(closed, monkeypatch):
     ("system", "machine"),
     [("linux", "aarch64"), ("darwin", "x86_64"), ("win32", "AMD64")],
 )
-def test_platform(closed, monkeypatch, system, machine):
+def test_the_gate_stays_closed_on_another_platform(
+    closed, monkeypatch, system, machine
+):
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(platform, "machine", lambda: machine)
     assert f"this is {system} on {machine}" in reason()
@@ -77,26 +79,26 @@ def test_an_empty_variable_counts_as_unset(closed, monkeypatch):
     assert "needs x86-64 Linux" in reason()
 
 
-def test_version(closed, monkeypatch):
+def test_the_gate_stays_closed_for_another_version_of_pybullet(closed, monkeypatch):
     monkeypatch.setattr(library, "SUPPORTED_VERSION", "3.2.6")
     assert reason() == "the packed solver needs pybullet 3.2.6, and 3.2.7 is installed"
 
 
-def test_no_compiled_library(closed, monkeypatch):
+def test_the_gate_stays_closed_without_a_compiled_library(closed, monkeypatch):
     monkeypatch.setattr(gate, "_LIBRARY", "torch_panda.bullet.solver.missing")
     assert "the packed solver is not compiled" in reason()
 
 
 @pytest.mark.parametrize("part", [0, 1])
 @pytest.mark.parametrize("index", range(len(gate._REPLACED)))
-def test_missing_symbol(closed, monkeypatch, index, part):
+def test_the_gate_stays_closed_if_a_symbol_is_missing(closed, monkeypatch, index, part):
     replaced = [list(names) for names in gate._REPLACED]
     replaced[index][part] = "_ZTV7missing"
     monkeypatch.setattr(gate, "_REPLACED", replaced)
     assert reason() == "pybullet has no symbol _ZTV7missing"
 
 
-def test_stripped_module(closed, monkeypatch, tmp_path):
+def test_the_gate_stays_closed_for_a_stripped_module(closed, monkeypatch, tmp_path):
     stripped = tmp_path / "pybullet.so"
     header = bytearray(64)
     header[:6] = b"\x7fELF\x02\x01"
@@ -105,12 +107,12 @@ def test_stripped_module(closed, monkeypatch, tmp_path):
     assert "has no .symtab" in reason()
 
 
-def test_module_that_is_no_elf_file(closed, monkeypatch):
+def test_the_gate_stays_closed_for_a_module_that_is_no_elf_file(closed, monkeypatch):
     monkeypatch.setattr(library, "library_path", lambda: __file__)
     assert "is not a 64-bit ELF file" in reason()
 
 
-def test_function_that_is_not_in_the_table(closed, monkeypatch):
+def test_the_gate_stays_closed_if_a_table_lacks_its_function(closed, monkeypatch):
     (table, _), *others = gate._REPLACED
     replaced = [(table, others[1][1]), *others]
     monkeypatch.setattr(gate, "_REPLACED", replaced)
@@ -145,7 +147,9 @@ def test_function_that_is_not_in_the_table(closed, monkeypatch):
         ("ik_iterations", 7, "m_maxNumIterations"),
     ],
 )
-def test_layout_that_differs(closed, monkeypatch, field, value, wrong):
+def test_the_gate_stays_closed_if_bullets_layout_differs(
+    closed, monkeypatch, field, value, wrong
+):
     # Expect wrong numbers of the scene: the probe then reports a field, as it would if
     # the field were at another offset.
     probe = native.SolverLibrary.set_mode
@@ -170,12 +174,12 @@ def test_an_interrupted_self_test_puts_bullets_functions_back(closed, monkeypatc
     assert gate.find_replacements(library.library_path())
 
 
-def test_library_of_other_sources(closed, monkeypatch):
+def test_the_gate_stays_closed_for_a_library_of_other_sources(closed, monkeypatch):
     monkeypatch.setattr(native, "VERSION", 0)
     assert "but the sources of torch_panda have version 0" in reason()
 
 
-def test_results_that_differ(closed, monkeypatch):
+def test_the_gate_stays_closed_if_results_differ(closed, monkeypatch):
     simulate = self_test._simulate
     runs = []
 
@@ -190,7 +194,7 @@ def test_results_that_differ(closed, monkeypatch):
     assert reason() == "the self-test differs from Bullet in step 7"
 
 
-def test_groups_that_are_left_to_bullet(closed, monkeypatch):
+def test_the_gate_stays_closed_if_groups_are_left_to_bullet(closed, monkeypatch):
     monkeypatch.setattr(self_test, "SOLVE", native.LEAVE)
     assert reason() == "the packed solver did not solve all groups of the self-test"
 
@@ -204,7 +208,9 @@ def test_groups_that_are_left_to_bullet(closed, monkeypatch):
         ("answers", "did not compute the inverse kinematics of the self-test"),
     ],
 )
-def test_parts_that_are_left_to_bullet(closed, monkeypatch, field, wrong):
+def test_the_gate_stays_closed_if_a_part_is_left_to_bullet(
+    closed, monkeypatch, field, wrong
+):
     counts = native.SolverLibrary.counts
 
     def without_field(self):
@@ -216,7 +222,7 @@ def test_parts_that_are_left_to_bullet(closed, monkeypatch, field, wrong):
     assert reason() == f"the packed solver {wrong}"
 
 
-def test_decides_once(monkeypatch):
+def test_the_gate_decides_once(monkeypatch):
     monkeypatch.setattr(gate, "open_gate", lambda: pytest.fail("decided again"))
     monkeypatch.setenv(SOLVER_VARIABLE, "bullet")
     assert gate.activate().name == "packed"
@@ -260,7 +266,7 @@ print("hash", digest.hexdigest(), {solver})
 """
 
 
-def test_clients_of_a_user_are_the_same_without_us():
+def test_a_users_own_clients_compute_the_same_beside_ours():
     hashes = []
     ours = "import torch_panda.bullet as b; ours = b.PhysicsClient()"
     for before, solver in (("", "None"), (ours, "b.solver.activate()")):

@@ -81,7 +81,7 @@ def assert_same_answers(ask, *, ours, bullet, **options):
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 100.0])
 @pytest.mark.parametrize("urdf", ROBOTS)
-def test_random_states_and_targets(urdf, scale):
+def test_random_states_and_targets_have_the_same_answers(urdf, scale):
     def ask(arm):
         damping = arm.generator.uniform(1e-3, 1.0, len(arm.joints))
         return [
@@ -107,14 +107,14 @@ def test_random_states_and_targets(urdf, scale):
         {"jointDamping": [0.01] * 9},
     ],
 )
-def test_options_that_a_command_may_leave_out(options):
+def test_commands_that_leave_out_options_have_the_same_answers(options):
     def ask(arm):
         return [arm.reach(**options) for _ in range(50)]
 
     assert_same_answers(ask, ours=49, bullet=1)
 
 
-def test_targets_that_are_nearly_reached():
+def test_nearly_reached_targets_have_the_same_answers():
     """The orientation's error is close to 0, or close to a full turn."""
 
     def ask(arm):
@@ -136,7 +136,7 @@ def test_targets_that_are_nearly_reached():
     assert_same_answers(ask, ours=20, bullet=1)
 
 
-def test_base_that_is_turned_and_moved():
+def test_a_turned_and_moved_base_has_the_same_answers():
     def ask(arm):
         results = []
         for _ in range(50):
@@ -147,7 +147,7 @@ def test_base_that_is_turned_and_moved():
     assert_same_answers(ask, ours=49, bullet=1)
 
 
-def test_later_commands_of_bullet():
+def test_later_commands_of_bullet_have_the_same_answers():
     """Bullet computes other things with the numbers that both solvers read."""
 
     def ask(arm):
@@ -169,7 +169,7 @@ def test_later_commands_of_bullet():
     assert_same_answers(ask, ours=19, bullet=21)
 
 
-def test_a_robot_that_is_removed_and_loaded_again():
+def test_a_robot_that_is_loaded_again_has_the_same_answers():
     """Bullet keeps the frames and axes of a body that was removed.
 
     It uses them for a new body with the same address, which depends on the allocator.
@@ -210,7 +210,7 @@ LIMITS = {
         {"jointDamping": [math.nan] * 9},
     ],
 )
-def test_commands_that_are_left_to_bullet(options):
+def test_other_options_and_bad_numbers_are_left_to_bullet(options):
     def ask(arm):
         return [arm.reach(11, **options) for _ in range(3)]
 
@@ -228,7 +228,7 @@ def test_commands_of_a_client_that_logs_them_are_left_to_bullet(tmp_path):
     assert_same_answers(ask, ours=3, bullet=3)
 
 
-def test_a_floating_base_is_left_to_bullet():
+def test_kinematics_of_a_floating_base_are_left_to_bullet():
     def ask(arm):
         return [arm.reach(11) for _ in range(3)]
 
@@ -248,7 +248,7 @@ def test_a_robot_of_more_than_32_joints_is_left_to_bullet(num_joints, ours):
 
 @pytest.mark.parametrize("control_type", ["ee", "ee_pose"])
 @pytest.mark.parametrize("env_id", ["PandaReach-v3", "PandaPush-v1"])
-def test_environments_with_a_turned_base(env_id, control_type):
+def test_environments_with_a_turned_base_step_alike(env_id, control_type):
     options = {
         "control_type": control_type,
         "base_position": (-0.5, 0.1, 0.05),

@@ -75,7 +75,7 @@ def pile():
     return world
 
 
-def test_64_clients_that_are_created_and_closed_at_random():
+def test_64_clients_created_and_closed_at_random_step_alike():
     with solver("bullet"):
         world, expected = pile(), []
         for k in range(60):

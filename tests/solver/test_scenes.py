@@ -113,11 +113,11 @@ def pile(world, **dynamics):
         {"restitution": 0.9},
     ],
 )
-def test_ten_cubes_in_a_pile(dynamics):
+def test_ten_cubes_in_a_pile_fall_alike(dynamics):
     assert_same(scene(lambda world: pile(world, **dynamics)), 300)
 
 
-def test_rolling_friction():
+def test_rolling_friction_acts_alike():
     def fill(world):
         pile(world, rollingFriction=0.05, spinningFriction=0.02)
         shape = world.client.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.05)
@@ -137,7 +137,7 @@ def test_rolling_friction():
         {"anisotropicFriction": (1.0, 0.2, 0.1)},
     ],
 )
-def test_settings_of_contacts(dynamics):
+def test_settings_of_contacts_act_alike(dynamics):
     def fill(world):
         pile(world, **dynamics)
         chain = world.chain(5, (1.0, 0, 0.45))
@@ -149,7 +149,7 @@ def test_settings_of_contacts(dynamics):
 
 
 @pytest.mark.parametrize("masses", [(1e-3, 1e3), (1e3, 1e-3)])
-def test_extreme_masses(masses):
+def test_extreme_masses_fall_alike(masses):
     def fill(world):
         world.ground()
         for i in range(6):
@@ -158,7 +158,7 @@ def test_extreme_masses(masses):
     assert_same(scene(fill), 200)
 
 
-def test_bodies_that_sleep_and_wake():
+def test_bodies_sleep_and_wake_alike():
     def fill(world):
         world.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         world.ground()
@@ -172,7 +172,7 @@ def test_bodies_that_sleep_and_wake():
 
 
 @pytest.mark.parametrize("base_mass", [0.0, 0.2])
-def test_chain_of_hinges(base_mass):
+def test_a_chain_of_hinges_moves_alike(base_mass):
     def fill(world):
         world.ground()
         world.box(0.5, (0.1, 0.02, 0.05))
@@ -189,7 +189,7 @@ def test_chain_of_hinges(base_mass):
     assert_same(scene(fill), 400)
 
 
-def test_box_wedged_between_fingers():
+def test_a_box_wedged_between_fingers_moves_alike():
     def fill(world):
         client = world.client
         client.setAdditionalSearchPath(pybullet_data.getDataPath())
@@ -222,7 +222,7 @@ def test_box_wedged_between_fingers():
 
 
 @pytest.mark.parametrize("last_force", [1e280, math.inf, math.nan])
-def test_diverging_simulation(last_force):
+def test_a_diverging_simulation_steps_alike(last_force):
     """If numbers become infinite or NaN, Bullet's function takes over."""
 
     def fill(world):
@@ -264,7 +264,7 @@ def test_diverging_simulation(last_force):
         {"contactERP": 0.5},
     ],
 )
-def test_engine_parameters(parameters):
+def test_engine_parameters_act_alike(parameters):
     def fill(world):
         pile(world, spinningFriction=0.01)
         world.chain(4, (1.0, 0, 0.4))
@@ -274,7 +274,7 @@ def test_engine_parameters(parameters):
     assert_same(scene(fill), 120)
 
 
-def test_body_in_two_groups_is_left_to_bullet():
+def test_a_body_in_two_groups_is_left_to_bullet():
     """A box rests on the fixed base of a chain; motors hold the chain's links."""
 
     def fill(world):
@@ -287,7 +287,7 @@ def test_body_in_two_groups_is_left_to_bullet():
 
 
 @pytest.mark.parametrize("joint", [pybullet.JOINT_POINT2POINT, pybullet.JOINT_FIXED])
-def test_constraints_between_bodies(joint):
+def test_constraints_between_bodies_act_alike(joint):
     def fill(world):
         world.ground()
         world.chain(3, (0, 0, 0.5))
@@ -300,7 +300,7 @@ def test_constraints_between_bodies(joint):
     assert_same(scene(fill), 150)
 
 
-def test_gear_between_joints():
+def test_a_gear_between_joints_acts_alike():
     def fill(world):
         world.ground()
         chain = world.chain(3, (0, 0, 0.5))
@@ -313,7 +313,7 @@ def test_gear_between_joints():
     assert_same(scene(fill), 150)
 
 
-def test_constraint_to_the_world_is_left_to_bullet():
+def test_a_constraint_to_the_world_is_left_to_bullet():
     def fill(world):
         world.ground()
         world.box(1.0, (0.7, 0, 0.3))
@@ -339,7 +339,7 @@ def test_rigid_bodies_are_left_to_bullet():
     assert_same(scene(fill), 150, leaves_groups=True)
 
 
-def test_solver_analytics():
+def test_solver_analytics_are_the_same():
     def fill(world):
         pile(world)
         world.client.setPhysicsEngineParameter(reportSolverAnalytics=1)
@@ -378,7 +378,7 @@ SLOW_ROBOTS = [pytest.param(robot, marks=pytest.mark.slow) for robot in MORE_ROB
 
 @pytest.mark.parametrize("fixed_base", [False, True])
 @pytest.mark.parametrize("robot", [*ROBOTS, *SLOW_ROBOTS])
-def test_robots_of_pybullet(robot, fixed_base):
+def test_robots_of_pybullet_move_alike(robot, fixed_base):
     """Floating bases, joints of several degrees of freedom, meshes, self-collisions."""
 
     def fill(world):

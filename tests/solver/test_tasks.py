@@ -62,27 +62,27 @@ CONTROL_TYPES = ("ee", "ee_pose", "joints", "joint_velocity", "joint_torque")
 
 
 @pytest.mark.parametrize("env_id", PHYSICS_IDS)
-def test_tasks(env_id):
+def test_every_task_steps_alike(env_id):
     assert_same(environment(env_id), 15)
 
 
 @pytest.mark.parametrize("control_type", CONTROL_TYPES)
-def test_control_types(control_type):
+def test_every_control_type_steps_alike(control_type):
     options = {"control_type": control_type}
     assert_same(environment("PandaPickAndPlace-v3", robot_options=options), 20)
 
 
-def test_fast_physics():
+def test_fast_physics_step_alike():
     assert_same(environment("PandaStack-v1", physics="fast"), 40)
 
 
 @pytest.mark.parametrize("env_id", ["PandaPickAndPlace-v1", "PandaPush-v3"])
-def test_objects_in_the_hand(env_id):
+def test_objects_in_the_hand_move_alike(env_id):
     assert_same(environment(env_id, expert=True), 50)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_randomized_physics(seed):
+def test_randomized_physics_step_alike(seed):
     build = environment("PandaPush-v1", seed=seed, randomize=RANDOMIZATION)
     assert_same(build, 60)
 
@@ -92,7 +92,7 @@ def test_randomized_physics(seed):
 @pytest.mark.parametrize("randomize", [None, RANDOMIZATION])
 @pytest.mark.parametrize("seed", range(1, 11))
 @pytest.mark.parametrize("env_id", PHYSICS_IDS)
-def test_many_seeds(env_id, seed, randomize, physics):
+def test_every_task_steps_alike_with_many_seeds(env_id, seed, randomize, physics):
     options = {} if randomize is None else {"randomize": randomize}
     # Bullet solves groups in which one object touches the base and another the hand.
     build = environment(env_id, seed=seed, physics=physics, **options)
