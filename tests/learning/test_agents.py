@@ -264,7 +264,7 @@ def test_td3_moves_its_actor_at_every_second_step(env):
 
 
 @pytest.mark.parametrize(("algo", "double_q"), [("sac", True), ("tqc", False)])
-def test_number_of_critics(env, algo, double_q):
+def test_double_q_chooses_between_one_and_two_critics(env, algo, double_q):
     agent = make(env, algo, double_q=double_q)
     layers = [x for x in critics_of(agent)[0] if x.shape[-1] == agent.state_size + 3]
     assert [x.shape[0] for x in layers] == [1 + double_q]
@@ -285,7 +285,7 @@ def test_environments_explore_differently(env):
 
 
 @pytest.mark.parametrize("algo", ALGOS)
-def test_fine_fingers(algo):
+def test_fine_fingers_make_networks_choose_cube_roots(algo):
     """Networks choose cube roots of finger actions; environments get the actions."""
     seen, executed = [], []
     with torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as env:

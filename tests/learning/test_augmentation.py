@@ -36,7 +36,7 @@ def test_every_second_row_is_mirrored(env):
     assert all(torch.equal(getattr(twice, x), getattr(rows, x)) for x in names)
 
 
-def test_shift(env):
+def test_half_of_the_rows_are_shifted_along_the_table(env):
     geometry, few = read_geometry(env), transitions(env)
     before = Transitions(*(x.repeat(50, *[1] * (x.ndim - 1)) for x in few))
     torch.manual_seed(0)
@@ -60,7 +60,7 @@ def test_shift(env):
 
 
 @pytest.mark.parametrize("mode", ["none", "mirror", "mirror-shift"])
-def test_modes(env, mode):
+def test_each_mode_applies_its_augmentations(env, mode):
     geometry, rows = read_geometry(env), transitions(env)
     torch.manual_seed(0)
     result = augment(rows, geometry, mode)

@@ -27,7 +27,7 @@ FUTURE = {"future": 1.0}
         ({"her": "geometric"}, ({"geometric": 1.0}, 1.0, None)),
     ],
 )
-def test_kinds_of_hindsight(stack, options, expected):
+def test_each_kind_of_hindsight_has_its_strategy_and_ratio(stack, options, expected):
     """The tests of the transforms show what its options do."""
     buffer = make_buffer(stack, 1000, discount=0.9, **options)
     [hindsight] = buffer._transform.transforms
@@ -39,17 +39,17 @@ def test_kinds_of_hindsight(stack, options, expected):
     assert torch.equal(batch["next", "reward"], stack.compute_reward(*goals))
 
 
-def test_none_keeps_the_goals(stack):
+def test_her_none_keeps_the_goals(stack):
     assert len(make_buffer(stack, 1000, her="none")._transform.transforms) == 0
 
 
-def test_capacity(stack, monkeypatch):
+def test_a_capacity_above_the_buffer_size_is_reduced(stack, monkeypatch):
     monkeypatch.setattr(buffers, "BUFFER_SIZE", 300)
     assert make_buffer(stack, 200)._storage.max_size == 200
     assert make_buffer(stack, 400)._storage.max_size == 300
 
 
-def test_episodes_in_which_nothing_moved(stack):
+def test_most_episodes_in_which_nothing_moved_are_left_out(stack):
     data = play_randomly(stack)
     goal = data["next", "achieved_goal"]
     goal[:] = goal[:, :1]
@@ -63,7 +63,7 @@ def test_episodes_in_which_nothing_moved(stack):
     assert data["next", "done"][:, -1].all()
 
 
-def test_short_episodes_in_which_something_moved(stack):
+def test_a_movement_in_short_episodes_is_found(stack):
     data = play_randomly(stack)[:, :3]
     goal = data["next", "achieved_goal"]
     goal[:] = goal[:, :1]

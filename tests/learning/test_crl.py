@@ -27,7 +27,7 @@ def make(env, **options):
     return make_agent(env, Hyperparameters(algo="crl", **options))
 
 
-def test_contrastive_loss():
+def test_the_contrastive_loss_is_a_symmetric_cross_entropy():
     logits = torch.randn(8, 8)
     labels = torch.arange(8)
     expected = cross_entropy(logits, labels) + cross_entropy(logits.T, labels)
@@ -42,7 +42,7 @@ def test_small_distances_are_exact():
     torch.testing.assert_close(distances(x, y).diagonal(), expected)
 
 
-def test_rewards_are_not_used(env):
+def test_crl_uses_no_rewards(env):
     batch = make_transitions(env, 64)
     other = batch.clone()
     other["next", "reward"] = torch.randn(64, 1)

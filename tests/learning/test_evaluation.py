@@ -10,7 +10,7 @@ from torch_panda.experts import make_expert
 from torch_panda.learning.evaluation import wilson_interval
 
 
-def test_a_policy_that_succeeds():
+def test_a_policy_that_succeeds_has_a_success_rate_of_1():
     policy = torch_panda.load_policy("PandaReach-v1")
     options = {"episodes": 40, "num_envs": 8, "seed": 1}
     result = torch_panda.evaluate(policy, "PandaReach-v1", **options)
@@ -25,7 +25,7 @@ def test_a_policy_that_succeeds():
     assert "40 episodes, success_rate=1.000" in repr(result)
 
 
-def test_a_policy_that_does_nothing():
+def test_a_policy_that_does_nothing_succeeds_only_at_the_start():
     still = TensorDictModule(lambda goal: 0 * goal, ["desired_goal"], ["action"])
     options = {"episodes": 30, "num_envs": 8, "seed": 3}
     result = torch_panda.evaluate(still, "PandaReach-v1", **options)
@@ -138,7 +138,7 @@ def test_episodes_of_a_fixed_task_differ_and_depend_on_the_seed_alone():
         ({"n_envs": 4}, TypeError, "n_envs"),
     ],
 )
-def test_bad_arguments(arguments, error, message):
+def test_bad_arguments_of_evaluate_are_refused(arguments, error, message):
     accepted = {"policy": RandomPolicy(None), "env_id": "PandaReach-v1", "episodes": 1}
     with pytest.raises(error, match=message):
         torch_panda.evaluate(**(accepted | arguments))

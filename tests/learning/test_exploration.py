@@ -159,7 +159,7 @@ def test_a_deterministic_policy_is_left_alone():
 
 @pytest.mark.parametrize("algo", AGENTS)
 @pytest.mark.parametrize("env_id", ["PandaPickAndPlace-v1", "PandaPushJoints-v1"])
-def test_every_agent_explores_by_it(algo, env_id):
+def test_every_agent_explores_by_random_points(algo, env_id):
     torch.manual_seed(0)
     hp = Hyperparameters(
         algo=algo, exploration="points", random_eps=(1.0, 1.0), noise_eps=0.0

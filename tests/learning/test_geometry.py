@@ -62,7 +62,7 @@ def test_mirrored_starts_and_actions_give_mirrored_episodes(task):
 
 
 @pytest.mark.parametrize("task", ["Push", "PickAndPlace", "Stack"])
-def test_differences(task):
+def test_differences_lead_from_hand_to_object_and_object_to_goal(task):
     with torch_panda.make(f"Panda{task}-v1", num_envs=3, seed=0) as env:
         td = env.reset()
         result = read_geometry(env).differences(td["observation"], td["desired_goal"])

@@ -17,7 +17,7 @@ def env():
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])
-def test_imitates_what_the_critic_prefers(env, algo):
+def test_an_agent_imitates_the_actions_that_its_critic_prefers(env, algo):
     def make():
         torch.manual_seed(0)
         return make_agent(env, Hyperparameters(algo=algo))
@@ -38,7 +38,7 @@ def test_imitates_what_the_critic_prefers(env, algo):
 
 
 @pytest.mark.parametrize("algo", AGENTS)
-def test_policy_comes_closer_to_demonstrations(env, algo):
+def test_the_policy_comes_closer_to_demonstrations(env, algo):
     torch.manual_seed(0)
     agent = make_agent(env, Hyperparameters(algo=algo))
     demos = make_transitions(env, 32)
@@ -49,7 +49,7 @@ def test_policy_comes_closer_to_demonstrations(env, algo):
     assert all(map(torch.equal, critics, critics_of(agent)[0]))
 
 
-def test_imitates_the_more_frequent_of_two_actions(env):
+def test_the_policy_imitates_the_more_frequent_of_two_actions(env):
     torch.manual_seed(0)
     agent = make_agent(env, Hyperparameters())
     demos = make_transitions(env, 1).expand(32).clone()

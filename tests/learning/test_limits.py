@@ -48,7 +48,7 @@ def refused(script, message, **options):
         *(("random_eps", (0.0, nan)), ("gamma", 0.0), ("gamma", 1.01)),
     ],
 )
-def test_training_refuses(tmp_path, option, value):
+def test_training_refuses_numbers_out_of_range(tmp_path, option, value):
     hints = get_type_hints(train.Args, include_extras=True)
     limit, *_ = find_limits(hints[option])
     message = re.escape(f"{option} must be {limit.description}, got {value}")
@@ -58,7 +58,7 @@ def test_training_refuses(tmp_path, option, value):
 
 
 @pytest.mark.parametrize("device", ["", "nothing", "meta", "cuda:99"])
-def test_devices_that_do_not_work(tmp_path, device):
+def test_devices_that_do_not_work_are_refused(tmp_path, device):
     message = f"device must be one that torch can use here, .* got '{device}': .+"
     refused(train, message, device=device, out=tmp_path / "run")
 
@@ -70,13 +70,13 @@ def test_devices_that_do_not_work(tmp_path, device):
         *((record_demos, "episodes", 0), (watch, "port", 0), (watch, "port", 65536)),
     ],
 )
-def test_other_commands_refuse(tmp_path, script, option, value):
+def test_other_commands_refuse_numbers_out_of_range(tmp_path, script, option, value):
     (tmp_path / "checkpoint.pt").touch()
     options = {option: value} | ({"run": tmp_path} if script is evaluate else {})
     refused(script, f"{option} must be .*, got {value}", **options)
 
 
-def test_accepts_ends_of_ranges():
+def test_the_ends_of_ranges_are_accepted():
     lowest = {"seed": 0, "desired_ratio": 0.0, "random_eps": (0.0, 0.0)}
     check_limits(train.Args(**lowest, updates_per_step=0.0, total_steps=0))
     highest = {"seed": 2**64 - 1, "desired_ratio": 1.0, "random_eps": (1.0, 1.0)}

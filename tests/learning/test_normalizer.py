@@ -13,7 +13,7 @@ def make(env, relative_inputs="none"):
     return Normalizer(read_spaces(env), relative_inputs)
 
 
-def test_relative_inputs():
+def test_relative_inputs_append_differences():
     with torch_panda.make("PandaStack-v1", num_envs=3, seed=0) as env:
         td = env.reset()
         observation, goal = td["observation"], td["desired_goal"]
@@ -30,7 +30,7 @@ def test_relative_inputs():
 
 
 @pytest.mark.parametrize(("relative_inputs", "shown"), [("none", 0.1), ("fine", 0.03)])
-def test_height_of_slides_goals(relative_inputs, shown):
+def test_fine_inputs_replace_the_height_of_slides_goals(relative_inputs, shown):
     with torch_panda.make("PandaSlide-v1", num_envs=3, seed=0) as env:
         td = env.reset()
         goal = td["desired_goal"].clone()
@@ -41,7 +41,7 @@ def test_height_of_slides_goals(relative_inputs, shown):
     assert (goal[:, 2] == 0.1).all()
 
 
-def test_statistics():
+def test_inputs_are_normalised_by_their_statistics_and_clipped():
     with torch_panda.make("PandaReach-v1", num_envs=1) as env:
         normalizer = make(env)
     observation, goal = 3 + 2 * torch.randn(200, 6), torch.randn(200, 3)

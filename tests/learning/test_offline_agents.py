@@ -138,7 +138,7 @@ def test_rewards_are_those_of_the_value_goal(env, transitions):
         assert torch.equal(batch[key], transitions[key][batch["index"]])
 
 
-def test_expectile_loss_by_hand():
+def test_the_expectile_loss_equals_a_calculation_by_hand():
     diff = torch.tensor([2.0, -3.0, 0.0])
     loss = expectile_loss(diff, diff, 0.9)
     torch.testing.assert_close(loss, torch.tensor([0.9 * 4, 0.1 * 9, 0.0]))
@@ -147,7 +147,7 @@ def test_expectile_loss_by_hand():
     torch.testing.assert_close(loss, torch.tensor([0.1 * 4, 0.9 * 9, 0.0]))
 
 
-def test_weighted_regression_by_hand():
+def test_the_weighted_regression_equals_a_calculation_by_hand():
     log_probs = torch.tensor([-1.0, -2.0, -3.0])
     advantage = torch.tensor([0.0, 0.5, 100.0])
     loss = weighted_regression(log_probs, advantage, 2.0)
@@ -163,7 +163,7 @@ def test_the_scale_of_values_does_not_change_the_policys_loss():
     torch.testing.assert_close(one, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_binary_loss_by_hand():
+def test_the_binary_loss_equals_a_calculation_by_hand():
     logits = torch.tensor([[2.0, -1.0], [0.5, 3.0]])
     signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0]])
     expected = torch.log1p((-signs * logits).exp()).mean()

@@ -132,7 +132,7 @@ def test_ids_without_a_policy_name_those_with_one():
         torch_panda.load_policy(None)
 
 
-def test_a_folder_without_a_policy(tmp_path):
+def test_a_folder_without_a_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"there is no file .*checkpoint\.pt"):
         torch_panda.load_policy(tmp_path)
 
@@ -148,7 +148,7 @@ def test_a_folder_without_a_policy(tmp_path):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_files_of_other_versions(tmp_path, change, message):
+def test_policy_files_of_other_versions_are_refused(tmp_path, change, message):
     content = torch.load(shipped_policies()["PandaReach-v1"]) | change
     path = tmp_path / "policy.pt"
     torch.save(content, path)

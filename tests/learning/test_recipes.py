@@ -20,7 +20,7 @@ from torch_panda.learning.training import Run
 
 @pytest.mark.parametrize("preset", ["tuned", "sample-efficient"])
 @pytest.mark.parametrize("task", RECIPES)
-def test_recipes_are_options(task, preset):
+def test_recipes_are_valid_options(task, preset):
     args = default_args(preset, f"Panda{task.__name__}-v1")
     check_limits(args)
     assert args.preset == preset

@@ -30,7 +30,7 @@ def start_in(states, env):
 
 
 @pytest.mark.parametrize("task", ["Push", "Slide"])
-def test_hand_beside_an_object_at_rest(task):
+def test_the_hand_starts_beside_an_object_at_rest(task):
     states = make_states(task)
     assert len(states) >= 12
     with torch_panda.make(f"Panda{task}-v1", num_envs=12) as env:
@@ -46,7 +46,7 @@ def test_hand_beside_an_object_at_rest(task):
 
 
 @pytest.mark.parametrize(("task", "number"), [("PickAndPlace", 1), ("Stack", 2)])
-def test_hand_holds_an_object(task, number):
+def test_the_hand_starts_holding_an_object(task, number):
     states = make_states(task)
     assert len(states) >= 12
     with torch_panda.make(f"Panda{task}-v1", num_envs=12) as env:
@@ -67,7 +67,7 @@ def test_hand_holds_an_object(task, number):
         assert 0.3 < raised[first_to_goal, -1].double().mean() < 0.7
 
 
-def test_lower_cube_of_a_stack_can_be_at_its_goal():
+def test_the_lower_cube_of_a_stack_can_start_at_its_goal():
     """The lower cube is at its goal in half of the states, and it stays there."""
     states = make_states("Stack")
     with_goal = states[states["first_to_goal"][:, 0]]
@@ -107,7 +107,7 @@ def test_without_room_for_the_object_an_episode_starts_as_usual():
         assert (td["observation"] == base.reset()["observation"]).all()
 
 
-def test_ratio_of_the_episodes(states):
+def test_a_ratio_of_the_episodes_starts_at_an_object(states):
     # In the neutral position the hand is 20 cm high.
     with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
         env = TransformedEnv(base, StartFrom(states, 0.3))
@@ -132,7 +132,7 @@ def test_ratio_of_the_episodes(states):
         assert not set(PLACED_KEYS) & set(td.keys())
 
 
-def test_partial_reset_leaves_the_others_alone(states):
+def test_a_partial_reset_starts_only_its_own_at_an_object(states):
     with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
         env = TransformedEnv(base, StartFrom(states, 1.0))
         td = env.rollout(3)[:, -1]["next"]
