@@ -28,7 +28,7 @@ def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", bench.CONTENDERS)
-def test_every_installed_contender_is_measured(name):
+def test_every_installed_contender_can_step(name):
     if name == "bare-bullet" and LIBRARY is None:
         pytest.skip("the native loop was not compiled")
     setting = bench.Setting("PandaReach-v3", num_envs=2, num_threads=1)
@@ -67,7 +67,7 @@ def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
     assert "interrupted" in output
 
 
-def test_buffers_are_compared(capsys):
+def test_bench_compares_buffers_with_and_without_hindsight(capsys):
     print(bench.compare_buffers(rounds=1, capacity=2000))
     rows = table_rows(capsys.readouterr().out)
     assert [row[0] for row in rows] == ["plain", "with HindsightRelabel"]
@@ -84,7 +84,7 @@ def test_buffers_are_compared(capsys):
         (["--plot", "speed.xyz"], "plot must end in one of .*, got 'speed.xyz'"),
     ],
 )
-def test_wrong_options_are_refused(monkeypatch, options, message):
+def test_wrong_options_of_bench_are_refused(monkeypatch, options, message):
     monkeypatch.setattr(bench, "measure", pytest.fail)
     with pytest.raises(SystemExit, match=message):
         main(["bench", *options])

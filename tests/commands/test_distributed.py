@@ -150,7 +150,7 @@ def test_another_run_is_not_overwritten(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_run_is_drawn(address, tmp_path):
+def test_plot_draws_a_distributed_run(address, tmp_path):
     args = distributed.Args(
         address=address,
         num_envs=4,

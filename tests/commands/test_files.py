@@ -29,7 +29,7 @@ def save(path, content):
     [b"", b"hello", b"\x80\x02]", "half", {"steps": 1}, [1, 2], TensorDict(x=1)],
     ids=["empty", "text", "pickle", "half", "state", "list", "tensordict"],
 )
-def test_files_that_hold_no_policy(tmp_path, content):
+def test_files_that_hold_no_policy_are_refused(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
     save(path, content)
     message = f"^{path} does not hold a policy, or is damaged \\(.+\\)$"
@@ -65,7 +65,7 @@ INCOMPLETE = dict.fromkeys(KEYS, 0)
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("content", [b"hello", {"args": {}}, INCOMPLETE])
-def test_damaged_state_of_a_run(tmp_path, content):
+def test_a_damaged_state_of_a_run_is_refused_and_kept(tmp_path, content):
     save(tmp_path / "resume.pt", content)
     before = (tmp_path / "resume.pt").read_bytes()
     message = "resume.pt does not hold the state of a run, or is damaged"
@@ -79,8 +79,9 @@ def test_damaged_state_of_a_run(tmp_path, content):
     [("file/out.gif", r"^\[Errno .*file"), ("folder.gif", "^cannot write to .*folder")],
 )
 @pytest.mark.parametrize("script", [record_demos, watch])
-def test_outputs_that_cannot_be_written(tmp_path, monkeypatch, script, name, message):
-    """The command ends before it plays."""
+def test_an_output_that_cannot_be_written_is_refused_before_playing(
+    tmp_path, monkeypatch, script, name, message
+):
     monkeypatch.setattr(video if script is watch else script, "play", pytest.fail)
     (tmp_path / "file").touch()
     (tmp_path / "folder.gif").mkdir()

@@ -46,7 +46,9 @@ def figures(monkeypatch):
         ("return", "return", -40.0),
     ],
 )
-def test_every_metric_is_seen(runs, tmp_path, figures, metric, label, shown):
+def test_every_metric_is_drawn_inside_its_axes(
+    runs, tmp_path, figures, metric, label, shown
+):
     plot.main(plot.Args(runs=[runs], metric=metric, out=tmp_path / "new" / "curves"))
     assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
     (axes,) = figures[0].axes
@@ -150,7 +152,7 @@ def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
     assert "anneal lr" in label
 
 
-def test_band_over_the_steps_that_all_seeds_have(tmp_path, figures):
+def test_a_band_covers_the_steps_that_all_seeds_have(tmp_path, figures):
     curves = [
         {0: 0.0, 100: 0.2, 200: 0.4, 300: 0.6},
         {0: 0.1, 200: 0.8},  # evaluated less often
@@ -177,7 +179,7 @@ def spoil_curve(folder):
 
 
 @pytest.mark.parametrize("spoil", [spoil_arguments, spoil_curve])
-def test_a_folder_that_holds_no_run_is_named(runs, tmp_path, spoil):
+def test_a_run_that_cannot_be_read_is_named(runs, tmp_path, spoil):
     spoil(runs / "1")
     with pytest.raises(
         SystemExit, match=f"^cannot draw: cannot read the run {runs / '1'}: "
@@ -185,14 +187,14 @@ def test_a_folder_that_holds_no_run_is_named(runs, tmp_path, spoil):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
 
 
-def test_what_is_no_run_is_left_out(runs, tmp_path, figures):
+def test_a_folder_without_options_is_left_out(runs, tmp_path, figures):
     (runs / "1" / "args.json").unlink()
     plot.main(plot.Args(runs=[runs], out=tmp_path / "curves.png"))
     (axes,) = figures[0].axes
     assert lines_of(axes) == ["DDPG, paper (1 seed)"]
 
 
-def test_no_run_and_no_place(runs, tmp_path):
+def test_missing_runs_and_an_unwritable_place_are_refused(runs, tmp_path):
     with pytest.raises(SystemExit, match="there is no run below nowhere: a run is"):
         plot.main(plot.Args(runs=[Path("nowhere")], out=tmp_path / "curves.png"))
     (tmp_path / "file").touch()
@@ -204,7 +206,7 @@ def test_runs_with_another_logger_have_the_same_label():
     assert find_changes(Args(logger="tensorboard"), Args()) == {}
 
 
-def test_when_the_learning_rate_has_fallen_is_another_line():
+def test_total_steps_are_in_the_label_only_with_a_falling_rate():
     args, default = Args(total_steps=200_000), Args()
     assert find_changes(args, default) == {}
     args.anneal_lr = default.anneal_lr = True

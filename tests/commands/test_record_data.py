@@ -102,7 +102,9 @@ def test_two_processes_do_not_mix_their_parts(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["noisy", "play"])
-def test_a_minari_data_set_holds_the_same(tmp_path, capsys, monkeypatch, kind):
+def test_a_minari_data_set_holds_the_generated_data(
+    tmp_path, capsys, monkeypatch, kind
+):
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     name = f"panda/reach-{kind}-v0"
@@ -144,7 +146,7 @@ def test_a_minari_data_set_holds_the_same(tmp_path, capsys, monkeypatch, kind):
         ({"env_id": "KukaReach-v1"}, "no expert for"),
     ],
 )
-def test_options_that_do_not_fit(tmp_path, options, message):
+def test_options_that_do_not_fit_the_kind_are_refused(tmp_path, options, message):
     with pytest.raises(SystemExit, match=message):
         record.main(make_args(**{"out": tmp_path / "data.pt", **options}))
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,7 @@ def test_every_episode_has_its_number(tmp_path, capsys):
     assert ids[last].tolist() == list(range(6))
 
 
-def test_what_is_saved_is_the_action_without_noise(tmp_path):
+def test_the_saved_action_is_the_one_without_noise(tmp_path):
     out = tmp_path / "demos.pt"
     args = record_demos.Args("PandaReach-v1", 2, num_envs=2, noise_eps=0.3, out=out)
     record_demos.main(args)
@@ -32,7 +32,7 @@ def test_what_is_saved_is_the_action_without_noise(tmp_path):
     assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
 
 
-def test_numbers_of_the_task_can_be_others(tmp_path, capsys):
+def test_options_of_the_task_can_be_changed(tmp_path, capsys):
     args = record_demos.Args("PandaReach-v1", 4, num_envs=4, out=tmp_path / "demos.pt")
     for threshold, success in ((0.5, "100.0%"), (1e-9, "  0.0%")):
         args.task_options = {"distance_threshold": threshold}
@@ -54,7 +54,7 @@ def test_seeds_that_a_format_cannot_store_are_refused(tmp_path, format):
     record_demos.check(record_demos.Args("PandaReach-v1", 1, 2**63 - 1, format=format))
 
 
-def test_wilson_interval():
+def test_the_wilson_interval_is_that_of_the_textbook():
     # The textbook value for 8 of 10.
     low, high = wilson_interval(8, 10)
     assert low == pytest.approx(0.490, abs=1e-3)

@@ -71,7 +71,7 @@ def test_a_policy_that_misses_learns_to_hit(crooked, tmp_path):
 
 
 @pytest.mark.parametrize("asked", [1, 7])  # while it plays, and while it imitates
-def test_a_stopped_run_goes_on_bit_for_bit(crooked, tmp_path, asked):
+def test_a_stopped_refinement_goes_on_bit_for_bit(crooked, tmp_path, asked):
     policies = []
     for name, stops in (("whole", [False]), ("stopped", [After(asked), False])):
         for stop in stops:
@@ -89,7 +89,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(crooked, tmp_path, asked):
 
 
 @pytest.mark.parametrize("during", ["play", "evaluation"])
-def test_a_killed_run_goes_on_from_its_last_save(
+def test_a_killed_refinement_goes_on_from_its_last_save(
     crooked, tmp_path, monkeypatch, during
 ):
     options = {"steps": 300, "updates": 4, "num_envs": 2, "batch_size": 64}
@@ -130,7 +130,7 @@ def test_a_stochastic_policy_is_refined_without_its_noise(tmp_path, monkeypatch)
             torch.testing.assert_close(played, own)
 
 
-def test_what_cannot_be_refined_is_refused(crooked, tmp_path):
+def test_missing_policies_and_wrong_options_are_refused(crooked, tmp_path):
     with pytest.raises(SystemExit, match="there is no file"):
         refine.main(refine.Args(tmp_path / "missing.pt", tmp_path / "run"))
     with pytest.raises(SystemExit, match="updates must be positive"):

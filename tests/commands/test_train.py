@@ -25,7 +25,7 @@ from torch_panda.learning.training import Run
 pytestmark = pytest.mark.usefixtures("quick")
 
 
-def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
+def test_a_training_writes_files_that_other_commands_read(tmp_path, capsys):
     out = tmp_path / "run"
     train.main(Args(total_steps=400, eval_interval=200, out=out, noise_eps=0.1))
     assert "after 400 steps; see" in capsys.readouterr().out
@@ -73,8 +73,9 @@ def test_writes_curve_plot_and_checkpoint(tmp_path, capsys):
     ],
     ids=lambda options: "-".join(map(str, options.values())),
 )
-def test_resumed_run_equals_uninterrupted_run(tmp_path, options, device):
-    """A stop after an iteration changes no bit of the result."""
+def test_a_resumed_run_equals_an_uninterrupted_run_bit_for_bit(
+    tmp_path, options, device
+):
     args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=300, **options)
     args = replace(args, updates_per_step=0.1, eval_interval=100, device=device)
     whole = Run(args, tmp_path)
@@ -196,7 +197,7 @@ def test_a_resumed_run_keeps_its_label(tmp_path):
 
 # 150 steps end within an iteration, which is finished.
 @pytest.mark.parametrize(("total_steps", "falling"), [(200, 20), (150, 15)])
-def test_learning_rate_falls_to_0(tmp_path, total_steps, falling):
+def test_the_learning_rate_falls_to_0(tmp_path, total_steps, falling):
     options = {"num_envs": 2, "updates_per_step": 0.1}
     run = Run(Args(total_steps=total_steps, anneal_lr=True, **options), tmp_path)
     (group,) = run.agent.optimizer.param_groups
@@ -221,8 +222,8 @@ def test_episodes_in_which_nothing_moves_are_left_out(tmp_path, monkeypatch):
         run.close()
 
 
-def test_interrupt_saves(tmp_path):
-    """Ctrl-C in a process of its own."""
+def test_ctrl_c_saves_the_run(tmp_path):
+    """In a process of its own."""
     out = tmp_path / "run"
     command = ["-m", "torch_panda", "train", "--total-steps", "100000", "--out", out]
     process = subprocess.Popen(
@@ -260,7 +261,7 @@ def test_a_run_ends_well_if_its_video_cannot_be_written(tmp_path, monkeypatch, c
     assert "after 100 steps" in output
 
 
-def test_command_line_overrules_the_recipe():
+def test_the_command_line_overrules_the_recipe():
     args = parse(["--preset", "tuned", "--env-id", "PandaSlide-v1", "--gamma", "0.9"])
     recipe = default_args("tuned", "PandaSlide-v1")
     assert args == replace(recipe, gamma=0.9)
@@ -305,7 +306,9 @@ def test_crl_draws_geometric_goals_in_every_preset(preset, env_id):
         ({"out": Path("/dev/null")}, "out must be a folder, got the file /dev/null"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path, monkeypatch, options, message):
+def test_bad_options_of_a_training_end_with_one_line(
+    tmp_path, monkeypatch, options, message
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message) as stop:
         train.main(Args(**options))

@@ -48,7 +48,7 @@ def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("algo", ["hiql", "qrl"])  # the two with most state
-def test_a_resumed_run_equals_an_uninterrupted_run(tmp_path, algo, device):
+def test_a_resumed_offline_run_equals_an_uninterrupted_run(tmp_path, algo, device):
     args = make_args(tmp_path / "whole", algo, device=device)
     whole = train.make_run(args, args.out)
     assert whole.train()
@@ -85,8 +85,7 @@ def test_the_saved_policy_acts_as_the_agent(tmp_path, algo, device):
     assert torch.equal(policy(td.clone())["action"], expected)
 
 
-def test_data_of_a_file(tmp_path):
-    """Data that a run generated, and resuming with other data."""
+def test_a_file_trains_as_its_data_do_and_a_changed_file_is_refused(tmp_path):
     first = make_args(tmp_path / "first", total_steps=2)
     train.main(first)
     data = tmp_path / "first" / "data.pt"
@@ -127,7 +126,9 @@ def test_the_options_are_those_of_the_algorithm():
         ("--offline --resume", "there is no run to resume"),
     ],
 )
-def test_bad_options_are_one_line(tmp_path, monkeypatch, arguments, message):
+def test_bad_options_of_offline_training_end_with_one_line(
+    tmp_path, monkeypatch, arguments, message
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message) as stop:
         train.run(arguments.split())

@@ -18,7 +18,7 @@ from torch_panda.experts import make_expert
 
 
 @pytest.mark.parametrize("policy", ["random", "expert"])
-def test_video_shows_every_step(tmp_path, policy):
+def test_a_video_shows_every_step(tmp_path, policy):
     out = tmp_path / "watch.gif"
     watch.main(watch.Args(policy=policy, env_id="PandaReach-v1", num_envs=2, out=out))
     frames = iio.imread(out)
@@ -41,7 +41,7 @@ def test_video_shows_every_step(tmp_path, policy):
         ({"env_id": "PandaPushJoints-v1"}, "no expert for 'PandaPushJoints-v1'"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path, arguments, message):
+def test_bad_options_of_watch_are_refused(tmp_path, arguments, message):
     if "out" in arguments:
         arguments["out"] = tmp_path / arguments["out"]
     with pytest.raises(SystemExit, match=message):
@@ -86,7 +86,7 @@ def screen(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("Xvfb") is None, reason="needs Xvfb")
-def test_window_shows_the_arm_move(screen):
+def test_the_window_shows_the_arm_move(screen):
     display, look = screen
     process = start_human(display, episodes=2)
     views = []
@@ -104,7 +104,7 @@ def test_window_shows_the_arm_move(screen):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="DISPLAY is of X11")
-def test_window_without_a_display_is_one_line():
+def test_a_window_without_a_display_ends_with_one_line():
     process = start_human(None, episodes=1)
     output = process.communicate()[0]
     assert process.returncode == 1
@@ -112,7 +112,7 @@ def test_window_without_a_display_is_one_line():
     assert "Traceback" not in output
 
 
-def test_an_episode_that_ends_at_success_is_one(monkeypatch, capsys):
+def test_an_episode_that_ends_at_success_is_shown_as_one(monkeypatch, capsys):
     window = Mock()
     monkeypatch.setattr(watch, "FPS", 1e9)
     with torch_panda.make("PandaReach-v3", num_envs=1, seed=0) as env:
