@@ -100,12 +100,12 @@ def test_a_missing_urdf_is_named():
         client.step()
 
 
-def test_missing_symbol_names_the_version_that_works():
+def test_a_missing_symbol_names_the_version_that_works():
     with pytest.raises(ImportError, match=r"b3NoSuch.*pybullet==3\.2\.7"):
         library.bind(library.WORK, "b3NoSuch", None)
 
 
-def test_missing_pybullet_names_the_version_that_works():
+def test_a_missing_pybullet_names_the_version_that_works():
     with pytest.raises(ImportError, match=r"not installed.*pybullet==3\.2\.7"):
         library.library_path("no_such_pybullet")
 
@@ -163,7 +163,7 @@ def test_collision_filters_act_as_in_pybullet(reference, group, mask, falls):
         assert (position[2] < -0.1) == falls
 
 
-def test_urdf_with_a_collision_filter_is_refused():
+def test_a_urdf_with_a_collision_filter_is_refused():
     with PhysicsClient() as client:
         with pytest.raises(ValueError, match=r"cube_collisionfilter\.urdf"):
             client.load_urdf("cube_collisionfilter.urdf")

@@ -103,7 +103,7 @@ def test_an_unknown_loop_is_refused(monkeypatch):
         torch_panda.make("PandaReach-v1")
 
 
-def test_reasons_why_there_is_no_library(monkeypatch, tmp_path):
+def test_load_says_why_there_is_no_library(monkeypatch, tmp_path):
     monkeypatch.setattr(native.importlib.util, "find_spec", lambda name: None)
     assert "_loop*.so does not exist" in native.load()
     monkeypatch.setattr(native.shutil, "which", lambda name: None)

@@ -47,7 +47,7 @@ def test_coarse_files_are_small_and_written_once():
     assert 1000 < len(faces) < 12_000
 
 
-def test_other_robots_load():
+def test_another_robot_is_drawn_with_coarse_meshes():
     camera = Camera(target=(0, 0, 0.5), width=32, height=32)
     with PhysicsClient() as physics:
         arm = physics.load_urdf("kuka_iiwa/model.urdf", fixed_base=True)

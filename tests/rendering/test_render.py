@@ -172,7 +172,7 @@ def test_a_red_cube_is_below_a_green_one_in_stack():
             assert color[channel] > 4 * color[channel - 1]
 
 
-def test_some_environments_can_be_drawn():
+def test_render_draws_the_chosen_environments():
     with torch_panda.make("PandaPush-v1", num_envs=5, num_threads=2, seed=0) as env:
         with pytest.raises(ValueError, match="environment 0 was not reset: call reset"):
             env.render()

@@ -104,7 +104,7 @@ def test_bodies_that_were_moved_while_building_are_drawn_there():
     assert {0, 1} <= set(np.unique(pictures[0][2]))
 
 
-def test_depth_in_metres():
+def test_depth_is_converted_to_metres():
     camera = Camera(
         target=(0, 0, 0), distance=2.0, yaw=0, pitch=-90, height=32, width=32
     )
@@ -140,7 +140,7 @@ def test_the_six_faces_of_a_texture_differ():
             assert np.linalg.norm(colors[a] - colors[b]) > 0.15, (a, b)
 
 
-def test_bad_cameras_are_named():
+def test_bad_numbers_of_a_camera_are_named():
     with pytest.raises(ValueError, match="at least 1 pixel, got 0 x 480"):
         Camera(width=0)
     with pytest.raises(ValueError, match="fov"):
@@ -151,7 +151,7 @@ def test_bad_cameras_are_named():
     assert resized(Camera(), 50) == Camera(height=50, width=50)
 
 
-def test_missing_texture_is_named(tmp_path):
+def test_a_missing_texture_is_named(tmp_path):
     visual = Visual(texture=tmp_path / "none.png")
 
     def build_box(client):

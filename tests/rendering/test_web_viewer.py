@@ -73,7 +73,7 @@ def test_the_page_shows_the_state(env):
         assert "step 1" in viewer._status.content
 
 
-def test_pause_goes_back_and_on(env):
+def test_the_page_pauses_goes_back_and_goes_on(env):
     env.reset()
     with env.open_viewer(port=8765) as viewer:
         viewer.update()
@@ -108,8 +108,7 @@ def test_pause_goes_back_and_on(env):
         assert "step 0" in viewer._status.content
 
 
-def test_contacts_carry_the_cube():
-    """The table carries the weight of the cube at rest."""
+def test_the_contact_forces_carry_the_weight_of_the_cube():
     with torch_panda.make("PandaPush-v3", seed=1) as env:
         env.reset()
         for _ in range(5):
@@ -125,7 +124,7 @@ def test_contacts_carry_the_cube():
 
 
 @pytest.mark.parametrize("task", ["Slide", "Flip"])
-def test_every_task_can_be_seen(task):
+def test_the_page_has_the_objects_and_markers_of_a_task(task):
     with torch_panda.make(f"Panda{task}-v1", seed=0) as env:
         env.reset()
         with env.open_viewer(port=8765) as viewer:
@@ -136,7 +135,7 @@ def test_every_task_can_be_seen(task):
         viewer.close()
 
 
-def test_wrong_calls_raise_clear_errors(env):
+def test_wrong_calls_of_a_viewer_raise_clear_errors(env):
     with env.open_viewer(port=8765) as viewer:
         with pytest.raises(torch_panda.BulletError, match="never reset"):
             viewer.update()

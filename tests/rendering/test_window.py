@@ -34,7 +34,7 @@ def test_the_window_shows_the_chosen_environment(env, monkeypatch):
         opened.show(0)
 
 
-def test_a_client_that_cannot_be_made_raises(env, monkeypatch):
+def test_a_window_that_cannot_be_created_raises(env, monkeypatch):
     monkeypatch.setattr(window, "_check_display", lambda: None)
     monkeypatch.setattr(capi, "connect_window", lambda *_: None)
     with pytest.raises(BulletError, match="could not create a client"):

@@ -189,7 +189,7 @@ def test_a_robot_on_a_turned_base_moves_in_the_turned_directions():
         ({"base_orientation": (0, 0, 0, 0)}, "base_orientation must be"),
     ],
 )
-def test_options_out_of_range_are_refused(options, message):
+def test_robot_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Panda(**options)
 
@@ -208,7 +208,7 @@ def test_fingers_open_as_wide_as_the_gripper_allows():
         assert simulation.joint_position[0, 7:].sum().item() == pytest.approx(0.08)
 
 
-def test_a_repr_shows_the_arguments():
+def test_the_repr_of_a_robot_shows_its_arguments():
     assert repr(Panda(control_type="joints", fingers_width=0.02)) == (
         "Panda(control_type='joints', action_scale=0.05, block_gripper=False, "
         "base_position=(-0.6, 0.0, 0.0), base_orientation=(0.0, 0.0, 0.0, 1.0), "
@@ -219,7 +219,7 @@ def test_a_repr_shows_the_arguments():
 
 
 @pytest.mark.parametrize("robot_class", [Panda, Kuka, XArm6, XArm6Gripper])
-def test_an_unknown_argument_is_named_with_the_accepted_ones(robot_class):
+def test_an_unknown_robot_argument_is_named_with_a_similar_one(robot_class):
     message = f"^{robot_class.__name__} .*'control'; did you mean 'control_type'"
     with pytest.raises(TypeError, match=message):
         robot_class(control="joints")

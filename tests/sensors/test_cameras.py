@@ -19,7 +19,7 @@ def make(env_id="PandaPush-v1", **arguments):
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])
-def test_specs(num_envs):
+def test_images_have_the_shapes_and_types_of_their_specs(num_envs):
     with make("PandaStack-v1", num_envs=num_envs, sensors=("joint_torque",)) as env:
         check_env_specs(env)
         td = env.rollout(3)
@@ -179,7 +179,7 @@ def test_an_unknown_renderer_is_refused():
         make(renderer="gl")
 
 
-def test_two_cameras_of_which_one_is_on_the_hand():
+def test_a_camera_on_the_hand_sees_the_cube_beside_a_fixed_camera():
     front = CameraSensor(Camera(width=48, height=48))
     hand = CameraSensor(
         HandCamera(width=64, height=48), depth=True, segmentation=True, name="wrist"

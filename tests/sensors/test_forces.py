@@ -103,7 +103,7 @@ def test_sensors_do_not_change_the_physics():
 
 
 @pytest.mark.parametrize("num_envs", [None, 2])
-def test_specs(num_envs):
+def test_readings_have_the_shapes_of_their_specs(num_envs):
     batch = () if num_envs is None else (num_envs,)
     with torch_panda.make(
         "PandaStack-v1", num_envs=num_envs, seed=0, sensors=(*SENSORS, "joint_state")
@@ -119,7 +119,7 @@ def test_specs(num_envs):
         assert (td["joint_torque"][..., 1].abs() > 1).all()
 
 
-def test_a_partial_reset_leaves_other_environments_unchanged():
+def test_a_partial_reset_keeps_the_torques_of_other_environments():
     with torch_panda.make("PandaPush-v1", num_envs=2, seed=0, sensors=SENSORS) as env:
         td = env.rollout(3)[:, -1]["next"]
         before = td["joint_torque"].clone()

@@ -7,7 +7,7 @@ import torch_panda
 SENSORS = ("joint_state",)
 
 
-def test_it_observes_the_joints_of_the_state():
+def test_joint_state_observes_the_joints_of_the_state():
     with torch_panda.make("PandaPush-v1", num_envs=2, seed=0, sensors=SENSORS) as env:
         following = env.rollout(5)["next"][:, -1]
         state = env.get_state()
@@ -25,7 +25,7 @@ def test_a_reset_takes_observed_joints_for_an_observation():
         assert torch.equal(start["joint_position"][1], td["joint_position"][1])
 
 
-def test_a_reset_starts_from_a_state():
+def test_a_reset_to_a_state_observes_its_joints():
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=0, sensors=SENSORS) as env:
         expected = env.rollout(5)[:, -1]["next"]
         state = env.get_state()

@@ -25,7 +25,7 @@ def test_rotate_equals_pybullet(roll, pitch, yaw):
     torch.testing.assert_close(rotated, vector @ matrix.double().T, atol=1e-6, rtol=0)
 
 
-def test_rewards_and_success_of_push():
+def test_push_succeeds_within_5_cm_and_pays_minus_the_distance():
     goal = torch.zeros(2, 3)
     achieved = torch.tensor([[0.03, 0.0, 0.04], [0.03, 0.0, 0.039]])
     assert Push().is_success(achieved, goal).flatten().tolist() == [False, True]
@@ -101,7 +101,7 @@ def test_a_distance_at_the_threshold_is_neither_success_nor_punished():
     assert task.compute_reward(achieved, goal) == 0.0
 
 
-def test_a_repr_shows_the_arguments():
+def test_the_repr_of_a_task_shows_its_arguments():
     task = PickAndPlace(distance_threshold=0.02)
     assert repr(task) == (
         "PickAndPlace(reward_type='sparse', distance_threshold=0.02, "
@@ -125,7 +125,7 @@ class Penalty(Push):
     penalty: float = 1.0
 
 
-def test_a_repr_shows_the_arguments_of_a_users_task():
+def test_the_repr_of_a_users_task_shows_its_arguments():
     shown = repr(Bonus(bonus=2.0, object_mass=1.0))
     assert shown.startswith("Bonus(bonus=2.0, reward_type='sparse', ")
     assert "object_mass=1.0" in shown
@@ -146,7 +146,7 @@ def test_tasks_are_compared_and_hashed_by_identity():
 
 
 @pytest.mark.parametrize("task_class", [Push, Penalty])
-def test_an_unknown_argument_is_named_with_the_accepted_ones(task_class):
+def test_an_unknown_task_argument_is_named_with_the_accepted_ones(task_class):
     message = (
         f"{task_class.__name__} got an unexpected keyword argument 'threshold'; "
         r"did you mean 'distance_threshold'\? accepted are reward_type, "
@@ -157,7 +157,7 @@ def test_an_unknown_argument_is_named_with_the_accepted_ones(task_class):
         Bonus(threshold=0.02)
 
 
-def test_reward_types_are_named():
+def test_an_unknown_reward_type_is_refused():
     with pytest.raises(ValueError, match=r"reward_type must be .* got 'shaped'"):
         Push(reward_type="shaped")
 

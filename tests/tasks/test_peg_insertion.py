@@ -48,7 +48,7 @@ def test_the_hand_holds_the_peg():
 
 
 @pytest.mark.parametrize("clearance", [0.001, 0.0005])
-def test_the_hole_is_wider_by_the_play(clearance):
+def test_the_hole_is_wider_than_the_peg_by_the_clearance(clearance):
     options = {"clearance": clearance}
     with torch_panda.make(
         "PandaPegInsertion-v1", num_envs=N, seed=0, task_options=options
@@ -82,7 +82,7 @@ def test_only_a_peg_in_the_hole_is_a_success():
         ({"depth": 0.005}, "depth must be from distance_threshold"),
     ],
 )
-def test_options_out_of_range_are_refused(options, message):
+def test_peg_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         PegInsertion(**options)
 
