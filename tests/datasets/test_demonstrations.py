@@ -35,7 +35,7 @@ def test_demonstrations_keep_their_goals(env, make_demos, tmp_path):
     assert len(batch["index"].unique()) > 100
 
 
-def test_demonstrations_of_another_task(env, make_demos):
+def test_demonstrations_of_another_task_are_refused(env, make_demos):
     path = make_demos("PandaReach-v1")
     with pytest.raises(
         ValueError,
@@ -62,7 +62,7 @@ def test_episodes_are_found_in_any_layout(env, make_demos, case):
     assert (demos["collector", "traj_ids"] == torch.arange(4)[:, None]).all()
 
 
-def test_shuffled_demonstrations(env, make_demos):
+def test_shuffled_demonstrations_are_refused(env, make_demos):
     path = make_demos()
     content = TensorDict(torch.load(path)).auto_batch_size_(1)
     torch.save(content[torch.randperm(200)].to_dict(), path)
@@ -70,7 +70,7 @@ def test_shuffled_demonstrations(env, make_demos):
         read_demos(path, env)
 
 
-def test_demonstrations_of_double_precision(env, make_demos):
+def test_demonstrations_of_double_precision_become_float32(env, make_demos):
     path = make_demos()
     content = TensorDict(torch.load(path))
     torch.save(content.to(torch.float64).to_dict(), path)
@@ -98,7 +98,7 @@ def test_incomplete_demonstrations_are_refused(env, make_demos, spoil, message):
         read_demos(path, env)
 
 
-def test_demonstrations_of_other_rewards(make_demos):
+def test_demonstrations_of_other_rewards_are_refused(make_demos):
     path = make_demos()
     with (
         torch_panda.make("PandaPushDense-v1", num_envs=1) as env,
@@ -143,7 +143,7 @@ def test_a_ratio_of_each_batch_is_demonstrations(make_demos, tmp_path):
 @pytest.mark.parametrize(
     ("updates", "expected"), [(40, [0, 12, 24, 36, 40, 40]), (36, [0, 12, 24, 36, 36])]
 )
-def test_imitation_saves_in_between(
+def test_imitation_saves_at_intervals_and_at_its_end(
     make_demos, tmp_path, monkeypatch, updates, expected
 ):
     monkeypatch.setattr(pretraining, "SAVE_INTERVAL", 12)
@@ -202,7 +202,7 @@ def test_a_run_is_not_resumed_with_other_demonstrations(make_demos, tmp_path):
         make_run(replace(args, resume=True), tmp_path)
 
 
-def test_what_was_imitated_is_evaluated_also_after_a_kill(make_demos, tmp_path):
+def test_the_imitation_is_evaluated_also_after_a_kill(make_demos, tmp_path):
     """A kill, or a second Ctrl-C, ends the evaluation after the last imitation."""
     options = {"total_steps": 100, "pretrain_updates": 4, "updates_per_step": 0.05}
     args = small(make_demos(), **options)

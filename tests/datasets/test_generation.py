@@ -107,6 +107,6 @@ def test_play_pursues_goal_after_goal():
         ),
     ],
 )
-def test_wrong_arguments_are_refused(options, message):
+def test_wrong_arguments_of_generate_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         generate(**options)

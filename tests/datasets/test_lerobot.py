@@ -17,7 +17,7 @@ lerobot_dataset = pytest.importorskip(
 EPISODES = 16
 
 
-def test_round_trip(tmp_path):
+def test_a_lerobot_data_set_is_read_back(tmp_path):
     folder = tmp_path / "reach"
     record("lerobot", folder, "PandaReach-v1", EPISODES, image_size=96)
     dataset = lerobot_dataset.LeRobotDataset("torch_panda/reach", root=folder)

@@ -51,7 +51,7 @@ def test_episodes_start_again_from_id_and_seed(recorded):
     env.close()
 
 
-def test_torchrl_reads_it_offline(recorded, tmp_path):
+def test_torchrl_reads_a_minari_data_set_offline(recorded, tmp_path):
     from torchrl.data.datasets.minari_data import MinariExperienceReplay
 
     replay = MinariExperienceReplay(
@@ -64,7 +64,7 @@ def test_torchrl_reads_it_offline(recorded, tmp_path):
     assert torch.equal(reward, batch["next", "reward"].float())
 
 
-def test_bad_names_are_one_line(recorded):
+def test_bad_names_of_minari_data_sets_are_refused(recorded):
     for name, message in (
         (recorded[1], "already"),
         ("push", "'push' is not an id of .*: it must end in a version"),

@@ -102,7 +102,7 @@ def test_a_buffer_of_worker_processes_is_relabelled(monkeypatch):
     assert not torch.equal(*goals)
 
 
-def test_stable_baselines3_trains(monkeypatch, capsys):
+def test_the_script_of_stable_baselines3_trains(monkeypatch, capsys):
     monkeypatch.setattr(sb3, "TOTAL_STEPS", 800)
     monkeypatch.setattr(sb3, "EPISODES", 4)
     sb3.main()

@@ -26,7 +26,7 @@ from torch_panda.experts.moves import sqrt
         ("PandaFlip-v3", 32, 20),
     ],
 )
-def test_solves_its_task(env_id, episodes, least):
+def test_an_expert_solves_its_task(env_id, episodes, least):
     result = torch_panda.evaluate(
         experts.make_expert(env_id),
         env_id,
@@ -66,13 +66,13 @@ def test_a_single_environment_has_no_batch_dimension():
         ("PandaFly-v1", "unknown environment id 'PandaFly-v1'"),
     ],
 )
-def test_ids_without_an_expert(env_id, message):
+def test_ids_without_an_expert_are_refused(env_id, message):
     with pytest.raises(ValueError, match=message):
         experts.make_expert(env_id)
 
 
 @pytest.mark.parametrize(("table_friction", "expected"), [(0.1, "drag"), (0.5, "push")])
-def test_an_id_of_your_own_at_a_shipped_task(table_friction, expected):
+def test_the_friction_of_the_table_chooses_the_expert_of_push(table_friction, expected):
     task = torch_panda.Push(table_friction=table_friction)
     robot = torch_panda.Panda(block_gripper=True)
     assert experts.find_expert(robot, task) is getattr(experts.push, expected)
@@ -91,7 +91,7 @@ class PushFar(torch_panda.Push):
         (torch_panda.XArm6(), torch_panda.Reach()),
     ],
 )
-def test_robots_and_tasks_that_an_expert_was_not_made_for(robot, task):
+def test_other_robots_and_tasks_have_no_expert(robot, task):
     assert experts.find_expert(robot, task) is None
 
 

@@ -46,7 +46,9 @@ EARLY_END = {"residual_threshold": 1e-3}  # the solver stops early, all else is 
         ("Slide", EARLY_END, 2048, 5),
     ],
 )
-def test_experts_succeed_as_often(task, physics, episodes, allowed):
+def test_experts_succeed_nearly_as_often_under_coarser_physics(
+    task, physics, episodes, allowed
+):
     """The success at the end falls by at most the allowed percentage points."""
     params = physics if physics == "fast" else torch_panda.PhysicsParams(**physics)
     exact, other = (success(task, p, episodes) for p in ("exact", params))

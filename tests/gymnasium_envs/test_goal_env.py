@@ -47,7 +47,7 @@ def test_all_ids_are_registered(env_id):
 @pytest.mark.filterwarnings(NO_BOUNDS)
 @pytest.mark.filterwarnings(NOT_OLD)
 @pytest.mark.filterwarnings("error")
-def test_contract(env_id):
+def test_an_environment_keeps_gymnasiums_contract(env_id):
     env = gymnasium.make(f"torch_panda/{env_id}")
     try:
         check_env(env.unwrapped, skip_render_check=True)
@@ -62,7 +62,7 @@ def test_contract(env_id):
         env.close()
 
 
-def test_same_episodes_as_the_torch_environment(env):
+def test_episodes_are_those_of_the_torch_environment(env):
     action = np.random.default_rng(0).uniform(-1, 1, (2, 15, 3)).astype(np.float32)
     with torch_panda.make("PandaPush-v3", seed=5) as other:
         for episode in range(2):
@@ -129,7 +129,7 @@ def test_episodes_are_truncated_at_a_given_time_limit(limit):
 
 
 @pytest.mark.parametrize("env_id", ["PandaReach-v3", "PandaReachDense-v1"])
-def test_goal_functions(env_id):
+def test_reward_and_ends_are_computed_from_arrays_of_goals(env_id):
     env = GoalEnv(env_id)
     achieved = np.zeros((4, 3), np.float32)
     desired = np.array([[0.01, 0, 0], [0.2, 0, 0], [0, 0.03, 0], [0, 0, -1]])

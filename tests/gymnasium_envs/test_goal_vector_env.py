@@ -74,7 +74,7 @@ def test_values_equal_those_of_sync_vector_env(env_id, limit, mode):
     assert np.sum(ends, axis=0).min() >= 3
 
 
-def test_start_from_a_state():
+def test_a_reset_starts_masked_environments_from_a_state():
     env = GoalVectorEnv("PandaPush-v1", num_envs=2)
     env.reset(seed=0)
     first, *_ = env.step(np.ones((2, 3)))
@@ -144,7 +144,7 @@ def test_bad_resets_are_refused(env, arguments, error, message):
 
 
 @pytest.mark.filterwarnings("error")
-def test_bad_arguments_are_refused():
+def test_bad_arguments_of_a_vector_env_are_refused():
     with pytest.raises(ValueError, match="Sometimes"):
         GoalVectorEnv("PandaReach-v1", autoreset_mode="Sometimes")
     with (

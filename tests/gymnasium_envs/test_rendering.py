@@ -21,7 +21,7 @@ VIEW = {
 }
 
 
-def test_unknown_modes():
+def test_an_unknown_render_mode_is_refused():
     for env_class in (GoalEnv, GoalVectorEnv):
         with pytest.raises(ValueError, match=r"render_mode must be None or one of"):
             env_class("PandaReach-v1", render_mode="human")
@@ -38,7 +38,7 @@ def test_videos_are_as_fast_as_the_simulation(substeps):
     assert GoalEnv.metadata["render_fps"] == 25
 
 
-def test_the_view_of_panda_gym():
+def test_the_camera_arguments_of_panda_gym_give_its_view():
     """Outside the translucent target, the pixels equal panda-gym's."""
     ours = gymnasium.make("torch_panda/PandaReach-v3", render_mode="rgb_array", **VIEW)
     theirs = gymnasium.make(
@@ -54,7 +54,7 @@ def test_the_view_of_panda_gym():
     assert (a != b).any(axis=-1).mean() < 0.05
 
 
-def test_a_camera_and_what_changes_it():
+def test_a_given_camera_is_used_and_a_width_changes_it():
     camera = Camera(distance=0.6, width=30, height=20)
     single = GoalEnv("PandaReach-v1", render_mode="rgb_array", render_camera=camera)
     many = GoalVectorEnv(

@@ -26,7 +26,7 @@ def make_dummy():
 
 
 @pytest.mark.parametrize("make_env", [make_single, make_dummy, make_vectorised])
-def test_hindsight_trains(make_env):
+def test_stable_baselines3_trains_with_its_hindsight(make_env):
     env = make_env()
     model = DDPG(
         "MultiInputPolicy",
@@ -80,7 +80,7 @@ def test_values_equal_those_of_dummy_vec_env(env_id):
     assert number_of_ends.min() >= 1
 
 
-def test_attributes_and_methods():
+def test_attributes_and_methods_are_those_of_all_environments():
     env = SB3VecEnv("PandaReach-v1", num_envs=3, render_mode="rgb_array")
     assert env.render_mode == "rgb_array"
     assert env.get_attr("num_envs") == [3, 3, 3]
