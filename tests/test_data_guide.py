@@ -26,7 +26,9 @@ def read_commands():
 
 
 @pytest.mark.usefixtures("quick")
-def test_from_data_to_the_video_of_a_policy(tmp_path, monkeypatch, capsys):
+def test_the_commands_of_the_guide_lead_to_the_video_of_a_policy(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     for words in read_commands():
         for option, size in SMALL.items():

@@ -103,7 +103,7 @@ def check_alive(env):
     assert td["observation"].isfinite().all()
 
 
-def test_ids():
+def test_any_id_makes_an_environment_or_is_refused():
     pieces = st.sampled_from([*"-v13", "Panda", "Push", "Joints", "Dense", "Reach", ""])
     words = st.one_of(things, st.lists(pieces, max_size=5).map("".join))
 
@@ -128,7 +128,7 @@ def test_ids():
     check()
 
 
-def test_arguments():
+def test_any_arguments_of_make_work_or_raise_a_documented_error():
     @fuzz
     @given(
         st.fixed_dictionaries(
@@ -155,7 +155,7 @@ def test_arguments():
     check()
 
 
-def test_actions(env):
+def test_finite_float_actions_are_taken_and_others_change_nothing(env):
     shape = tuple(env.action_spec.shape)
     env.reset()
 
@@ -180,7 +180,7 @@ def test_actions(env):
     check()
 
 
-def test_states(env):
+def test_any_state_starts_an_episode_or_changes_nothing(env):
     env.reset()
     right = {key: tuple(value.shape) for key, value in env.get_state().items()}
     entries = {
@@ -220,8 +220,7 @@ def test_states(env):
     assert any(accepted)
 
 
-def test_gymnasium(vector_env):
-    """The calls of Gymnasium's interface, with any arrays."""
+def test_calls_of_gymnasium_work_or_raise_a_documented_error(vector_env):
     env = vector_env
     arrays = st.one_of(
         st_numpy.arrays(

@@ -24,7 +24,7 @@ MAX_LINES = 250
         "torch_panda/datasets/README.md",
     ],
 )
-def test_snippets(guide):
+def test_the_snippets_of_a_guide_run(guide):
     """One after the other, as a reader would type them."""
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / guide).read_text(), re.DOTALL)
     assert snippets
@@ -38,7 +38,7 @@ def test_the_readme_is_short():
 
 
 @pytest.mark.parametrize("name", GUIDES)
-def test_links_of_a_guide(name):
+def test_links_of_a_guide_lead_to_files(name):
     guide = ROOT / name
     links = re.findall(r"\]\(([^)#]+)\)", guide.read_text())
     files = [link for link in links if not link.startswith("http")]
@@ -58,7 +58,7 @@ def find_anchors(page):
 
 
 @pytest.mark.parametrize("name", GUIDES)
-def test_links_to_sections(name):
+def test_links_to_sections_lead_to_headings(name):
     guide = ROOT / name
     links = re.findall(r"\]\(((?:[^):#]+\.md)?)#([^)]+)\)", guide.read_text())
     pages = [(guide.parent / page if page else guide, anchor) for page, anchor in links]

@@ -95,7 +95,7 @@ def check_row(theirs, ours, env, make, *, is_fetch):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("theirs", "ours"), rows("From panda-gym 3"))
-def test_from_panda_gym(theirs, ours):
+def test_both_columns_of_the_panda_gym_table_agree(theirs, ours):
     env = gymnasium.make("torch_panda/PandaPush-v3", render_mode="rgb_array")
     make = functools.partial(make_reference, "PandaPush-v3", render_mode="rgb_array")
     check_row(theirs, ours, env, make, is_fetch=False)
@@ -103,7 +103,7 @@ def test_from_panda_gym(theirs, ours):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("theirs", "ours"), rows("From Fetch"))
-def test_from_fetch(theirs, ours):
+def test_both_columns_of_the_fetch_table_agree(theirs, ours):
     robotics = pytest.importorskip(
         "gymnasium_robotics", reason="needs gymnasium-robotics, which brings MuJoCo"
     )
@@ -129,8 +129,8 @@ def test_fetch_has_the_same_clock():
     theirs.close()
 
 
-def test_an_exact_state_goes_on():
-    """The episode continues, as `restore_state` is meant to do."""
+def test_an_episode_continues_from_an_exact_state():
+    """As panda-gym's `restore_state` is meant to do."""
     env = gymnasium.make("torch_panda/PandaPush-v3")
     env.reset(seed=0)
     action = np.float32([0.3, 0.2, -1.0])

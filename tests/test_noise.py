@@ -74,7 +74,7 @@ def test_noise_of_actions_has_its_size_and_its_seed():
     assert 0.07 < first.std() / 3**0.5 < 0.14
 
 
-def test_noise_of_observations():
+def test_noise_changes_observations_but_not_goals_or_rewards():
     with make() as plain, make(ObservationNoise(0.01, seed=0)) as noisy:
         check_env_specs(noisy)
         for env in (plain, noisy):
@@ -90,7 +90,7 @@ def test_noise_of_observations():
             assert torch.equal(actual["reward"], expected["reward"])
 
 
-def test_rollouts_and_pickles():
+def test_noisy_environments_roll_out_and_their_noise_pickles():
     with make(ActionDelay(1), ActionNoise(0.1), ObservationNoise(0.01)) as env:
         check_env_specs(env)
         assert env.rollout(5).shape == (N, 5)
@@ -98,7 +98,7 @@ def test_rollouts_and_pickles():
         assert noise.inv(env.rand_action(env.reset()))["action"].shape == (N, 3)
 
 
-def test_the_global_generator_is_left_alone():
+def test_noise_leaves_the_global_generator_alone():
     before = torch.random.get_rng_state()
     arrived(ActionNoise(0.1), ObservationNoise(0.1), actions=torch.zeros(3, N, 3))
     assert torch.equal(before, torch.random.get_rng_state())
@@ -112,6 +112,6 @@ def test_the_global_generator_is_left_alone():
         (lambda: ObservationNoise(float("nan")), "std must be"),
     ],
 )
-def test_bad_arguments(make_transform, message):
+def test_a_delay_of_0_and_a_bad_std_are_refused(make_transform, message):
     with pytest.raises(ValueError, match=message):
         make_transform()

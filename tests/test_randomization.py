@@ -135,7 +135,7 @@ def test_masses_change_and_a_state_can_set_them():
         ("start_physics_parameters", "object_friction", -1.0),
     ],
 )
-def test_impossible_physics_change_nothing(key, name, factor):
+def test_impossible_physics_are_refused_and_change_nothing(key, name, factor):
     with make() as env:
         env.reset()
         before = env.get_state(exact=True)

@@ -109,7 +109,7 @@ def test_options_of_task_and_robot_are_checked():
         ({"max_episode_steps": 0}, ValueError, "max_episode_steps must be"),
     ],
 )
-def test_wrong_registrations(arguments, error, message):
+def test_wrong_registrations_are_refused(arguments, error, message):
     accepted = {"env_id": "Shove-v0", "robot": Panda, "task": Push}
     with pytest.raises(error, match=message):
         torch_panda.register(**(accepted | arguments))

@@ -86,7 +86,7 @@ def random_step(env, td, rng):
 @pytest.mark.parametrize(
     ("steps", "num_envs"), [(1000, 1), pytest.param(STEPS, 4, marks=LONG)]
 )
-def test_steps(steps, num_envs):
+def test_long_runs_leak_no_memory_threads_or_files(steps, num_envs):
     rng = np.random.default_rng(0)
     gc.collect()
     before = left_over()
@@ -118,7 +118,7 @@ def test_steps(steps, num_envs):
 
 
 @pytest.mark.parametrize("cycles", [12, pytest.param(CYCLES, marks=LONG)])
-def test_create_and_close(cycles):
+def test_creating_and_closing_environments_leaks_nothing(cycles):
     rng = np.random.default_rng(0)
     used, threads = [], set()
     for index in range(cycles):

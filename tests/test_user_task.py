@@ -160,7 +160,7 @@ def test_episodes_and_exact_states_repeat_bit_for_bit(loop):
         assert (forked == after["next"][[1, 1, 1]]).all()
 
 
-def test_a_registered_task_in_gymnasium():
+def test_gymnasium_makes_a_registered_task():
     with gymnasium.make(
         f"torch_panda/{ID}", task_options={"distance_threshold": 0.01}
     ) as env:
