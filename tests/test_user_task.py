@@ -182,8 +182,9 @@ def test_gymnasium_makes_a_registered_task():
 def test_a_moved_drawer_changes_the_picture():
     with torch_panda.make(ID, seed=0) as env:
         env.reset()
-        before = env.render(size=64)
-        push_forward(env)
+        before, state = env.render(size=64), env.get_state()
+        state["object_joint_position"][:] = 0.1
+        env.reset(state, set_state=True)
         assert (env.render(size=64) != before).any()
         assert "object" in env.segmentation_ids
 
