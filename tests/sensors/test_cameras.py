@@ -72,6 +72,7 @@ def test_partial_resets_and_steps_leave_other_pictures_unchanged():
         action = torch.ones(3, 3)
         td = env.step(td.set("action", action).set("_step", mask.squeeze(-1)))["next"]
         for key, value in before.items():
+            assert (td[key][[0, 2]] == value[[0, 2]]).all(), key
             assert not (td[key][1] == value[1]).all(), key
     with make() as env:
         td = env.reset()
