@@ -123,6 +123,7 @@ def test_a_stochastic_policy_is_refined_without_its_noise(tmp_path, monkeypatch)
     monkeypatch.setattr(refine, "relabel", lambda x, *_: asked.append(x))
     run.play(stop=False)
     run.close()
+    assert len(asked) == 2
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         for episode in asked:
             played = episode["action"].clone()
