@@ -200,7 +200,7 @@ def test_without_an_environment_a_computed_entry_is_a_warning(key):
     transform = HindsightRelabel(env.base_env.compute_reward)
     messages = get_warnings(lambda: store(env, transform))
     matches = [message for message in messages if "affine" in message]
-    assert len(matches) == (1 if key != "policy_input" else len(matches))
+    assert len(matches) == 1
     assert key in matches[0] and "after this transform" in matches[0]
 
 
