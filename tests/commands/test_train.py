@@ -270,6 +270,15 @@ def test_the_command_line_overrules_the_recipe():
     assert parse([]) == Args()
 
 
+def test_help_shows_the_defaults_of_the_preset(capsys):
+    with pytest.raises(SystemExit):
+        parse(["--help", "--preset", "tuned", "--env-id", "PandaSlide-v1"])
+    words = capsys.readouterr().out.split()
+    default = words[words.index("--total-steps") :]
+    steps = default_args("tuned", "PandaSlide-v1").total_steps
+    assert f"{steps})" in default[: default.index("--eval-interval")]
+
+
 @pytest.mark.parametrize("preset", ["paper", "tuned", "sample-efficient"])
 @pytest.mark.parametrize("env_id", ["PandaSlide-v1", "PandaStack-v1"])
 def test_crl_draws_geometric_goals_in_every_preset(preset, env_id):

@@ -67,8 +67,9 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
         ValueError: A module of ``--import`` does not exist, or ``--offline`` and the
             algorithm do not fit together.
     """
-    modes = [x for x in arguments if x not in ("-h", "--help")]
-    mode, _ = tyro.cli(Mode, args=modes, return_unknown_args=True)
+    # The help is printed at the end, with the defaults of this preset and algorithm.
+    without_help = [x for x in arguments if x not in ("-h", "--help")]
+    mode, _ = tyro.cli(Mode, args=without_help, return_unknown_args=True)
     if mode.offline:
         cls = make_args_class(mode.algo or OfflineArgs.algo)
         arguments = [x for x in arguments if x != "--offline"]
@@ -77,7 +78,7 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
         return offline_args
     if mode.algo in OFFLINE_AGENTS and mode.algo not in AGENTS:
         raise ValueError(f"{mode.algo} learns offline: add --offline")
-    first = tyro.cli(Args, prog=PROG, args=arguments)
+    first = tyro.cli(Args, prog=PROG, args=without_help)
     import_modules(read_modules(first.imports))
     default = default_args(first.preset, first.env_id, first.algo)
     return tyro.cli(Args, prog=PROG, args=arguments, default=default)
