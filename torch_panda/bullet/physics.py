@@ -31,9 +31,9 @@ class PhysicsParams:
             substep.
         gravity: Gravity along the world's z axis [m/s^2].
         ik_iterations: Maximum number of iterations of the inverse kinematics in a step.
-            With the defaults, which are Bullet's, the arm stops about 13 mm short of a
-            target that is 50 mm away. Fewer iterations get as close if ``ik_damping``
-            is reduced by about the same factor.
+            With the defaults of this and of ``ik_damping``, which are Bullet's own, the
+            arm stops about 13 mm short of a target that is 50 mm away. Fewer iterations
+            get as close if ``ik_damping`` is reduced by about the same factor.
         ik_damping: Damping of the inverse kinematics, which Bullet solves by damped
             least squares.
 

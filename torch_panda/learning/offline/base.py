@@ -296,7 +296,7 @@ def ensemble_loss(q: Tensor, v: Tensor, v_target: Tensor, expectile: float) -> T
 def weighted_regression(log_probs: Tensor, advantage: Tensor, alpha: float) -> Tensor:
     """Advantage-weighted regression, a scalar (2110.06169, eq. 7).
 
-    The paper calls ``alpha`` beta.
+    The paper writes beta for ``alpha``.
 
     Args:
         log_probs: Log probabilities of the imitated actions or waypoints, (n,).
