@@ -24,16 +24,6 @@ def make(env_id="PandaPush-v1", **options):
 # ---- goal_indices --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", PHYSICS_IDS)
-def test_goal_indices_are_the_achieved_goal_of_every_id(env_id):
-    with torch_panda.make(env_id, num_envs=2, seed=0) as env:
-        indices = env.goal_indices
-        assert isinstance(indices, tuple)
-        rollout = env.rollout(5)["next"]
-        entries = rollout["observation"][..., list(indices)]
-        assert torch.equal(entries, rollout["achieved_goal"])
-
-
 class Undeclared(Push):
     """Overrides `observation` without declaring ``goal_entries`` again."""
 

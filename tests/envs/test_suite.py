@@ -22,7 +22,7 @@ SIZES = {
     "PegInsertion": (21, 3, 3, 50),
 }
 PAPER = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
-NUM_ENVS = 3
+NUM_ENVS = 2
 
 
 @pytest.fixture(scope="module", params=PHYSICS_IDS)
@@ -100,6 +100,14 @@ def test_reward_success_and_ends_follow_from_the_goals(env):
     assert torch.equal(after["reward"], after["success"].float() - 1)
     ends = env.terminate_on_success
     assert torch.equal(after["terminated"], after["success"] & ends)
+
+
+def test_goal_indices_are_where_observations_have_the_achieved_goal(env):
+    indices = env.goal_indices
+    assert isinstance(indices, tuple)
+    after = env.rollout(5)["next"]
+    observed = after["observation"][..., list(indices)]
+    assert torch.equal(observed, after["achieved_goal"])
 
 
 def test_reward_types_share_their_physics(env, env_id):
