@@ -28,8 +28,8 @@ PUCK_START_HEIGHT = 0.03  # [m]
 class Slide(Task):
     """Strike a puck so that it slides to a point and stops there.
 
-    By default the square of goals has the paper's size. It is out of the arm's reach,
-    which is 0.855 m around the base at x = -0.6 m.
+    By default the square of goals has the paper's size, and the arm cannot reach it:
+    the hand comes at most 0.855 m away from the arm's base, which is at x = -0.6 m.
 
     Args:
         reward_type: "sparse" or "dense"; see `Task`.
