@@ -53,8 +53,14 @@ def test_falling_bodies_equal_those_of_pybullet(reference, shape):
     with PhysicsClient() as client:
         ground = create(reference, client, "ground", 0.0, (0.0, 0.0, -0.1))
         body = create(reference, client, shape, 1.0, (0.01, 0.02, 0.2))
-        reference.changeDynamics(body, -1, lateralFriction=0.3, spinningFriction=0.01)
-        client.set_friction(body, lateral=0.3, spinning=0.01)
+        reference.changeDynamics(
+            body,
+            -1,
+            lateralFriction=0.3,
+            spinningFriction=0.01,
+            rollingFriction=0.002,
+        )
+        client.set_friction(body, lateral=0.3, spinning=0.01, rolling=0.002)
         rotation = (0.1, 0.2, 0.3, float(np.sqrt(1 - 0.14)))
         velocity, spin = (0.5, 0.1, 0.0), (1.0, 2.0, 3.0)
         reference.resetBasePositionAndOrientation(body, (0.0, 0.0, 0.2), rotation)

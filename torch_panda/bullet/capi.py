@@ -222,6 +222,9 @@ dynamics_set_joint_damping = _cheap(
 dynamics_set_lateral_friction = _cheap(
     "b3ChangeDynamicsInfoSetLateralFriction", *_set_dynamics
 )
+dynamics_set_rolling_friction = _cheap(
+    "b3ChangeDynamicsInfoSetRollingFriction", *_set_dynamics
+)
 dynamics_set_spinning_friction = _cheap(
     "b3ChangeDynamicsInfoSetSpinningFriction", *_set_dynamics
 )

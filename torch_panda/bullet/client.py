@@ -355,6 +355,7 @@ class PhysicsClient:
         *,
         lateral: float | None = None,
         spinning: float | None = None,
+        rolling: float | None = None,
     ) -> None:
         """Set the friction coefficients of a link (-1 is the base).
 
@@ -364,7 +365,11 @@ class PhysicsClient:
             ValueError: A coefficient is negative or not finite.
         """
         self.set_dynamics(
-            body, link, lateral_friction=lateral, spinning_friction=spinning
+            body,
+            link,
+            lateral_friction=lateral,
+            spinning_friction=spinning,
+            rolling_friction=rolling,
         )
 
     def set_dynamics(
@@ -375,13 +380,16 @@ class PhysicsClient:
         mass: float | None = None,
         lateral_friction: float | None = None,
         spinning_friction: float | None = None,
+        rolling_friction: float | None = None,
         restitution: float | None = None,
         joint_damping: float | None = None,
     ) -> None:
         """Change physical properties of a link (-1 is the base).
 
         None keeps a property as it is. For a contact between two links, Bullet
-        multiplies their frictions, and also multiplies their restitutions.
+        multiplies their lateral frictions, and also multiplies their restitutions. The
+        spinning and the rolling friction of each link are multiplied by the lateral
+        friction of the other link, and the two products are added.
 
         Args:
             body: Body id.
@@ -391,6 +399,8 @@ class PhysicsClient:
             lateral_friction: Coefficient of friction along the surface.
             spinning_friction: Coefficient of friction against rotation about the normal
                 of a contact.
+            rolling_friction: Coefficient of friction against rolling. Without it, a
+                ball never comes to rest.
             restitution: Share of its speed that a body keeps when it bounces, 0 to 1.
             joint_damping: Damping of the joint that moves the link [N m s/rad] or
                 [N s/m].
@@ -402,6 +412,7 @@ class PhysicsClient:
             "mass": mass,
             "lateral_friction": lateral_friction,
             "spinning_friction": spinning_friction,
+            "rolling_friction": rolling_friction,
             "restitution": restitution,
             "joint_damping": joint_damping,
         }
@@ -717,6 +728,7 @@ _DYNAMICS_SETTERS = {
     "mass": capi.dynamics_set_mass,
     "lateral_friction": capi.dynamics_set_lateral_friction,
     "spinning_friction": capi.dynamics_set_spinning_friction,
+    "rolling_friction": capi.dynamics_set_rolling_friction,
     "restitution": capi.dynamics_set_restitution,
     "joint_damping": capi.dynamics_set_joint_damping,
 }
