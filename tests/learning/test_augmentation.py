@@ -4,8 +4,9 @@ import pytest
 import torch
 
 import torch_panda
+from tests.learning.transitions import make_transitions
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.augmentation import SHIFT, augment, mirror, shift
+from torch_panda.learning.augmentation import augment, mirror, shift
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.learning.transitions import Transitions
 
@@ -67,12 +68,19 @@ def test_each_mode_applies_its_augmentations(env, mode):
     expected = rows if mode == "none" else mirror(rows, geometry)
     torch.manual_seed(0)
     if mode == "mirror-shift":
-        expected = shift(expected, geometry, SHIFT)
+        expected = shift(expected, geometry, 0.15)
     assert all(map(torch.equal, result, expected))
 
 
-def test_joint_control_has_no_mirror():
-    with torch_panda.make("PandaPushJoints-v1", num_envs=1) as env:
-        with pytest.raises(ValueError, match="pass --augmentation none"):
-            make_agent(env, Hyperparameters(augmentation="mirror"))
-        make_agent(env, Hyperparameters())
+@pytest.mark.parametrize("learn", ["update", "imitate"])
+def test_agents_learn_from_augmented_rows(env, learn):
+    batch = make_transitions(env, 8)
+    results = []
+    for augmentation in ("mirror", "none"):
+        torch.manual_seed(0)
+        agent = make_agent(env, Hyperparameters(augmentation=augmentation))
+        results.append(getattr(agent, learn)(batch.clone()))
+        rows = mirror(Transitions.from_tensordict(batch), read_geometry(env))
+        batch["observation"], batch["desired_goal"] = rows.observation, rows.goal
+        batch["action"], batch["next", "observation"] = rows.action, rows[-1]
+    torch.testing.assert_close(*results)

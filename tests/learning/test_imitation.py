@@ -1,63 +1,32 @@
-"""Learning from demonstrations beside one's own transitions."""
+"""Imitation of demonstrations before reinforcement learning."""
+
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 import torch_panda
-from tests.learning.test_agents import critics_of
 from tests.learning.transitions import make_transitions
-from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
-from torch_panda.learning.agents.ddpg import BC_WEIGHT
+from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.checkpoint import Progress
+from torch_panda.learning.pretraining import pretrain
 
 
-@pytest.fixture(scope="module")
-def env():
+def test_the_learning_rate_of_imitation_falls_to_0(monkeypatch):
+    """Reinforcement learning then starts with the usual learning rate."""
     with torch_panda.make("PandaPush-v1", num_envs=2) as env:
-        yield env
+        agent = make_agent(env, Hyperparameters())
+        rows = make_transitions(env, 8)
+    rates, imitate = [], agent.imitate
 
+    def remember(batch):
+        rates.append(agent.optimizer.param_groups[0]["lr"])
+        return imitate(batch)
 
-@pytest.mark.parametrize("algo", ["ddpg", "td3"])
-def test_an_agent_imitates_the_actions_that_its_critic_prefers(env, algo):
-    def make():
-        torch.manual_seed(0)
-        return make_agent(env, Hyperparameters(algo=algo))
-
-    batch, demos = make_transitions(env, 64), make_transitions(env, 32)
-    agent = make()
-    with torch.no_grad():
-        state = agent.normalizer(demos["observation"], demos["desired_goal"])
-        action = agent.actor(state)
-        critic = agent.critics[0]
-        better = critic(state, demos["action"]) > critic(state, action)
-    assert 0 < better.sum() < len(better)
-    expected = BC_WEIGHT * ((action - demos["action"]).square() * better).mean()
-
-    losses = agent.update(batch.clone(), demos.clone())
-    plain = make().update(torch.cat((batch, demos)))  # as if they were its own
-    torch.testing.assert_close(losses["actor_loss"] - plain["actor_loss"], expected)
-
-
-@pytest.mark.parametrize("algo", AGENTS)
-def test_the_policy_comes_closer_to_demonstrations(env, algo):
-    torch.manual_seed(0)
-    agent = make_agent(env, Hyperparameters(algo=algo))
-    demos = make_transitions(env, 32)
-    critics = [x.clone() for x in critics_of(agent)[0]]
-    losses = [agent.imitate(demos.clone()) for _ in range(20)]
-    assert 0 < losses[-1] < 0.9 * losses[0]
-    assert not losses[-1].requires_grad
-    assert all(map(torch.equal, critics, critics_of(agent)[0]))
-
-
-def test_the_policy_imitates_the_more_frequent_of_two_actions(env):
-    torch.manual_seed(0)
-    agent = make_agent(env, Hyperparameters())
-    demos = make_transitions(env, 1).expand(32).clone()
-    frequent, rare = torch.tensor((0.6, -0.2, 0.4)), torch.tensor((-0.6, 0.4, -0.4))
-    demos["action"] = torch.where(torch.arange(32)[:, None] % 4 > 0, frequent, rare)
-    for count in range(300):
-        agent.set_learning_rate(1 - count / 300)
-        agent.imitate(demos.clone())
-    with torch.no_grad():
-        action = agent.policy(demos[:1].clone())["action"]
-    torch.testing.assert_close(action, frequent[None], atol=0.02, rtol=0)
+    monkeypatch.setattr(agent, "imitate", remember)
+    demos = SimpleNamespace(sample=lambda size: rows[torch.randint(8, (size,))])
+    run = SimpleNamespace(agent=agent, progress=Progress(), save=lambda: None)
+    pretrain(run, demos, updates=4, batch_size=2, learning_rate=0.5, stop=False)
+    assert rates == pytest.approx([5e-4, 3.75e-4, 2.5e-4, 1.25e-4])
+    assert agent.optimizer.param_groups[0]["lr"] == 1e-3
+    assert run.progress.pretrained == 4

@@ -1,0 +1,108 @@
+"""Data of offline learning: rewards, goals and waypoints of sampled transitions."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import torch_panda
+from tests.learning.episodes import play_randomly
+from torch_panda.learning.buffers import STORED_KEYS
+from torch_panda.learning.offline import OFFLINE_AGENTS
+from torch_panda.learning.offline.base import VALUE_GOALS, Batch
+from torch_panda.learning.offline.data import OfflineData
+from torch_panda.learning.spaces import read_spaces
+
+GOALS = {"value_goal": VALUE_GOALS, "actor_goal": "future"}
+
+
+@pytest.fixture(scope="module")
+def env():
+    with torch_panda.make("PandaReach-v1", num_envs=4, seed=0) as env:
+        yield env
+
+
+@pytest.fixture(scope="module")
+def transitions(env):
+    """Random episodes of Reach, (200,)."""
+    return play_randomly(env).select(*STORED_KEYS).reshape(-1)
+
+
+def test_the_data_of_the_caller_stay_as_they_are(env, transitions):
+    data = transitions.clone()
+    data["next", "reward"].fill_(-7.0)
+    before = data.clone()
+    OfflineData(data, env, GOALS, discount=0.99)
+    assert (data == before).all()
+
+
+def test_rewards_are_those_of_the_value_goal(env, transitions):
+    data = OfflineData(transitions.clone(), env, GOALS, discount=0.99)
+    batch = data.sample(1_000)
+    b = Batch.from_tensordict(batch)
+    reached = (b.achieved - b.g).norm(dim=-1) < 0.05
+    assert 0.2 < reached.float().mean() < 0.9
+    assert torch.equal(b.r, reached.float() - 1)
+    assert torch.equal(b.mask, 1 - reached.float())
+    for key in ("observation", "action"):
+        assert torch.equal(batch[key], transitions[key][batch["index"]])
+
+
+@pytest.mark.parametrize("actor_goal", ["future", "geometric"])
+def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, actor_goal):
+    """Each row has its episode and step as its observation and goal."""
+    lengths = [7, 30, 1, 12]
+    episode = torch.cat([torch.full((n,), i) for i, n in enumerate(lengths)])
+    step = torch.cat([torch.arange(n) for n in lengths])
+    names = torch.stack([episode, step], -1).float()
+    rows = torch.zeros(50, 1)
+    cls = OFFLINE_AGENTS["hiql"]
+    hp = cls.Hyperparameters(subgoal_steps=5, actor_goal=actor_goal, hidden_size=8)
+    agent = cls(read_spaces(env), hp)
+    named = named_transitions(env, episode, names, rows)
+    data = OfflineData(named, env, agent.goal_strategies, discount=0.9)
+    batch = agent.extend(data.sample(5_000), data)
+    t = batch["index"]
+    last = torch.tensor(lengths)[episode[t]] - 1
+    goal = batch["actor_goal"][:, :2]
+    high, low, value = (
+        batch[f"{name}_waypoint"][:, :2] for name in ("high", "low", "value")
+    )
+    for name in (goal, high, low):
+        assert torch.equal(name[:, 0], episode[t].float())
+    assert (goal[:, 1] >= step[t]).all()
+    assert (goal[:, 1] <= last).all()
+    # A row's next state is one step later, so 4 rows later is 5 steps later.
+    assert torch.equal(low[:, 1], torch.minimum(step[t] + 4, last).float())
+    assert torch.equal(high[:, 1], torch.minimum(step[t] + 4, goal[:, 1]))
+    is_own = (value == names[t]).all(-1)
+    assert torch.equal(is_own, batch["reaches_waypoint"])
+    assert 0.2 < is_own.float().mean() < 0.5
+
+
+def named_transitions(env, episode, names, rows):
+    """Transitions whose next observation and achieved goal are their names."""
+    n, spaces = len(rows), read_spaces(env)
+    observation = torch.zeros(n, spaces.observation_size)
+    observation[:, :2] = names
+    goal = torch.zeros(n, spaces.goal_size)
+    goal[:, :2] = names
+    no = torch.zeros(n, 1, dtype=torch.bool)
+    desired = torch.zeros_like(goal)
+    after = {
+        "observation": observation,
+        "achieved_goal": goal,
+        "desired_goal": desired,
+        "reward": rows,
+        "done": no,
+        "terminated": no,
+    }
+    return TensorDict(
+        {
+            "observation": torch.zeros_like(observation),
+            "desired_goal": desired,
+            "action": torch.zeros(n, spaces.action_size),
+            "collector": {"traj_ids": episode},
+            "next": after,
+        },
+        [n],
+    )
