@@ -30,7 +30,7 @@ ENDS = [False, False, False, False, False, False, True, True]
 
 def make_agent(algo, seed=0, **options):
     torch.manual_seed(seed)
-    hp = Hyperparameters(algo=algo, gamma=GAMMA, action_l2=0.5, **options)
+    hp = Hyperparameters(algo=algo, gamma=GAMMA, **options)
     agent = AGENTS[algo](SPACES, hp)
     fill_normalizer(agent)
     return agent
@@ -79,7 +79,7 @@ def actor_terms(agent, state):
     """The actions of a deterministic actor, and the penalties on them."""
     before_tanh = agent.actor[0](state)
     action = before_tanh.tanh()
-    return action, 0.5 * (action**2).mean() + 0.01 * (before_tanh**2).mean()
+    return action, (action**2).mean() + 0.01 * (before_tanh**2).mean()
 
 
 def make_dispersed(algo, **options):
@@ -99,7 +99,7 @@ def target_networks(agent):
     )
 
 
-def test_ddpg():
+def test_ddpg_takes_the_calculated_step():
     agent, rows = make_dispersed("ddpg"), make_rows()
     [critic], [target_critic] = agent.critics, agent.target_critics
     state, next_state = states(agent, rows)
@@ -116,15 +116,19 @@ def test_ddpg():
     check_step(agent, lambda: agent.update(rows), expected, target_networks(agent), TAU)
 
 
-def test_targets_of_other_rewards_are_not_clipped():
-    """Without sparse rewards nothing bounds a return, and a failure has no minimum."""
+@pytest.mark.parametrize(("lowest", "highest"), [(None, math.inf), (-math.inf, 0.0)])
+def test_only_possible_bounds_clip_targets(lowest, highest):
+    """Returns of other rewards have no bounds; without discount they have no minimum.
+
+    A failure then keeps its reward.
+    """
     agent, rows = make_dispersed("ddpg"), make_rows()
-    agent.min_return = None
+    agent.min_return = lowest
     state, next_state = states(agent, rows)
     with torch.no_grad():
         next_value = agent.target_critics[0](next_state, agent.target_actor(next_state))
-        target = target_values(next_value[:, 0], -math.inf, math.inf)
-        target[6] = -1.0  # the failure keeps its reward
+        target = target_values(next_value[:, 0], -math.inf, highest)
+        target[6] = -1.0
         difference = agent.critics[0](state, rows["action"])[:, 0] - target
     loss = agent.update(rows)["critic_loss"]
     torch.testing.assert_close(loss, (difference**2).mean())
@@ -156,20 +160,20 @@ def test_ddpg_and_td3_imitate_demonstrations_that_their_critic_prefers(algo):
 
 
 @pytest.mark.parametrize("double_q", [True, False])
-def test_td3(double_q):
+def test_td3_takes_the_calculated_step(double_q, monkeypatch):
     agent, rows = make_dispersed("td3", double_q=double_q), make_rows()
     assert len(agent.critics) == (2 if double_q else 1)
     state, next_state = states(agent, rows)
-    torch.manual_seed(1)
-    noise = 0.2 * torch.randn(8, 3)
-    assert (noise.abs() > 0.5).any()
-    next_action = agent.target_actor(next_state) + noise.clamp(-0.5, 0.5)
-    assert (next_action.abs() > 1).any()
-    next_values = [
-        critic(next_state, next_action.clamp(-1, 1))[:, 0]
-        for critic in agent.target_critics
-    ]
-    target = target_values(torch.stack(next_values).amin(0))
+    draws = torch.linspace(-5, 5, 24)[torch.randperm(24)].view(8, 3)
+    monkeypatch.setattr(torch, "randn_like", lambda action: draws)
+
+    def targets(noise):
+        action = (agent.target_actor(next_state) + noise).clamp(-1, 1)
+        values = [critic(next_state, action)[:, 0] for critic in agent.target_critics]
+        return target_values(torch.stack(values).amin(0))
+
+    target = targets((0.2 * draws).clamp(-0.5, 0.5))
+    assert (target - targets(0.2 * draws)).abs().max() > 0.1  # some noise is clipped
     critic_loss = sum(
         ((critic(state, rows["action"])[:, 0] - target) ** 2).mean()
         for critic in agent.critics
@@ -181,7 +185,6 @@ def test_td3(double_q):
         "critic_loss": Expected(critic_loss, trained, LEARNING_RATE),
         "actor_loss": Expected(actor_loss, parameters_of(agent.actor), LEARNING_RATE),
     }
-    torch.manual_seed(1)
     check_step(agent, lambda: agent.update(rows), expected, target_networks(agent), TAU)
     # Every second step trains the critics only.
     actor = [p.detach().clone() for p in agent.actor.parameters()]
@@ -217,7 +220,7 @@ def sac_networks(agent):
 
 
 @pytest.mark.parametrize("double_q", [True, False])
-def test_sac(double_q):
+def test_sac_takes_the_calculated_step(double_q):
     agent, rows = make_agent("sac", double_q=double_q), make_rows()
     online, target = sac_networks(agent)
     assert len(online) == (2 if double_q else 1)
@@ -237,7 +240,7 @@ def test_sac(double_q):
 
 
 @pytest.mark.parametrize("double_q", [True, False])
-def test_tqc(double_q):
+def test_tqc_takes_the_calculated_step(double_q):
     """The target leaves out the 4 highest of both critics' 50 quantiles."""
     agent, rows = make_agent("tqc", double_q=double_q), make_rows()
     online, target = sac_networks(agent)
@@ -280,7 +283,7 @@ def check_sac_step(agent, rows, critic_loss, actor_loss):
     check_step(agent, lambda: agent.update(rows), expected, targets, TAU)
 
 
-def test_crl():
+def test_crl_takes_the_calculated_step():
     """Neither rewards nor ends of episodes are used."""
     agent, rows = make_agent("crl"), make_rows()
     state, _ = states(agent, rows)
@@ -306,7 +309,7 @@ def test_crl():
 
 
 @pytest.mark.parametrize("algo", AGENTS)
-def test_imitation(algo):
+def test_imitation_takes_the_calculated_step(algo):
     """The loss is the mean absolute difference. Only the policy learns."""
     agent, demos = make_agent(algo), make_rows()
     actor = agent.explore.module[1]

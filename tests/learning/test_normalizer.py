@@ -6,8 +6,10 @@ import torch
 import torch_panda
 from tests.learning.episodes import play_randomly
 from tests.learning.gradient_steps import SPACES
+from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.options import Args
 from torch_panda.learning.spaces import read_spaces
 from torch_panda.learning.training import Run
@@ -31,6 +33,20 @@ def test_relative_inputs_append_differences():
     clipped = differences.clamp(-0.03, 0.03)
     assert 0 < (clipped != differences).sum() < differences.numel()
     torch.testing.assert_close(fine, torch.cat((coarse, clipped), -1))
+
+
+def test_agents_see_the_offsets_that_their_options_name():
+    """Reach has one offset, from the hand to the goal. It is an input twice, "fine"."""
+    cls = OFFLINE_AGENTS["gcbc"]
+    with torch_panda.make("PandaReach-v1", num_envs=3, seed=0) as env:
+        td = env.reset()
+        online = make_agent(env, Hyperparameters(relative_inputs="fine"))
+        offline = cls(read_spaces(env), cls.Hyperparameters())
+    offset = td["desired_goal"] - td["observation"][:, :3]
+    expected = torch.cat((offset, offset.clamp(-0.03, 0.03)), -1)
+    for agent in (online, offline):
+        seen = agent.normalizer(td["observation"], td["desired_goal"])
+        torch.testing.assert_close(seen[:, 9:], expected)
 
 
 @pytest.mark.parametrize(("relative_inputs", "shown"), [("none", 0.1), ("fine", 0.03)])

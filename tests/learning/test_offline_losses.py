@@ -113,7 +113,7 @@ def ascent(q, log_probs, alpha):
     return -q.mean() / q.detach().abs().mean() - alpha * log_probs.mean()
 
 
-def test_gcbc():
+def test_gcbc_takes_the_calculated_step():
     agent, rows = make_agent("gcbc"), make_rows()
     x, _ = inputs(agent, rows, "actor_goal")
     loss = -log_probs(agent.actor.net(x), rows["action"]).mean()
@@ -121,7 +121,7 @@ def test_gcbc():
     check_step(agent, lambda: agent.update(rows), expected)
 
 
-def test_gcivl():
+def test_gcivl_takes_the_calculated_step():
     agent, rows = make_agent("gcivl"), make_rows()
     for net in (*agent.value, *agent.target_value):
         disperse(net, scale=6)
@@ -149,7 +149,7 @@ def test_gcivl():
     check_step(agent, lambda: agent.update(rows), expected, targets, TAU)
 
 
-def test_gciql():
+def test_gciql_takes_the_calculated_step():
     agent, rows = make_agent("gciql"), make_rows()
     disperse(agent.value, scale=4, bias=-5)
     for net in (*agent.critic, *agent.target_critic):
@@ -183,7 +183,7 @@ def test_gciql():
     check_step(agent, lambda: agent.update(rows), expected, targets, TAU)
 
 
-def test_hiql():
+def test_hiql_takes_the_calculated_step():
     agent, rows = make_agent("hiql"), make_rows()
     for part in (agent.online, agent.target):
         for net in (*part["waypoint_value"], *part["goal_value"]):
@@ -288,20 +288,20 @@ def qrl_losses(agent, rows):
     }
 
 
-def test_qrl():
-    agent, rows = make_qrl(alpha=1.0)
+def test_qrl_takes_the_calculated_step():
+    agent, rows = make_qrl()
     goal = agent.goal_encoder(agent.normalizer.goal(rows["actor_goal"]))
     before, after = (
         agent.quasimetric(agent.state_encoder(s), goal) for s in states(agent, rows)
     )
     x, _ = inputs(agent, rows, "actor_goal")
     log_prob = log_probs(agent.actor.net(x), rows["action"])
-    loss, _ = weighted_imitation(log_prob, before - after, alpha=1.0)
+    loss, _ = weighted_imitation(log_prob, before - after, alpha=10.0)
     expected = {**qrl_losses(agent, rows), "actor_loss": trains(loss, agent.actor)}
     check_step(agent, lambda: agent.update(rows), expected)
 
 
-def test_qrl_descends_its_costs():
+def test_qrl_that_descends_takes_the_calculated_step():
     agent, rows = make_qrl(actor_loss="descend")
     disperse(agent.actor, scale=2)
     d, s = agent.quasimetric, states(agent, rows)
@@ -346,8 +346,8 @@ def test_iqe_mixes_maximum_and_mean_of_the_lengths_of_unions():
     torch.testing.assert_close(d(x, y).detach(), expected)
 
 
-def test_crl():
-    agent, rows = make_agent("crl", alpha=0.2, latent_size=16), make_rows()
+def test_crl_takes_the_calculated_step():
+    agent, rows = make_agent("crl"), make_rows()
     for net in (*agent.phi, *agent.psi):
         disperse(net, scale=1)
     disperse(agent.actor, scale=2)
@@ -358,7 +358,7 @@ def test_crl():
         x, y = phi(s, rows["action"]), psi(goal)
         for i in range(4):
             for j in range(4):
-                f = x[i] @ y[j] / 4  # the square root of the latent size
+                f = x[i] @ y[j] / math.sqrt(128)  # the size of both
                 own = 1 if i == j else -1
                 terms.append((1 + (-own * f).exp()).log())
     critic_loss = torch.stack(terms).mean()
@@ -369,12 +369,12 @@ def test_crl():
     goal = agent.normalizer.goal(rows["actor_goal"])
     f = torch.stack(
         [
-            (phi(s, mean.clamp(-1, 1)) * psi(goal)).sum(-1) / 4
+            (phi(s, mean.clamp(-1, 1)) * psi(goal)).sum(-1) / math.sqrt(128)
             for phi, psi in zip(agent.phi, agent.psi, strict=True)
         ]
     )
     log_prob = log_probs(mean, rows["action"])
-    actor_loss = ascent(f.amin(0), log_prob, alpha=0.2)
+    actor_loss = ascent(f.amin(0), log_prob, alpha=0.1)
     expected = {
         "critic_loss": trains(critic_loss, agent.phi, agent.psi),
         "actor_loss": trains(actor_loss, agent.actor),
