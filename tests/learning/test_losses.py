@@ -289,6 +289,7 @@ def test_crl_takes_the_calculated_step():
     state, _ = states(agent, rows)
     s, goal = state[:, : SPACES.observation_size], rows["desired_goal"]
     phi, psi = agent.phi(s, rows["action"]), agent.psi(agent.normalizer.goal(goal))
+    assert phi.shape == psi.shape == (8, 64)
     f = torch.stack([torch.stack([-(x - y).norm() for y in psi]) for x in phi])
     critic_loss = 0.0
     for i in range(8):

@@ -6,13 +6,15 @@ from tensordict import TensorDict
 
 import torch_panda
 from tests.learning.episodes import play_randomly
+from tests.learning.gradient_steps import SPACES
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.base import VALUE_GOALS, Batch
+from torch_panda.learning.offline.base import Batch
 from torch_panda.learning.offline.data import OfflineData
 from torch_panda.learning.spaces import read_spaces
 
-GOALS = {"value_goal": VALUE_GOALS, "actor_goal": "future"}
+MIXTURE = {"current": 0.2, "geometric": 0.5, "random": 0.3}  # OGBench's
+GOALS = {"value_goal": MIXTURE, "actor_goal": "future"}
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,36 @@ def test_rewards_are_those_of_the_value_goal(env, transitions):
     assert torch.equal(b.mask, 1 - reached.float())
     for key in ("observation", "action"):
         assert torch.equal(batch[key], transitions[key][batch["index"]])
+
+
+@pytest.mark.parametrize(
+    ("algo", "value_goal"),
+    [
+        ("gcbc", MIXTURE),
+        ("gcivl", MIXTURE),
+        ("gciql", MIXTURE),
+        ("hiql", MIXTURE),
+        ("qrl", "random"),
+        ("crl", "geometric"),
+    ],
+)
+def test_each_agent_draws_its_goals(algo, value_goal):
+    cls = OFFLINE_AGENTS[algo]
+    agent = cls(SPACES, cls.Hyperparameters(hidden_size=8))
+    expected = {"value_goal": value_goal, "actor_goal": "future"}
+    assert agent.goal_strategies == expected
+
+
+def test_geometric_goals_lie_ahead_by_the_horizon_of_the_discount(env):
+    """With a discount of 0.9, the mean number of steps is 0.9 / (1 - 0.9) = 9."""
+    episode, step = torch.zeros(10_000, dtype=torch.int64), torch.arange(10_000)
+    names = torch.stack([episode, step], -1).float()
+    named = named_transitions(env, episode, names, torch.zeros(10_000, 1))
+    data = OfflineData(named, env, {"value_goal": "geometric"}, discount=0.9)
+    torch.manual_seed(0)
+    batch = data.sample(5_000)
+    ahead = batch["value_goal"][:, 1] - batch["index"]
+    assert ahead.mean() == pytest.approx(9, abs=0.7)
 
 
 @pytest.mark.parametrize("actor_goal", ["future", "geometric"])
