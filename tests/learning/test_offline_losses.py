@@ -119,6 +119,7 @@ def test_gcbc_takes_the_calculated_step():
     loss = -log_probs(agent.actor.net(x), rows["action"]).mean()
     expected = {"actor_loss": trains(loss, agent.actor)}
     check_step(agent, lambda: agent.update(rows), expected)
+    assert agent.updates == 1
 
 
 def test_gcivl_takes_the_calculated_step():
