@@ -17,7 +17,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+import pytest
 import tomllib
+import torchrl.collectors
+import torchrl.data
+import torchrl.objectives  # noqa: F401 (for the forks)
 
 ROOT = Path(__file__).parent.parent
 COPIED = ("torch_panda", "transforms", "examples", "tests", "pyproject.toml")
@@ -45,37 +49,61 @@ def copy_checkout(folder: Path) -> None:
             shutil.copy(source, target)
 
 
+def run_tests(names: list[str], folder: Path, log: Path) -> int:
+    """Run tests of the copy in a forked process, and return pytest's exit code.
+
+    The fork has already imported the libraries, which takes several seconds. The
+    package itself is imported from the copy.
+    """
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    for name in [x for x in sys.modules if x.split(".")[0] == "tests"]:
+        del sys.modules[name]
+    os.chdir(folder)
+    sys.path.insert(0, str(folder))
+    sys.dont_write_bytecode = True
+    os.environ |= {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    code = 3
+    try:
+        options = ["-q", "-x", "-m", "", "-n", "0", "-p", "no:cacheprovider"]
+        code = int(pytest.main([*options, *names]))
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
 def mutate(mutation: dict[str, str], folder: Path) -> str:
     """Make one fault in the copy, run its test, and mend the fault again.
 
     Returns:
         "caught", or the reason why the entry is wrong.
     """
-    path = folder / mutation["file"]
+    path, log = folder / mutation["file"], folder / "log.txt"
     text = path.read_text()
     if text.count(mutation["old"]) != 1:
         return f"{text.count(mutation['old'])} places have the text `old`, need one"
-    env = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    build = [sys.executable, "-c", BUILD, "-q", "build_ext", "--inplace"]
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "", "-n", "0"]
     path.write_text(text.replace(mutation["old"], mutation["new"]))
     try:
-        if path.suffix in (".c", ".h"):
-            subprocess.run(build, cwd=folder, env=env, check=True, capture_output=True)
-        done = subprocess.run(
-            [*command, *mutation["caught_by"].split()],
-            cwd=folder,
-            env=env,
-            capture_output=True,
-            text=True,
-        )
+        build(path, folder)
+        code = run_tests(mutation["caught_by"].split(), folder, log)
     finally:
         path.write_text(text)
-        if path.suffix in (".c", ".h"):
-            subprocess.run(build, cwd=folder, env=env, check=True, capture_output=True)
-    if done.returncode == 1 and " failed" in done.stdout:
+        build(path, folder)
+    output = log.read_text()
+    if code == pytest.ExitCode.TESTS_FAILED and " failed" in output:
         return "caught"
-    return "SURVIVED" if done.returncode == 0 else done.stdout[-2000:] + done.stderr
+    return "SURVIVED" if code == pytest.ExitCode.OK else output[-2000:]
+
+
+def build(path: Path, folder: Path) -> None:
+    """Build the libraries of the copy, if a file in C has changed."""
+    if path.suffix in (".c", ".h"):
+        command = [sys.executable, "-c", BUILD, "-q", "build_ext", "--inplace"]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
 
 
 def main() -> None:
