@@ -422,7 +422,7 @@ def test_padded_rows_are_dropped(strategy, prepared):
     achieved = ("next", "achieved_goal")
     assert torch.equal(stored[achieved], real[achieved])
     if not prepared:
-        check_batch(rb.sample(), stored, strategy)
+        check_batch(rb.sample(), stored, strategy, her_ratio=1.0)
 
 
 def test_padded_rows_are_not_augmented():
@@ -430,7 +430,7 @@ def test_padded_rows_are_not_augmented():
     rb = buffer(HindsightAugment(reward_fn, k=1, strategy="final"))
     rb.extend(padded)
     stored = rb.storage[:]
-    check_batch(stored, stored, "final")
+    check_batch(stored, stored, "final", her_ratio=0.5)
     kept = stored["next", "achieved_goal"][~relabelled(stored)].tolist()
     ids, done = real["collector", "traj_ids"], real["next", "done"].squeeze(-1)
     ended = real[torch.isin(ids, ids[done])]
@@ -457,5 +457,5 @@ def test_split_trajectories_of_a_collector_are_relabelled():
         toy.make_env, frames_per_batch=60, total_frames=240, split_trajs=True
     ):
         rb.extend(data.reshape(-1))
-        check_batch(rb.sample(), rb.storage[:], "future")
+        check_batch(rb.sample(), rb.storage[:], "future", her_ratio=1.0)
     assert len(rb) == 240

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.transforms.identifiable import Envs, name_goals, reward_fn
+from tests.transforms.identifiable import Envs, check_share, name_goals, reward_fn
 from tests.transforms.pipelines import buffer
 from torch_panda.transforms import HindsightRelabel
 from torch_panda.transforms.strategies import NAMES
@@ -31,11 +31,6 @@ def sample(capacity, lengths, **options):
 def is_among(goals, others):
     """Which goals, (n, 3), are among others, (m, 3)."""
     return (goals[:, None] == others).all(-1).any(1)
-
-
-def is_near(mask, fraction):
-    error = (fraction * (1 - fraction) / len(mask)) ** 0.5
-    return abs(mask.float().mean() - fraction) <= 5 * error + 1e-6
 
 
 mixtures = st.dictionaries(
@@ -64,7 +59,7 @@ def test_mixtures_draw_allowed_goals_in_their_proportions(
     assert is_among(goal[is_achieved], held).all()
     assert is_among(goal[~is_achieved], stored["desired_goal"]).all()
     total = sum(weights.values())
-    assert is_near(is_achieved, her_ratio * (1 - weights.get("desired", 0) / total))
+    check_share(is_achieved, her_ratio * (1 - weights.get("desired", 0) / total))
     if "desired" not in weights:
         assert (goal == own)[~is_achieved].all()
     if "random" not in weights:
@@ -92,7 +87,7 @@ def test_parts_are_kept_or_achieved_at_allowed_steps(
     for part in torch.arange(3).split(parts):
         is_new = (goal[:, part] != own[:, part]).all(1)
         assert (goal[:, part] == own[:, part])[~is_new].all()
-        assert is_near(is_new, her_ratio)
+        check_share(is_new, her_ratio)
         masks.append(is_new)
     for column in (0, 1):  # of the same environment and episode
         new = goal[:, column] != own[:, column]
@@ -108,7 +103,7 @@ def test_parts_are_kept_or_achieved_at_allowed_steps(
         source[:, 2] += 1
         assert not is_among(source, held).any()
     if len(masks) > 1:  # independently
-        assert is_near(masks[0] & masks[1], her_ratio**2)
+        check_share(masks[0] & masks[1], her_ratio**2)
 
 
 def test_a_mixture_may_hold_a_users_own_strategy():
@@ -119,7 +114,7 @@ def test_a_mixture_may_hold_a_users_own_strategy():
     goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
     is_achieved = goal[:, 2] > 0
     assert (goal == achieved)[is_achieved].all()
-    assert is_near(is_achieved, 0.4)
+    check_share(is_achieved, 0.4)
 
 
 @pytest.mark.parametrize("key", ["desired_goal", ("next", "achieved_goal")])
