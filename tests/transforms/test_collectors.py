@@ -44,9 +44,9 @@ def check(make_collector, frames, batches, *, ndim=1, **options):
 
 
 @pytest.mark.parametrize("reset_at_each_iter", [True, False])
-@pytest.mark.parametrize(("ndim", "steps"), [(1, 1), (1, 5), (2, 5), (2, 17)])
+@pytest.mark.parametrize(("ndim", "steps"), [(1, 1), (1, 5), (2, 17)])
 def test_batches_of_a_single_process_are_relabelled(ndim, steps, reset_at_each_iter):
-    check(SINGLE, 3 * steps, 40, ndim=ndim, reset_at_each_iter=reset_at_each_iter)
+    check(SINGLE, 3 * steps, 20, ndim=ndim, reset_at_each_iter=reset_at_each_iter)
 
 
 @pytest.mark.parametrize(

@@ -95,27 +95,6 @@ def test_from_env_of_another_environment_raises(hindsight):
     hindsight.from_env(toy.make_env(), **options, terminated_fn=None)
 
 
-@pytest.mark.parametrize(
-    ("hindsight", "options", "message"),
-    [
-        (HindsightRelabel, {"k": 4}, "use her_ratio=0.8; accepted are reward_fn"),
-        (HindsightRelabel, {"n_sampled_goal": 1}, "use her_ratio=0.5"),
-        (HindsightRelabel, {"goal_selection_strategy": "final"}, "strategy='final'"),
-        (HindsightRelabel, {"stategy": "final"}, "use strategy; .*goal_parts"),
-        (HindsightAugment, {"her_ratio": 0.8}, "use k=4; .*, trajectory_key"),
-        (HindsightAugment, {"xyz": 0}, "no argument 'xyz'; accepted are reward_fn, k"),
-    ],
-)
-def test_unknown_arguments_are_refused_with_the_right_ones(hindsight, options, message):
-    env = make("PandaReach-v1", None)
-    for make_transform in (
-        lambda: hindsight(reward_fn, **options),
-        lambda: hindsight.from_env(env, **options),
-    ):
-        with pytest.raises(TypeError, match=message):
-            make_transform()
-
-
 @pytest.mark.parametrize("with_success", [True, False])
 def test_an_end_for_another_reason_stays(with_success):
     def reached(achieved, desired):
@@ -160,7 +139,6 @@ def test_an_ensemble_of_buffers_is_relabelled(strategy):
             own = member.storage[:]["desired_goal"]
             is_old = (batch["desired_goal"][:, None] == own).all(-1).any(1)
             assert is_old.float().mean() < 0.1
-    assert [transform._memory.oldest for transform in transforms] == [0, 0]
 
 
 def test_rows_of_another_transform_in_an_ensemble_are_refused():
@@ -257,6 +235,13 @@ def test_data_with_time_first_are_refused():
     rb.extend(torch.stack(steps, dim=1))
 
 
+def test_replacing_rows_is_refused():
+    rb, data = buffer(HindsightRelabel(reward_fn)), Envs(2, [4]).chunk(8).reshape(-1)
+    rb.extend(data)
+    with pytest.raises(RuntimeError, match=r"replacing.*use extend"):
+        rb[2:4] = data[:2]
+
+
 def test_adding_several_steps_as_one_is_refused():
     rb = buffer(HindsightRelabel(reward_fn))
     message = r"add\(\).*\[16\].*call extend\(\).*extend_buffer"
@@ -279,7 +264,7 @@ def test_a_transform_that_moves_to_another_buffer_goes_by_that_one():
     second = buffer(chain, ndim=2)
     envs = Envs(3, [5], first_env=10)
     chain[0].empty()
-    for _ in range(400):  # the second is written over
+    for _ in range(200):  # the second is written over
         second.extend(envs.chunk(2))
     check_batch(second.sample(), second.storage[:].reshape(-1), "episode")
     with pytest.raises(RuntimeError, match="ndim=1"):

@@ -177,45 +177,6 @@ def test_a_users_strategy_with_wrong_steps_raises(strategy, message):
         rb.sample()
 
 
-BAD_VALUES = [
-    *((HindsightRelabel, {"her_ratio": x}, "her_ratio must be with") for x in (-1, 2)),
-    *(
-        (HindsightRelabel, {"capacity": x}, "capacity must be a positive integer")
-        for x in (0, 1.5, float("inf"))
-    ),
-    *(
-        (HindsightRelabel, {"goal_parts": x}, "goal_parts must be positive sizes")
-        for x in ((), (0, 3))
-    ),
-    (HindsightRelabel, {"unit": "episode"}, 'unit must be "row" or "slice"'),
-    *(
-        (HindsightRelabel, {"strategy": x}, "strategy must be one of.*got")
-        for x in ("past", None, 3, {"past": 1})
-    ),
-    *(
-        (HindsightRelabel, {"strategy": x}, "strategy must")
-        for x in ({}, {"future": 0.0}, {"future": -1}, {"final": 1e999})
-    ),
-    (HindsightRelabel, {"discount": -0.1}, "discount must be within"),
-    *((HindsightAugment, {"k": x}, "k must be an integer") for x in (0, 1.5)),
-    *(
-        (HindsightAugment, {"strategy": x}, "one episode at a time")
-        for x in ("random", "desired", {"future": 1, "desired": 1})
-    ),
-]
-
-
-@pytest.mark.parametrize(("hindsight", "options", "message"), BAD_VALUES)
-def test_bad_options_of_hindsight_are_refused(hindsight, options, message):
-    with pytest.raises(ValueError, match=message):
-        hindsight(reward_fn, **options)
-
-
-def test_reward_fn_must_be_a_function():
-    with pytest.raises(ValueError, match="reward_fn must be a function, got None"):
-        HindsightRelabel(None)
-
-
 @pytest.mark.parametrize(
     ("values", "got"),
     [(lambda achieved, desired: torch.zeros(8), r"\(8,\)"), (lambda *_: 0.0, "float")],
@@ -445,7 +406,7 @@ def test_slices_share_a_goal(strategy, strict):
     )
     envs = Envs(1, [4, 9, 16])
     share = []
-    for _ in range(60):
+    for _ in range(30):
         rb.extend(envs.chunk(16).reshape(-1))
         batch = rb.sample()
         check_batch(batch, rb.storage[:], strategy, her_ratio=None)
@@ -475,7 +436,9 @@ def test_padded_slices_share_a_goal():
     envs = Envs(1, [2, 9])
     for _ in range(10):
         rb.extend(envs.chunk(20).reshape(-1))
-        pieces = rb.sample()["desired_goal"].view(10, 6, 3)
+        batch = rb.sample()
+        assert relabelled(batch).all()
+        pieces = batch["desired_goal"].view(10, 6, 3)
         assert (pieces == pieces[:, :1]).all()
 
 
@@ -545,11 +508,11 @@ def test_relabelling_changes_no_draw_of_a_prioritized_sampler():
 def test_prefetched_goals_are_right_while_another_thread_writes():
     rb = buffer(HindsightRelabel(reward_fn), capacity=100, prefetch=3)
     envs = Envs(3, [5, 9, 30])
-    failures = []
+    failures, count = [], 0
 
     def write():
         try:
-            for _ in range(200):
+            for _ in range(100):
                 rb.extend(envs.chunk(3).reshape(-1))
         except Exception as error:
             failures.append(error)
@@ -559,11 +522,13 @@ def test_prefetched_goals_are_right_while_another_thread_writes():
     writer.start()
     while writer.is_alive():
         batch = rb.sample()
+        count += int(relabelled(batch).sum())
         assert not is_mixed(batch).any()
         goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
         assert (goal[:, 2] >= achieved[:, 2])[relabelled(batch)].all()
     writer.join()
     assert not failures
+    assert count
     rb.shutdown()
 
 
@@ -724,7 +689,7 @@ def test_relabelling_ignores_the_default_device(seed, layout):
     data = Envs(3, [5]).chunk(10)
     data = flatten(data, layout)
     with torch.device("meta"):
-        batch = transform.forward(transform._inv_call(data))
+        batch = transform(transform.inv(data))
     assert relabelled(batch).any()
     assert not is_mixed(batch).any()
 

@@ -84,7 +84,10 @@ def test_desired_goals_keep_their_precision(achieved_type):
     data["next", "reward"] = distance_reward(*goals)
     rb = buffer(HindsightRelabel(distance_reward, strategy="desired"))
     rb.extend(data)
-    assert torch.isin(rb.sample()["desired_goal"], data["desired_goal"]).all()
+    batch = rb.sample()
+    assert torch.isin(batch["desired_goal"], data["desired_goal"]).all()
+    own = data["desired_goal"][batch["index"]]
+    assert (batch["desired_goal"] != own).any()
 
 
 @BOTH
@@ -95,5 +98,7 @@ def test_a_learned_reward_gets_no_gradient(hindsight):
     with pytest.warns(UserWarning, match="other rewards"):
         rb.extend(play())
     for _ in range(2):
-        (scale - rb.sample()["next", "reward"]).square().mean().backward()
+        batch = rb.sample()
+        assert (batch["desired_goal"][:, 2] > 0).any()
+        (scale - batch["next", "reward"]).square().mean().backward()
     assert network.weight.grad is None

@@ -1,0 +1,71 @@
+"""Options that the transforms do not accept, with the error that each raises."""
+
+import pytest
+
+from tests.transforms.identifiable import reward_fn
+from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
+
+
+def relabel(**options):
+    return HindsightRelabel(**{"reward_fn": reward_fn, **options})
+
+
+def augment(**options):
+    return HindsightAugment(reward_fn, **options)
+
+
+def sample(strategies=(("goal", "future"),), **options):
+    if isinstance(strategies, tuple):
+        strategies = dict(strategies)
+    return GoalSampler(strategies, reward_fn, **options)
+
+
+BAD_VALUES = [
+    (relabel, {"reward_fn": None}, "reward_fn must be a function, got None"),
+    (relabel, {"her_ratio": -1}, "her_ratio must be within"),
+    (relabel, {"her_ratio": 2}, "her_ratio must be within"),
+    (relabel, {"capacity": 0}, "capacity must be a positive integer"),
+    (relabel, {"capacity": 1.5}, "capacity must be a positive integer"),
+    (relabel, {"capacity": float("inf")}, "capacity must be a positive integer"),
+    (relabel, {"goal_parts": ()}, "goal_parts must be positive sizes"),
+    (relabel, {"goal_parts": (0, 3)}, "goal_parts must be positive sizes"),
+    (relabel, {"unit": "episode"}, 'unit must be "row" or "slice"'),
+    (relabel, {"strategy": "past"}, "strategy must be one of.*got 'past'"),
+    (relabel, {"strategy": None}, "strategy must be one of.*got None"),
+    (relabel, {"strategy": {"past": 1}}, "strategy must be one of.*got 'past'"),
+    (relabel, {"strategy": {}}, "strategy must be one of"),
+    (relabel, {"strategy": {"future": 0.0}}, "strategy must have positive, finite"),
+    (relabel, {"strategy": {"future": 1e999}}, "strategy must have positive, finite"),
+    (relabel, {"discount": -0.1}, "discount must be within"),
+    (augment, {"k": 0}, "k must be an integer"),
+    (augment, {"strategy": "random"}, "one episode at a time"),
+    (sample, {"strategies": {}}, "strategies must map keys"),
+    (sample, {"strategies": "future"}, "strategies must map keys.*'future'"),
+    (sample, {"strategies": {"goal": "past"}}, "strategy must be one of.*'past'"),
+    (sample, {"strategies": {"achieved_goal": "future"}}, "must not replace 'achieved"),
+]
+UNKNOWN = [
+    (relabel, {"k": 4}, "HindsightRelabel has no argument 'k'; use her_ratio=0.8; "),
+    (relabel, {"n_sampled_goal": 1}, "use her_ratio=0.5; accepted are reward_fn"),
+    (relabel, {"goal_selection_strategy": "final"}, "use strategy='final'"),
+    (relabel, {"stategy": "final"}, "use strategy; .*goal_parts"),
+    (augment, {"her_ratio": 0.8}, "use k=4; .*, trajectory_key"),
+    (sample, {"strategy": "future"}, "'strategy'; pass strategies, one for each key"),
+    (sample, {"her_ratio": 0.8}, "'her_ratio'; accepted are strategies, reward_fn"),
+    (sample, {"goal_selection_strategy": "final"}, "use strategies; accepted"),
+]
+CASES = [
+    *((*case, ValueError) for case in BAD_VALUES),
+    *((*case, TypeError) for case in UNKNOWN),
+]
+
+
+@pytest.mark.parametrize(("make", "options", "message", "error"), CASES)
+def test_options_that_are_not_accepted_raise(make, options, message, error):
+    with pytest.raises(error, match=message):
+        make(**options)
+
+
+def test_from_env_needs_the_strategies_of_a_goal_sampler():
+    with pytest.raises(TypeError, match=r"missing .* argument: 'strategies'"):
+        GoalSampler.from_env(None)
