@@ -21,7 +21,7 @@ from tests.transforms.identifiable import (
     reward_fn,
     terminated_fn,
 )
-from tests.transforms.pipelines import buffer
+from tests.transforms.pipelines import PHASES, buffer
 from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
 from torch_panda.transforms.strategies import NAMES
 
@@ -38,7 +38,12 @@ def check_sample(batch, stored):
     assert torch.equal(batch["next", "reward"], reward_fn(achieved, first))
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=15,
+    deadline=None,
+    phases=PHASES,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 @given(
     num_envs=st.integers(1, 5),
     lengths=st.lists(st.integers(1, 30), min_size=1, max_size=3),

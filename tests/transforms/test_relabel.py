@@ -34,7 +34,7 @@ from tests.transforms.identifiable import (
     reward_fn,
     terminated_fn,
 )
-from tests.transforms.pipelines import buffer
+from tests.transforms.pipelines import PHASES, buffer
 from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 STRATEGIES = ["future", "final", "episode", "random"]
@@ -60,7 +60,12 @@ def is_mixed(batch):
     return relabelled(batch) & other.any(-1)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=60,
+    deadline=None,
+    phases=PHASES,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 @given(
     num_envs=st.integers(1, 7),
     lengths=st.lists(st.integers(1, 30), min_size=1, max_size=4),

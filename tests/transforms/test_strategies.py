@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.transforms.identifiable import Envs, check_share, name_goals, reward_fn
-from tests.transforms.pipelines import buffer
+from tests.transforms.pipelines import PHASES, buffer
 from torch_panda.transforms import HindsightRelabel
 from torch_panda.transforms.strategies import NAMES
 
@@ -43,7 +43,7 @@ layouts = {
 }
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, phases=PHASES)
 @given(weights=mixtures, **layouts)
 def test_mixtures_draw_allowed_goals_in_their_proportions(
     weights, capacity, lengths, her_ratio
@@ -69,7 +69,7 @@ def test_mixtures_draw_allowed_goals_in_their_proportions(
             assert (goal[:, 2] >= achieved[:, 2])[is_achieved].all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, phases=PHASES)
 @given(
     parts=st.sampled_from([(3,), (1, 2), (2, 1), (1, 1, 1)]),
     strategy=st.sampled_from(["future", "final", "episode"]),
