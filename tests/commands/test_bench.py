@@ -1,5 +1,7 @@
 """The benchmark command, run in small."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from torch_panda.__main__ import main
@@ -12,6 +14,7 @@ def table_rows(output):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
+@pytest.mark.slow
 def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
     picture = tmp_path / "speed.png"
     options = ["--num-envs", "2", "1", "--num-threads", "2", "--rounds", "2"]
@@ -27,7 +30,13 @@ def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", bench.CONTENDERS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("sb3", "parallel")))
+        for name in bench.CONTENDERS
+    ],
+)
 def test_every_installed_contender_can_step(name):
     if name == "bare-bullet" and LIBRARY is None:
         pytest.skip("the native loop was not compiled")
@@ -38,6 +47,27 @@ def test_every_installed_contender_can_step(name):
         pytest.skip(str(error))
     contender.step()
     contender.close()
+
+
+def test_a_measurement_counts_the_steps_of_all_environments(monkeypatch):
+    now = 0.0  # time in seconds, which only `make` and `step` spend
+
+    def spend(seconds):
+        nonlocal now
+        now += seconds
+
+    def make(setting):
+        spend(2.0)
+        return bench.Environments(lambda: spend(0.5), lambda: None)
+
+    clock = SimpleNamespace(perf_counter=lambda: now)
+    monkeypatch.setattr(bench, "time", clock)
+    monkeypatch.setattr(bench, "_cpu_time", lambda: 2 * now)
+    monkeypatch.setattr(bench, "_memory", lambda: 10 * now)
+    monkeypatch.setattr(bench.os, "dup2", lambda *files: None)
+    monkeypatch.setitem(bench.CONTENDERS, "fake", bench.Contender("fake", make))
+    measured = bench._measure_here("fake", bench.Setting("PandaPush-v3", 4, 1), steps=5)
+    assert measured == bench.Measurement(4 / 0.5, 4 / 1.0, 2.0 / 4, 20.0 / 4)
 
 
 def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
@@ -67,24 +97,9 @@ def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
     assert "interrupted" in output
 
 
+@pytest.mark.slow
 def test_bench_compares_buffers_with_and_without_hindsight(capsys):
     print(bench.compare_buffers(rounds=1, capacity=2000))
     rows = table_rows(capsys.readouterr().out)
     assert [row[0] for row in rows] == ["plain", "with HindsightRelabel"]
     assert all(float(row[1].partition(" ")[0]) > 0 for row in rows)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--ids", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
-        (["--num-envs", "4", "0"], "num_envs must be positive, got "),
-        (["--plot", "/dev/null/speed.png"], "File exists"),
-        (["--plot", "speed.png", "--buffers"], "plot does not work with buffers"),
-        (["--plot", "speed.xyz"], "plot must end in one of .*, got 'speed.xyz'"),
-    ],
-)
-def test_wrong_options_of_bench_are_refused(monkeypatch, options, message):
-    monkeypatch.setattr(bench, "measure", pytest.fail)
-    with pytest.raises(SystemExit, match=message):
-        main(["bench", *options])

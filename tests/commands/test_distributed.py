@@ -9,6 +9,7 @@ from torch_panda.commands import plot
 from torch_panda.learning import curve
 from torch_panda.learning.exploration import WARM_UP
 
+pytestmark = pytest.mark.slow
 ray = pytest.importorskip("ray")
 distributed = pytest.importorskip("torch_panda.commands.distributed")
 

@@ -32,9 +32,9 @@ def runs(tmp_path):
 
 @pytest.fixture
 def figures(monkeypatch):
-    """The figures that are written."""
-    drawn, save = [], plots.save
-    monkeypatch.setattr(plots, "save", lambda x, path: drawn.append(x) or save(x, path))
+    """The figures that would be written."""
+    drawn = []
+    monkeypatch.setattr(plots, "save", lambda figure, path: drawn.append(figure))
     return drawn
 
 
@@ -49,13 +49,17 @@ def figures(monkeypatch):
 def test_every_metric_is_drawn_inside_its_axes(
     runs, tmp_path, figures, metric, label, shown
 ):
-    plot.main(plot.Args(runs=[runs], metric=metric, out=tmp_path / "new" / "curves"))
-    assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    plot.main(plot.Args(runs=[runs], metric=metric, out=tmp_path / "curves.png"))
     (axes,) = figures[0].axes
     assert axes.get_ylabel() == label
     low, high = axes.get_ylim()
     assert low < shown < high
     assert axes.lines[0].get_ydata().tolist() == [shown]
+
+
+def test_a_picture_gets_an_ending_and_a_folder(runs, tmp_path):
+    plot.main(plot.Args(runs=[runs], out=tmp_path / "new" / "curves"))
+    assert (tmp_path / "new" / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 def lines_of(axes):
@@ -120,6 +124,7 @@ def test_algorithms_share_a_panel_where_they_fit(tmp_path, figures):
     ]
     titles = [axes.get_title() for axes in others]
     assert titles == ["PandaReach-v1", "PandaSlide-v1", "PandaStack-v1"]
+    figures[0].draw_without_rendering()  # places the panels
     rows = {round(axes.get_position().y0, 2) for axes in figures[0].axes}
     assert len(rows) == 2  # three panels are side by side
 
@@ -146,6 +151,7 @@ def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
     for task in ("Reach", "Slide"):
         write_run(tmp_path / task, Args(env_id=f"Panda{task}-v1"))
     plot.main(plot.Args(runs=[tmp_path], out=tmp_path / "curves.png"))
+    figures[0].draw_without_rendering()  # places the panels
     assert all(axes.get_position().width > 0.2 for axes in figures[0].axes)
     (label,) = lines_of(figures[0].axes[0])
     assert "gamma 0.9" in label
@@ -194,9 +200,7 @@ def test_a_folder_without_options_is_left_out(runs, tmp_path, figures):
     assert lines_of(axes) == ["DDPG, paper (1 seed)"]
 
 
-def test_missing_runs_and_an_unwritable_place_are_refused(runs, tmp_path):
-    with pytest.raises(SystemExit, match="there is no run below nowhere: a run is"):
-        plot.main(plot.Args(runs=[Path("nowhere")], out=tmp_path / "curves.png"))
+def test_an_unwritable_place_is_refused(runs, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(SystemExit, match=r"^cannot draw: \[Errno"):
         plot.main(plot.Args(runs=[runs], out=tmp_path / "file" / "curves.png"))

@@ -6,7 +6,6 @@ from tensordict import TensorDict
 
 from torch_panda.commands import record as record_demos
 from torch_panda.experts import make_expert
-from torch_panda.learning.evaluation import wilson_interval
 
 
 def test_every_episode_has_its_number(tmp_path, capsys):
@@ -41,21 +40,3 @@ def test_options_of_the_task_can_be_changed(tmp_path, capsys):
     args.task_options = {"threshold": 1.0}
     with pytest.raises(SystemExit, match=r"accepted are .*distance_threshold"):
         record_demos.main(args)
-    args.task_options, args.format = {"distance_threshold": 0.5}, "minari"
-    with pytest.raises(SystemExit, match="task_options do not work with the format"):
-        record_demos.main(args)
-
-
-@pytest.mark.parametrize("format", ["minari", "lerobot"])
-def test_seeds_that_a_format_cannot_store_are_refused(tmp_path, format):
-    args = record_demos.Args("PandaReach-v1", 2, 2**63 - 1, format=format)
-    with pytest.raises(SystemExit, match=rf"must be below 2\*\*63, .* {2**63}$"):
-        record_demos.main(args)
-    record_demos.check(record_demos.Args("PandaReach-v1", 1, 2**63 - 1, format=format))
-
-
-def test_the_wilson_interval_is_that_of_the_textbook():
-    # The textbook value for 8 of 10.
-    low, high = wilson_interval(8, 10)
-    assert low == pytest.approx(0.490, abs=1e-3)
-    assert high == pytest.approx(0.943, abs=1e-3)

@@ -33,23 +33,6 @@ def test_a_video_shows_every_step(tmp_path, monkeypatch, policy):
     assert solved.all() == (policy == "expert")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"policy": "nothing"}, "no policy 'nothing': pass the folder of a run"),
-        ({"env_id": "PandaFly-v1"}, "unknown environment id 'PandaFly-v1'"),
-        ({"human": True, "web": True}, "human and web .*: pass one of them"),
-        ({"out": "watch.txt"}, "must end in .mp4 or .gif, got 'watch.txt'"),
-        ({"env_id": "PandaPushJoints-v1"}, "no expert for 'PandaPushJoints-v1'"),
-    ],
-)
-def test_bad_options_of_watch_are_refused(tmp_path, arguments, message):
-    if "out" in arguments:
-        arguments["out"] = tmp_path / arguments["out"]
-    with pytest.raises(SystemExit, match=message):
-        watch.main(watch.Args(**arguments))
-
-
 @pytest.fixture
 def screen(tmp_path):
     """A virtual display: its name, and what it shows as (height, width, 4) bytes."""

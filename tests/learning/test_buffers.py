@@ -60,7 +60,13 @@ def test_most_episodes_in_which_nothing_moved_are_left_out(stack):
     kept = [len(select_sequences(data.clone(), 0.25)) for _ in range(200)]
     assert abs(sum(kept) / 200 - (1 + 3 / 4)) < 0.2
     assert len(select_sequences(data, 1.0)) == 4
-    assert data["next", "done"][:, -1].all()
+
+
+def test_episodes_that_are_cut_end_with_their_sequence(stack):
+    data = play_randomly(stack)[:, :3]
+    assert not data["next", "done"].any()
+    done = select_sequences(data, 1.0)["next", "done"].squeeze(-1)
+    assert done.tolist() == [[False, False, True]] * 4
 
 
 def test_a_movement_in_short_episodes_is_found(stack):

@@ -11,7 +11,7 @@ from torch_panda import evaluation_tasks
 from torch_panda.learning.evaluation_tasks import _CHOSEN, QUANTILES
 
 
-@pytest.mark.parametrize("env_id", PHYSICS_IDS[::4])
+@pytest.mark.parametrize("env_id", PHYSICS_IDS[::8])
 def test_an_environment_starts_from_each_task(env_id):
     tasks = evaluation_tasks(env_id)
     assert list(tasks) == list(QUANTILES)
@@ -24,6 +24,20 @@ def test_an_environment_starts_from_each_task(env_id):
             distances.append(float(env.task.distance(*goals)))
     assert distances == pytest.approx(sorted(distances), abs=1e-6)
     assert distances[0] < distances[-1]
+
+
+def test_the_tasks_are_quantiles_of_the_distances_of_random_starts():
+    """The fixture `few_starts` lets 11 starts suffice."""
+    names = ["very_near", "near", "medium", "far", "very_far"]
+    with torch_panda.make("PandaReach-v1", num_envs=11, seed=0) as env:
+        start = env.reset()
+    offset = start["achieved_goal"] - start["desired_goal"]
+    order = offset.norm(dim=1).argsort()
+    expected = start["desired_goal"][order[[0, 2, 5, 8, 10]]]
+    tasks = evaluation_tasks("PandaReach-v1")
+    assert list(tasks) == names
+    for name, goal in zip(names, expected, strict=True):
+        assert torch.equal(tasks[name]["desired_goal"].float(), goal)
 
 
 def test_the_tasks_are_always_the_same():

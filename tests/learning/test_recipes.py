@@ -27,7 +27,7 @@ PRESETS = ("tuned", "sample-efficient")
 PANDA = [
     env_id
     for env_id in torch_panda.ENV_IDS
-    if re.fullmatch("Panda.*?-v[13]", env_id) and not re.search("Joints|Dense", env_id)
+    if env_id.startswith("Panda") and not re.search("Joints|Dense", env_id)
 ]
 
 

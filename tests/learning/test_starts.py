@@ -29,7 +29,9 @@ def start_in(states, env):
     return env.reset(states[: env.num_envs].exclude("first_to_goal"), set_state=True)
 
 
-@pytest.mark.parametrize("task", ["Push", "Slide"])
+@pytest.mark.parametrize(
+    "task", ["Push", pytest.param("Slide", marks=pytest.mark.slow)]
+)
 def test_the_hand_starts_beside_an_object_at_rest(task):
     states = make_states(task)
     assert len(states) >= 12
@@ -45,7 +47,10 @@ def test_the_hand_starts_beside_an_object_at_rest(task):
     torch.testing.assert_close(still, td["achieved_goal"], atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize(("task", "number"), [("PickAndPlace", 1), ("Stack", 2)])
+@pytest.mark.parametrize(
+    ("task", "number"),
+    [pytest.param("PickAndPlace", 1, marks=pytest.mark.slow), ("Stack", 2)],
+)
 def test_the_hand_starts_holding_an_object(task, number):
     states = make_states(task)
     assert len(states) >= 12

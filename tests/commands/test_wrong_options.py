@@ -1,0 +1,81 @@
+"""Wrong options end a command with one line, before it writes anything."""
+
+import pytest
+
+from torch_panda.commands import main
+
+DATA = ["--kind", "noisy", "--out", "data.pt"]
+DEMOS = ["--demos", "nofile.pt"]
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "message"),
+    [
+        ("train", ["--env-id", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
+        ("train", ["--resume"], "there is no run to resume"),
+        ("train", ["--total-steps", "0"], "total_steps must be positive"),
+        ("train", DEMOS, r"there is no file or folder nofile\.pt: "),
+        ("train", ["--pretrain-updates", "9"], "needs demonstrations: pass --demos"),
+        ("train", [*DEMOS, "--batch-size", "3"], "must be at least 4 with demos"),
+        (
+            "train",
+            ["--noise-eps", "0", "--random-eps", "0", "0"],
+            "algo ddpg explores by noise_eps and random_eps",
+        ),
+        (
+            "train",
+            ["--algo", "crl", "--her", "relabel"],
+            "--her geometric --desired-ratio 0",
+        ),
+        ("train", ["--algo", "crl", *DEMOS], "algo crl cannot use demonstrations"),
+        ("train", ["--her", "parts"], "--her parts needs goals of several objects"),
+        ("train", ["--start-at-object", "0.5"], "needs end-effector control"),
+        ("train", ["--out", "/dev/null"], "out must be a folder, got the file"),
+        ("train", ["--import", "no.py"], r"cannot import the file no\.py: .*No such"),
+        ("evaluate", ["nothing"], "no policy 'nothing': pass the folder of a run"),
+        (
+            "evaluate",
+            ["PandaReach-v1", "--env-id", "PandaPush-v1", "--episodes", "1"],
+            "where observation has size 6, got 18",
+        ),
+        ("evaluate", ["run", "--import", "no"], "'no': there is no such module; --imp"),
+        ("watch", ["--env-id", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
+        ("watch", ["--human", "--web"], "human and web .*: pass one of them"),
+        ("watch", ["--out", "a.txt"], r"must end in \.mp4 or \.gif, got 'a\.txt'"),
+        ("watch", ["--env-id", "PandaPushJoints-v1"], "no expert for 'PandaPushJoints"),
+        ("record", [*DATA, "--episodes", "3"], "do not work with the kind noisy"),
+        ("record", [*DATA, "--noise-eps", "0.1"], "episodes and noise_eps do not work"),
+        ("record", DATA[:2], "needs a file or name to write"),
+        ("record", ["--transitions", "9"], "transitions and resume do not work with"),
+        ("record", [*DATA, "--env-id", "KukaReach-v1"], "no expert for"),
+        (
+            "record",
+            ["--format", "minari", "--seed", str(2**63 - 1)],
+            r"must be below 2\*\*63",
+        ),
+        (
+            "record",
+            ["--format", "minari", "--task-options", "distance_threshold", "0.5"],
+            "task_options do not work with the format minari",
+        ),
+        ("bench", ["--ids", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
+        ("bench", ["--num-envs", "4", "0"], "num_envs must be positive, got "),
+        ("bench", ["--plot", "/dev/null/speed.png"], "File exists"),
+        ("bench", ["--plot", "a.png", "--buffers"], "plot does not work with buffers"),
+        ("bench", ["--plot", "a.xyz"], "plot must end in one of .*, got 'a.xyz'"),
+        ("refine", ["missing.pt", "--out", "new"], "there is no file"),
+        (
+            "refine",
+            ["missing.pt", "--out", "new", "--updates", "0"],
+            "updates must be positive",
+        ),
+        ("plot", ["nowhere"], "there is no run below nowhere: a run is"),
+        ("trian", [], r"unknown command 'trian'(.|\n)*evaluate"),
+    ],
+)
+def test_wrong_options_are_refused(tmp_path, monkeypatch, command, options, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message) as stop:
+        main([command, *options])
+    assert command == "trian" or "\n" not in str(stop.value)
+    assert list(tmp_path.iterdir()) == []
