@@ -8,6 +8,7 @@ DATA = ["--kind", "noisy", "--out", "data.pt"]
 DEMOS = ["--demos", "nofile.pt"]
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     ("command", "options", "message"),
     [
