@@ -4,7 +4,7 @@ import math
 import operator
 import os
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
 import torch
@@ -58,15 +58,52 @@ def check_seed(seed: int) -> int:
     return number
 
 
-def check_not_negative(**values: float | None) -> None:
-    """Check that arguments are finite numbers of at least 0, or None.
+def check_finite(**values: float) -> None:
+    """Check that arguments are finite numbers.
 
     Raises:
-        ValueError: An argument is negative or not finite.
+        ValueError: An argument is not finite.
+        TypeError: An argument is not a number.
     """
+    _check_numbers(values, lambda value: True, "finite")
+
+
+def check_not_negative(**values: float) -> None:
+    """Check that arguments are finite and at least 0; see `check_finite`."""
+    _check_numbers(values, lambda value: value >= 0, "finite and at least 0")
+
+
+def check_above_zero(**values: float) -> None:
+    """Check that arguments are finite and above 0; see `check_finite`."""
+    _check_numbers(values, lambda value: value > 0, "finite and above 0")
+
+
+def _check_numbers(
+    values: Mapping[str, float], is_valid: Callable[[float], bool], requirement: str
+) -> None:
+    """Check numbers, given by the names of the arguments."""
     for name, value in values.items():
-        if value is not None and not 0 <= value < math.inf:
-            raise ValueError(f"{name} must be finite and at least 0, got {value}")
+        try:
+            accepted = math.isfinite(value) and is_valid(value)
+        except (TypeError, ValueError):  # a tensor of several numbers: ValueError
+            raise TypeError(f"{name} must be a number, got {value!r}") from None
+        if not accepted:
+            raise ValueError(f"{name} must be {requirement}, got {value}")
+
+
+def check_vector(name: str, values: Sequence[float]) -> tuple[float, float, float]:
+    """Return three finite numbers, such as a position, as floats.
+
+    Raises:
+        ValueError: The values are not three, or one is not a finite number.
+    """
+    try:
+        x, y, z = (float(value) for value in values if not isinstance(value, str))
+    except (TypeError, ValueError):
+        x, y, z = math.nan, math.nan, math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ValueError(f"{name} must be three finite numbers, got {values!r}")
+    return x, y, z
 
 
 def check_range(name: str, value: Sequence[float]) -> None:

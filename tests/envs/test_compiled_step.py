@@ -1,7 +1,5 @@
 """Setpoints, observations, success and reward from C equal those from torch."""
 
-import math
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -111,7 +109,7 @@ def test_distances_near_the_threshold_are_left_to_torch():
         assert 0.3 < successes / (200 * 64) < 0.7
 
 
-@pytest.mark.parametrize("threshold", [0.0, 1e-30, 0.04, 1.0, 1e30, math.inf])
+@pytest.mark.parametrize("threshold", [0.0, 1e-30, 0.04, 1.0, 1e30])
 def test_success_follows_a_threshold_of_any_size_that_changes_later(threshold):
     with torch_panda.make("PandaPush-v3", num_envs=N, seed=0) as env:
         env.task.distance_threshold = threshold

@@ -360,39 +360,6 @@ def test_reward_functions_pickle_without_the_simulator(env):
     assert success(*goals).all()
 
 
-@pytest.mark.parametrize(
-    "name", ["max_episode_steps", "terminate_on_success", "on_divergence"]
-)
-def test_a_change_without_effect_is_refused(env, name):
-    with pytest.raises(AttributeError, match=name):
-        setattr(env, name, 5)
-
-
-@pytest.mark.parametrize(
-    ("part", "name", "value"),
-    [
-        ("task", "object_mass", 5.0),
-        ("task", "table_friction", 0.2),
-        ("robot", "finger_friction", 2.0),
-        ("robot", "base_position", (0.0, 0.0, 0.0)),
-        ("robot", "workspace", ((0.0,) * 3, (1.0,) * 3)),
-    ],
-)
-def test_a_changed_option_of_a_built_scene_is_refused(part, name, value):
-    with torch_panda.make("PandaPush-v1") as env:
-        owner = getattr(env, part)
-        before = repr(owner)
-        with pytest.raises(AttributeError, match=f"{name} cannot .* with {name}="):
-            setattr(owner, name, value)
-        assert repr(owner) == before
-
-
-def test_goals_follow_a_changed_option_of_a_task():
-    with torch_panda.make("PandaPush-v1", num_envs=8, seed=0) as env:
-        env.task.goal_xy_range = 0.01
-        assert env.reset()["desired_goal"][:, :2].abs().max() <= 0.005
-
-
 def test_a_viewer_without_viser_is_refused(env, monkeypatch):
     monkeypatch.setattr(robot_task, "find_spec", lambda name: None)
     message = r"^viewers need viser: pip install 'torch_panda\[viewer\]'$"

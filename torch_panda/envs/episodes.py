@@ -8,7 +8,6 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from torch_panda.arguments import argument_names, arguments_in
 from torch_panda.bullet import (
     BulletError,
     PhysicsName,
@@ -62,7 +61,7 @@ class Episodes:
         renderer: Draws the environments.
         seeds: Seeds of the episodes.
         entries: Shape and dtype of the keys that sensors, task and randomization add to
-            the observations.
+            the outputs.
         goal_indices: Column of ``observation`` of each number of the task's achieved
             goal, or None; see `RobotTaskEnv.goal_indices`.
         goal_dim: Size of ``achieved_goal`` and ``desired_goal``.
@@ -132,9 +131,6 @@ class Episodes:
         self.simulation = VectorSimulation(
             build, n, num_threads=num_threads, physics=self.physics
         )
-        task.fix(arguments_in(type(task), "build"))
-        robot.fix(arguments_in(type(robot), "build"))
-        robot.fix({*argument_names(Robot)} - {"action_scale"})
         try:
             self._compiled_setpoints = None
             if CompiledSetpoints.applies(robot, self.simulation):
@@ -169,6 +165,9 @@ class Episodes:
                 robot, task, self.simulation, randomizer, self.seeds
             )
             self._history = History(self._starts.state(), robot.action_dim)
+            # From now on, changes of most arguments would have no effect.
+            robot.freeze()
+            task.freeze()
         except BaseException:
             self.simulation.close()
             raise

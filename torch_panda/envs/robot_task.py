@@ -17,7 +17,7 @@ from torchrl.envs.utils import _update_during_reset
 from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
-from torch_panda.arguments import check_names
+from torch_panda.arguments import argument_names, check_names
 from torch_panda.bullet import PhysicsName, PhysicsParams, native
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
@@ -118,9 +118,6 @@ class RobotTaskEnv(EnvBase):
         ValueError: An argument is out of range.
         TypeError: An argument has a wrong type.
         RuntimeError: EGL does not work.
-
-    Attributes:
-        episodes: The same environments as plain torch, without torchrl's interface.
     """
 
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
@@ -169,12 +166,9 @@ class RobotTaskEnv(EnvBase):
             goal=goal,
         )
         super().__init__(device=device, batch_size=episodes.batch_shape)
-        self.episodes, self.num_envs = episodes, num_envs
-        self.robot, self.task = robot, task
-        self.physics = episodes.physics
+        self._episodes, self._num_envs = episodes, num_envs
         self._terminate_on_success = terminate_on_success
-        self.goal = goal
-        self._observe_state = observe_state
+        self._goal, self._observe_state = goal, observe_state
         specs = Specs(episodes, device, observe_state=observe_state)
         self.observation_spec, self.action_spec = specs.observation, specs.action
         self.reward_spec = specs.reward
@@ -188,7 +182,52 @@ class RobotTaskEnv(EnvBase):
         """Number of threads that step the environments."""
         return self.episodes.simulation.num_threads
 
-    # The next three have no setter, because a later change would have no effect.
+    def __setattr__(self, name: str, value: object) -> None:
+        """Refuse assignments without effect: of arguments, and of a part's options."""
+        if name in _FIXED:
+            raise AttributeError(
+                f"{name} of a live environment cannot be changed: make a new "
+                f"environment"
+            )
+        if "_episodes" in vars(self) and not name.startswith("_"):
+            for part, owner in (("task", self.task), ("robot", self.robot)):
+                if name in argument_names(type(owner)):
+                    raise AttributeError(
+                        f"{name} is an option of the {part}, not of the environment: "
+                        f"see env.{part}.{name}"
+                    )
+        super().__setattr__(name, value)
+
+    @property
+    def episodes(self) -> Episodes:
+        """The same environments as plain torch, without torchrl's interface."""
+        return self._episodes
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self._episodes.robot
+
+    @property
+    def task(self) -> Task:
+        """The task."""
+        return self._episodes.task
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments; None if the batch size is []."""
+        return self._num_envs
+
+    @property
+    def physics(self) -> PhysicsParams:
+        """How Bullet integrates."""
+        return self._episodes.physics
+
+    @property
+    def goal(self) -> GoalName:
+        """Whether goals are the task's goals or full observations."""
+        return self._goal
+
     @property
     def max_episode_steps(self) -> int:
         """Number of steps after which an episode is ``truncated``."""
@@ -661,6 +700,12 @@ class RobotTaskEnv(EnvBase):
         # torchrl also makes its tensordicts by this private function. The public
         # constructor would take ten times as long, because of its checks.
         return TensorDict._new_unsafe(values, self.batch_size, self.device)
+
+
+# Attributes that cannot be assigned: the arguments, except the device, which `to`
+# changes.
+_FIXED = {*inspect.signature(RobotTaskEnv.__init__).parameters, "episodes"}
+_FIXED -= {"self", "device"}
 
 
 def _rebuild(

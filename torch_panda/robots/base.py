@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,15 @@ from torch_panda.arguments import Configured
 from torch_panda.bullet import Control, MotorControl, PhysicsClient, VectorSimulation
 from torch_panda.bullet.control import ArmMode
 from torch_panda.bullet.urdf import Tool
-from torch_panda.checks import check_choice, check_integer, check_quaternion
+from torch_panda.checks import (
+    check_above_zero,
+    check_choice,
+    check_finite,
+    check_integer,
+    check_not_negative,
+    check_quaternion,
+    check_vector,
+)
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
     NO_ROTATION,
@@ -85,10 +93,14 @@ class Robot(Configured):
         finger_links: Indices of the links of the fingers, for the sensor
             "finger_contact".
 
+    Once an environment was built, only ``action_scale`` may change.
+
     Raises:
         ValueError: An argument is out of range, or two arguments contradict each other.
-        TypeError: ``ee_link`` is not an integer.
+        TypeError: An argument has a wrong type.
     """
+
+    changeable: ClassVar[tuple[str, ...]] = ("action_scale",)
 
     def __init__(
         self,
@@ -116,24 +128,14 @@ class Robot(Configured):
                 f"neutral_joint_position and joint_forces must have the same length, "
                 f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
             )
-        if not np.isfinite(neutral_joint_position).all():
-            raise ValueError(
-                f"neutral_joint_position must be finite, got {neutral_joint_position}"
-            )
-        if not all(force >= 0 for force in joint_forces):
-            raise ValueError(f"joint_forces must be at least 0, got {joint_forces}")
-        if len(base_position) != 3 or not np.isfinite(base_position).all():
-            raise ValueError(
-                f"base_position must be three finite numbers, got {base_position}"
-            )
+        for position in neutral_joint_position:
+            check_finite(neutral_joint_position=position)
+        for force in joint_forces:
+            check_not_negative(joint_forces=force)
         check_quaternion("ee_orientation", ee_orientation)
         check_quaternion("base_orientation", base_orientation)
         if action_scale is None:
             action_scale = _ACTION_SCALES[control_type]
-        if not 0 < action_scale < math.inf:
-            raise ValueError(
-                f"action_scale must be finite and above 0, got {action_scale}"
-            )
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
         self.joint_forces = tuple(map(float, joint_forces))
@@ -159,21 +161,30 @@ class Robot(Configured):
         self._other_joints = torch.tensor(others, dtype=torch.float64, device="cpu")
         self.control_type: ControlType = control_type
         self.action_scale = action_scale
+        self.check_arguments()
         self.gripper = gripper
         self.block_gripper = block_gripper
-        self.base_position = tuple(map(float, base_position))
+        self.base_position = check_vector("base_position", base_position)
         self.base_orientation = tuple(map(float, base_orientation))
-        box = np.asarray(workspace, dtype=np.float64)
+        try:
+            box = np.asarray(workspace, dtype=np.float64)
+        except (TypeError, ValueError):  # no numbers, or corners of different sizes
+            box = np.empty(0)
         if box.shape != (2, 3) or not (box[0] <= box[1]).all():
             raise ValueError(
                 f"workspace must be the lowest and the highest (x, y, z), such as "
                 f"((-0.2, -0.2, 0), (0.2, 0.2, 0.4)), got {workspace!r}"
             )
-        self.workspace: Workspace = workspace
+        lowest, highest = box.tolist()
+        self.workspace: Workspace = (tuple(lowest), tuple(highest))
         self._lowest, self._highest = torch.from_numpy(box)
         self.tool = tool
         self.wrist_joint = wrist_joint
         self.finger_links = tuple(finger_links)
+
+    def check_arguments(self) -> None:
+        """Check the argument that may change; see `Configured.check_arguments`."""
+        check_above_zero(action_scale=self.action_scale)
 
     @property
     def action_dim(self) -> int:

@@ -1,7 +1,7 @@
 """Base class of goal-conditioned tasks."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, get_args
 
@@ -31,19 +31,12 @@ OBJECT_LAYOUT: tuple[Quantity, ...] = (
 RewardFunction = Callable[[Tensor, Tensor], Tensor]
 """A function of achieved and desired goals, both (..., goal_dim), to (..., 1)."""
 
-# The environment looks these methods up in the class of a task. It skips a hook that
-# the class does not override, and C code may replace the other inherited methods.
-_CLASS_METHODS = (
-    "observation",
-    "achieved_goal",
-    "distance",
-    "success_distance",
-    "is_success",
-    "compute_reward",
-    "reward",
-    "failure",
-    "extra_observation",
-    "randomize",
+SAMPLERS = ("sample_goal", "sample_objects", "sample_object_joints")
+"""The methods that the default of `Task.sample_start` calls."""
+
+_GOAL_ADVICE = (
+    "to start episodes with a goal, call env.reset(TensorDict({'desired_goal': goal}, "
+    "env.batch_size), set_state=True)"
 )
 
 
@@ -121,6 +114,14 @@ class Task(Configured, ABC):
     `randomize`, `reward`, `failure` and `extra_observation` are optional hooks. A hook
     that a task leaves out is never called, so it costs nothing.
 
+    Once an environment was built, its task refuses assignments that would have no
+    effect. Arguments that the class lists in ``changeable`` may change, because they
+    are read in every episode or step. A subclass lists only its own arguments there. It
+    checks its arguments in `check_arguments`, which also runs at each change. State of
+    a subclass, which changes during episodes, needs an attribute of the class, an
+    attribute that ``__init__`` or `build` sets, or a name that begins with an
+    underscore.
+
     Args:
         reward_type: "sparse" gives -1 above ``distance_threshold`` and 0 otherwise, or
             0 on success and -1 otherwise if a subclass overrides `is_success`; "dense"
@@ -154,17 +155,20 @@ class Task(Configured, ABC):
     reward_type: RewardType = "sparse"
     distance_threshold: float = 0.05
 
+    changeable: ClassVar[tuple[str, ...]] = ("reward_type", "distance_threshold")
+    # The environment looks all other methods up in the class of a task.
+    _replaceable_methods = frozenset(("sample_start", *SAMPLERS))
+    _assignment_advice: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("goal", "desired_goal"), _GOAL_ADVICE
+    )
+
     def __post_init__(self) -> None:
+        self.check_arguments()
+
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Configured.check_arguments`."""
         check_choice("reward_type", self.reward_type, get_args(RewardType))
         check_not_negative(distance_threshold=self.distance_threshold)
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in _CLASS_METHODS:
-            raise AttributeError(
-                f"{name} cannot be replaced in an object, because environments look it "
-                f"up in the class: override it in a subclass of {type(self).__name__}"
-            )
-        super().__setattr__(name, value)
 
     @abstractmethod
     def build(self, client: PhysicsClient) -> Bodies:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.bullet.shapes import Box
+from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION, rotate
 from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Start, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
@@ -47,6 +49,11 @@ class Drawer(Task):
     observation_dim = 5
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = ("position", "number", "number")
+    changeable: ClassVar[tuple[str, ...]] = (
+        "cabinet_x_range",
+        "cabinet_y_range",
+        "min_change",
+    )
 
     cabinet_x_range: float = 0.06
     cabinet_y_range: float = 0.2
@@ -55,10 +62,19 @@ class Drawer(Task):
     drawer_friction: float = 5.0
     table_friction: float = TABLE_FRICTION
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            cabinet_x_range=self.cabinet_x_range,
+            cabinet_y_range=self.cabinet_y_range,
+            min_change=self.min_change,
+            drawer_friction=self.drawer_friction,
+            table_friction=self.table_friction,
+        )
+        check_above_zero(drawer_mass=self.drawer_mass)
         # From the middle of the slide, no goal is farther than half of its length.
-        if not 0 <= self.min_change <= TRAVEL / 2:
+        if self.min_change > TRAVEL / 2:
             raise ValueError(
                 f"min_change must be from 0 to {TRAVEL / 2} [m], got {self.min_change}"
             )

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual, selects_state
+from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION, rotate, rotation_distance
 from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Task
 from torch_panda.tasks.table import (
@@ -47,12 +49,23 @@ class Flip(Task):
     observation_dim = 13
     goal_entries = GoalEntries("task", (3, 4, 5, 6))
     observation_layout = ("position", "quaternion", "velocity", "angular_velocity")
+    changeable: ClassVar[tuple[str, ...]] = ("obj_xy_range",)
 
     distance_threshold: float = 0.2
     obj_xy_range: float = 0.3
     object_mass: float = 1.0
     object_friction: float = 0.5
     table_friction: float = TABLE_FRICTION
+
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            obj_xy_range=self.obj_xy_range,
+            object_friction=self.object_friction,
+            table_friction=self.table_friction,
+        )
+        check_above_zero(object_mass=self.object_mass)
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cube and the marker."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import RED, Box
+from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION, rotate
 from torch_panda.tasks.base import (
     OBJECT_LAYOUT,
@@ -56,6 +58,7 @@ class PegInsertion(Task):
     observation_dim = 15
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = (*OBJECT_LAYOUT, "position")
+    changeable: ClassVar[tuple[str, ...]] = ("hole_xy_range",)
 
     distance_threshold: float = 0.01
     depth: float = 0.03
@@ -65,9 +68,18 @@ class PegInsertion(Task):
     peg_friction: float = 0.5
     table_friction: float = TABLE_FRICTION
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.clearance < HOLE_WIDTH:
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            hole_xy_range=self.hole_xy_range,
+            peg_friction=self.peg_friction,
+            table_friction=self.table_friction,
+        )
+        check_above_zero(
+            depth=self.depth, clearance=self.clearance, peg_mass=self.peg_mass
+        )
+        if not self.clearance < HOLE_WIDTH:
             raise ValueError(
                 f"clearance must be between 0 and {HOLE_WIDTH} [m], got "
                 f"{self.clearance}"

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from torch_panda.checks import check_not_negative
 from torch_panda.tasks.push import Push
 from torch_panda.tasks.table import CUBE_SIZE, sample_on_table
 
@@ -27,10 +29,16 @@ class PickAndPlace(Push):
         table_friction: Lateral friction of the table.
     """
 
-    marker_height = 0.05
+    changeable: ClassVar[tuple[str, ...]] = ("goal_z_range",)
+    _marker_height = 0.05
 
     goal_z_range: float = 0.2
     object_friction: float = 5.0
+
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(goal_z_range=self.goal_z_range)
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:
         """Draw a position of the cube, (3,); 30 % of the positions are on the table."""

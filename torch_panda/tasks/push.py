@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, selects_state
+from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import (
     OBJECT_LAYOUT,
@@ -43,9 +45,10 @@ class Push(Task):
     observation_dim = 12
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = OBJECT_LAYOUT
+    changeable: ClassVar[tuple[str, ...]] = ("goal_xy_range", "obj_xy_range")
     # Height at which panda-gym creates the marker, before it draws a goal [m]. It is
     # part of Bullet's tree of AABBs, which decides the order of contacts.
-    marker_height = CUBE_SIZE / 2
+    _marker_height = CUBE_SIZE / 2
 
     goal_xy_range: float = 0.3
     obj_xy_range: float = 0.3
@@ -53,13 +56,24 @@ class Push(Task):
     object_friction: float = 0.5
     table_friction: float = TABLE_FRICTION
 
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            goal_xy_range=self.goal_xy_range,
+            obj_xy_range=self.obj_xy_range,
+            object_friction=self.object_friction,
+            table_friction=self.table_friction,
+        )
+        check_above_zero(object_mass=self.object_mass)
+
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cube and the marker."""
         create_table(client, friction=self.table_friction)
         cube = create_cube(client, mass=self.object_mass, friction=self.object_friction)
         return Bodies(
             objects=(cube,),
-            markers=(client.create_marker((0.0, 0.0, self.marker_height), CUBE),),
+            markers=(client.create_marker((0.0, 0.0, self._marker_height), CUBE),),
         )
 
     def sample_goal(self, rng: np.random.Generator) -> Sequence[float]:

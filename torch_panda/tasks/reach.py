@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation, selects_state
+from torch_panda.checks import check_not_negative
 from torch_panda.tasks.base import Bodies, GoalEntries, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
 
@@ -29,8 +31,17 @@ class Reach(Task):
     goal_entries = GoalEntries("robot", (0, 1, 2))
     observation_layout = ()
 
+    changeable: ClassVar[tuple[str, ...]] = ("goal_range",)
+
     goal_range: float = 0.3
     table_friction: float = TABLE_FRICTION
+
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            goal_range=self.goal_range, table_friction=self.table_friction
+        )
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table and the marker."""

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
 
 from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation, selects_state
+from torch_panda.checks import check_above_zero, check_finite, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import (
     OBJECT_LAYOUT,
@@ -49,6 +51,11 @@ class Slide(Task):
     goal_entries = GoalEntries("task", (0, 1, 2))
     observation_layout = OBJECT_LAYOUT
     sampled_goal_height = PUCK_START_HEIGHT
+    changeable: ClassVar[tuple[str, ...]] = (
+        "goal_xy_range",
+        "goal_x_offset",
+        "obj_xy_range",
+    )
 
     goal_xy_range: float = 0.5
     goal_x_offset: float = 0.51
@@ -58,6 +65,20 @@ class Slide(Task):
     object_mass: float = 2.0
     object_friction: float = 0.5
     table_friction: float = TABLE_FRICTION
+
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            goal_xy_range=self.goal_xy_range,
+            obj_xy_range=self.obj_xy_range,
+            object_friction=self.object_friction,
+            table_friction=self.table_friction,
+        )
+        check_finite(
+            goal_x_offset=self.goal_x_offset, table_x_offset=self.table_x_offset
+        )
+        check_above_zero(table_length=self.table_length, object_mass=self.object_mass)
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the puck and the marker."""

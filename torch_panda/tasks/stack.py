@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual, selects_state
 from torch_panda.bullet.shapes import GREEN, RED, Color
+from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import OBJECT_LAYOUT, Bodies, GoalEntries, Task
 from torch_panda.tasks.table import (
@@ -53,6 +55,7 @@ class Stack(Task):
     goal_entries = GoalEntries("task", (0, 1, 2, 12, 13, 14))
     observation_layout = OBJECT_LAYOUT * 2
     max_episode_steps = 100
+    changeable: ClassVar[tuple[str, ...]] = ("goal_xy_range", "obj_xy_range")
 
     per_object: bool = True
     goal_xy_range: float = 0.3
@@ -62,6 +65,23 @@ class Stack(Task):
     object_mass: tuple[float, float] = (2.0, 2.0)
     object_friction: float = 5.0
     table_friction: float = TABLE_FRICTION
+
+    def check_arguments(self) -> None:
+        """Check the arguments; see `Task`."""
+        super().check_arguments()
+        check_not_negative(
+            goal_xy_range=self.goal_xy_range,
+            obj_xy_range=self.obj_xy_range,
+            object_friction=self.object_friction,
+            table_friction=self.table_friction,
+        )
+        if np.shape(self.object_mass) != (2,):
+            raise ValueError(
+                f"object_mass must be the masses of the lower and the upper cube, got "
+                f"{self.object_mass!r}"
+            )
+        for mass in self.object_mass:
+            check_above_zero(object_mass=mass)
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, both cubes and their markers."""

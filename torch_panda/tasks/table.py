@@ -4,6 +4,7 @@ import numpy as np
 
 from torch_panda.bullet import Box, PhysicsClient, Visual
 from torch_panda.bullet.shapes import DARK_GREY, GREEN, LIGHT_GREY
+from torch_panda.checks import check_above_zero, check_finite
 
 # The table of panda-gym. Its top is the plane z = 0.
 TABLE_LENGTH = 1.1  # along x [m]
@@ -31,7 +32,13 @@ def create_table(
         x_offset: x coordinate of the centre of the table [m].
         friction: Lateral friction of the table. The friction of a contact is the
             product of the two bodies' values.
+
+    Raises:
+        ValueError: The length is not above 0, the friction is negative, or a number is
+            not finite.
     """
+    check_above_zero(length=length)
+    check_finite(x_offset=x_offset)
     client.create_box(
         (3.0, 3.0, 0.01),
         mass=0.0,
