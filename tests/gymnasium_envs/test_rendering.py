@@ -72,5 +72,5 @@ def test_a_given_camera_is_used_and_a_width_changes_it():
     assert [frame.shape for frame in frames] == [(20, 40, 3)] * 2
     single.close()
     many.close()
-    with pytest.raises(ValueError, match="at least 1 pixel"):
+    with pytest.raises(ValueError, match="width must be finite and above 0"):
         GoalEnv("PandaReach-v1", render_width=0)

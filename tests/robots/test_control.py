@@ -197,7 +197,7 @@ def test_robot_options_out_of_range_are_refused(options, message):
 def test_grippers_that_cannot_move_are_refused():
     with pytest.raises(ValueError, match="differ in at least one position"):
         Gripper(closed=(0.0,), opened=(0.0,), width=0.1)
-    with pytest.raises(ValueError, match="width must be above 0"):
+    with pytest.raises(ValueError, match="width must be finite and above 0"):
         Gripper(closed=(0.0,), opened=(0.1,), width=0.0)
 
 

@@ -18,7 +18,6 @@ from torch_panda.bullet.blueprint import (
     SetCollisionFilter,
     SetJoints,
     SetPhysics,
-    Vector,
 )
 from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState, Doubles
 from torch_panda.bullet.building import ORIGIN
@@ -32,7 +31,12 @@ from torch_panda.bullet.connection import (
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.shapes import Box, Cylinder, Shape, Sphere, Visual
 from torch_panda.bullet.urdf import Tool, check_urdf, find_urdf, urdf_with_tool
-from torch_panda.checks import check_not_negative, check_quaternion
+from torch_panda.checks import (
+    check_above_zero,
+    check_not_negative,
+    check_quaternion,
+    check_vector,
+)
 from torch_panda.rotations import NO_ROTATION
 
 if TYPE_CHECKING:  # imported at its first use
@@ -191,7 +195,8 @@ class PhysicsClient:
         check_urdf(file)
         if tool is not None:
             file = urdf_with_tool(file, tool)
-        base_position, rotation = _vector(position), _quaternion(orientation)
+        base_position = check_vector("position", position)
+        rotation = _quaternion(orientation)
         body = building.load_urdf(
             self.connection,
             file,
@@ -221,9 +226,12 @@ class PhysicsClient:
             visual: How renderers draw the box.
 
         Raises:
-            ValueError: The mass is negative or not finite.
+            ValueError: A size is not above 0, the mass is negative, or a number is not
+                finite.
+            TypeError: A size or the mass is not a number.
         """
-        return self._create_body(Box(_vector(half_extents)), mass, position, visual)
+        shape = Box(check_vector("half_extents", half_extents))
+        return self._create_body(shape, mass, position, visual)
 
     def create_cylinder(
         self,
@@ -261,6 +269,10 @@ class PhysicsClient:
             position: Position of its centre, world frame [m].
             shape: Shape that renderers draw; None makes the marker invisible.
             visual: How renderers draw the shape. Markers are translucent.
+
+        Raises:
+            ValueError: A size is not above 0, or a number is not finite.
+            TypeError: A size is not a number.
         """
         return self._create_body(shape, 0.0, position, visual, is_marker=True)
 
@@ -274,7 +286,9 @@ class PhysicsClient:
         is_marker: bool = False,
     ) -> int:
         check_not_negative(mass=mass)
-        centre = _vector(position)
+        centre = check_vector("position", position)
+        if shape is not None:
+            _check_shape(shape)
         collision_shape = building.NO_SHAPE
         if shape is not None and not is_marker:
             collision_shape = self._create_collision_shape(shape)
@@ -416,11 +430,11 @@ class PhysicsClient:
             "restitution": restitution,
             "joint_damping": joint_damping,
         }
-        check_not_negative(**numbers)
+        changes = {name: x for name, x in numbers.items() if x is not None}
+        check_not_negative(**changes)
         command = capi.dynamics_init(self.connection.handle)
-        for name, value in numbers.items():
-            if value is not None:
-                _DYNAMICS_SETTERS[name](command, body, link, value)
+        for name, value in changes.items():
+            _DYNAMICS_SETTERS[name](command, body, link, value)
         self.connection.submit_quick(
             command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
         )
@@ -513,18 +527,21 @@ class PhysicsClient:
             orientation: Quaternion xyzw.
             linear_velocity: Linear velocity [m/s].
             angular_velocity: Angular velocity [rad/s].
+
+        Raises:
+            ValueError: The position is not finite, or the quaternion has no direction.
         """
+        centre = check_vector("position", position)
+        check_quaternion("orientation", orientation)
         building.set_base(
             self.connection,
             body,
-            position,
+            centre,
             orientation,
             linear_velocity,
             angular_velocity,
         )
-        if self._is_recording:
-            pose = _vector(position), _quaternion(orientation)
-            self._record(SetBase(body, *pose))
+        self._record(SetBase(body, centre, _quaternion(orientation)))
 
     def set_gravity(self, gravity: float) -> None:
         """Set gravity along the world's z axis [m/s^2]."""
@@ -734,9 +751,12 @@ _DYNAMICS_SETTERS = {
 }
 
 
-def _vector(values: Sequence[float]) -> Vector:
-    x, y, z = map(float, values)
-    return x, y, z
+def _check_shape(shape: Shape) -> None:
+    """Check that a shape has finite sizes above 0."""
+    for name, size in shape._asdict().items():
+        sizes = check_vector(name, size) if name == "half_extents" else (size,)
+        for number in sizes:
+            check_above_zero(**{name: number})
 
 
 def _quaternion(values: Sequence[float]) -> Quaternion:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torch_panda.bullet.library import library_path
+from torch_panda.checks import check_vector
 
 _JOINT_TYPES = (
     "revolute",
@@ -240,7 +241,8 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     be another one, because Bullet's order is depth-first.
 
     Raises:
-        ValueError: The URDF has no link of the name to which the tool is fixed.
+        ValueError: The URDF has no link of the name to which the tool is fixed, or the
+            tool's position is not finite.
     """
     source = Path(file).absolute()
     robot = parse_urdf(source)
@@ -256,7 +258,7 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     )
     link = f"<link name='tool'><inertial>{massless}</inertial></link>"
     robot.append(ElementTree.fromstring(link))
-    x, y, z = tool.position
+    x, y, z = check_vector("the position of a tool", tool.position)
     robot.append(
         ElementTree.fromstring(
             f"<joint name='tool' type='fixed'><parent link='{tool.link}'/>"

@@ -3,12 +3,12 @@
 import dataclasses
 from typing import Any
 
+from torch_panda.checks import check_vector
 from torch_panda.rendering import Camera
 
 RENDER_MODES = ("rgb_array",)
 
-# Fields of `Camera`, by the names of panda-gym's arguments.
-_CAMERA_FIELDS = {
+CAMERA_FIELDS = {
     "render_width": "width",
     "render_height": "height",
     "render_target_position": "target",
@@ -17,6 +17,7 @@ _CAMERA_FIELDS = {
     "render_pitch": "pitch",
     "render_roll": "roll",
 }
+"""Fields of `Camera`, by the names of panda-gym's arguments."""
 
 
 def check_render_mode(render_mode: str | None) -> None:
@@ -48,10 +49,10 @@ def take_camera(camera: Camera | None, arguments: dict[str, Any]) -> Camera | No
     """
     changes = {
         field: arguments.pop(name)
-        for name, field in _CAMERA_FIELDS.items()
+        for name, field in CAMERA_FIELDS.items()
         if name in arguments
     }
     if "target" in changes:
-        x, y, z = changes["target"]
-        changes["target"] = (float(x), float(y), float(z))
+        target = check_vector("render_target_position", changes["target"])
+        changes["target"] = target
     return dataclasses.replace(camera or Camera(), **changes) if changes else camera

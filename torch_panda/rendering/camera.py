@@ -8,6 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from torch_panda.checks import (
+    check_above_zero,
+    check_finite,
+    check_integer,
+    check_vector,
+)
 from torch_panda.rotations import rotate_vector
 
 # Depths from here on are background, whose depth is 1 up to rounding.
@@ -34,6 +40,7 @@ class Camera:
 
     Raises:
         ValueError: A size, a distance or an angle is out of range.
+        TypeError: A size is not an integer, or another argument is not a number.
     """
 
     target: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -49,17 +56,21 @@ class Camera:
     shadows: bool = True
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1:
+        check_vector("target", self.target)
+        check_finite(yaw=self.yaw, pitch=self.pitch, roll=self.roll)
+        check_above_zero(
+            distance=self.distance,
+            fov=self.fov,
+            near=self.near,
+            far=self.far,
+            width=check_integer("width", self.width),
+            height=check_integer("height", self.height),
+        )
+        if not self.fov < 180:
+            raise ValueError(f"fov must be below 180 degrees, got {self.fov}")
+        if not self.near < self.far:
             raise ValueError(
-                f"a camera's width and height must be at least 1 pixel, got "
-                f"{self.width} x {self.height}"
-            )
-        if not 0 < self.fov < 180:
-            raise ValueError(f"fov must be between 0 and 180 degrees, got {self.fov}")
-        if not (0 < self.near < self.far and self.distance > 0):
-            raise ValueError(
-                f"distance must be above 0, and near between 0 and far, got distance "
-                f"{self.distance}, near {self.near}, far {self.far}"
+                f"near must be below far, got near {self.near} and far {self.far}"
             )
 
 
@@ -92,6 +103,8 @@ class HandCamera(Camera):
     far: float = 5.0
 
     def __post_init__(self) -> None:
+        for name in ("eye", "target", "up"):
+            check_vector(name, getattr(self, name))
         sight = np.subtract(self.target, self.eye)
         if np.linalg.norm(np.cross(sight, self.up)) < 1e-6:
             raise ValueError(

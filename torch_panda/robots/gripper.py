@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import native
+from torch_panda.checks import check_above_zero, check_finite
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Gripper:
 
     Raises:
         ValueError: The lengths of ``closed`` and ``opened`` differ, no joint moves, all
-            joints follow, or ``width`` is not above 0.
+            joints follow, or a number is out of range.
     """
 
     closed: tuple[float, ...]
@@ -40,6 +41,10 @@ class Gripper:
     _closed: Tensor = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        for name in ("closed", "opened"):
+            for position in getattr(self, name):
+                check_finite(**{name: position})
+        check_above_zero(width=self.width, scale=self.scale)
         double = torch.float64
         closed = torch.tensor(self.closed, dtype=double, device="cpu")
         opened = torch.tensor(self.opened, dtype=double, device="cpu")
@@ -48,8 +53,6 @@ class Gripper:
                 "closed and opened must have the same length and differ in at least "
                 f"one position, got {self.closed} and {self.opened}"
             )
-        if not self.width > 0:
-            raise ValueError(f"width must be above 0 [m], got {self.width}")
         per_width = (opened - closed) / self.width
         leads = closed != opened
         leads[list(self.followers)] = False

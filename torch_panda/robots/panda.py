@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from torch_panda.bullet import PhysicsClient
+from torch_panda.checks import check_not_negative
 from torch_panda.robots.base import ABOVE_THE_TABLE, ControlType, Robot, Workspace
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import NO_ROTATION
@@ -44,7 +45,10 @@ class Panda(Robot):
         finger_friction: float = 1.0,
         finger_spinning_friction: float | None = None,
     ) -> None:
-        if not 0 <= fingers_width <= GRIPPER.width:
+        check_not_negative(fingers_width=fingers_width, finger_friction=finger_friction)
+        if finger_spinning_friction is not None:
+            check_not_negative(finger_spinning_friction=finger_spinning_friction)
+        if fingers_width > GRIPPER.width:
             raise ValueError(
                 f"fingers_width must be from 0 to {GRIPPER.width} [m], got "
                 f"{fingers_width}"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import Tool
+from torch_panda.checks import check_not_negative
 from torch_panda.robots.base import ABOVE_THE_TABLE, ControlType, Robot, Workspace
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import NO_ROTATION
@@ -72,6 +73,7 @@ class XArm6Gripper(Robot):
         workspace: Workspace = ABOVE_THE_TABLE,
         finger_friction: float = 1.0,
     ) -> None:
+        check_not_negative(finger_friction=finger_friction)
         super().__init__(
             urdf="xarm/xarm6_with_gripper.urdf",
             neutral_joint_position=(*NEUTRAL_ARM_WITH_GRIPPER, *GRIPPER.closed),
