@@ -31,7 +31,7 @@ from torch_panda.envs.history import History
 from torch_panda.envs.observer import EpisodeObserver, Observed
 from torch_panda.envs.randomization import DomainRandomizer, Randomization
 from torch_panda.envs.seeds import EpisodeSeeds
-from torch_panda.envs.start import EpisodeStarts
+from torch_panda.envs.start import EpisodeStarts, check_samplers
 from torch_panda.envs.state import StartState, read_state
 from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
@@ -89,6 +89,7 @@ class Episodes:
     ) -> None:
         check_instance("robot", robot, Robot)
         check_instance("task", task, Task)
+        check_samplers(task)
         if randomize is not None:
             check_instance("randomize", randomize, Randomization)
         check_positive(

@@ -1,6 +1,8 @@
 """Draws the starts of episodes and holds the tensors of the state."""
 
+import copy
 import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +16,10 @@ from torch_panda.envs.seeds import EpisodeSeeds
 from torch_panda.robots import Robot
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Task
+from torch_panda.tasks.base import SAMPLERS
+
+# Number of starts that `check_samplers` draws.
+_NUM_PROBES = 100
 
 
 class EpisodeStarts:
@@ -125,6 +131,54 @@ class EpisodeStarts:
         if type(self._task).sample_start is not Task.sample_start:
             return "sample_start"
         return name
+
+
+def check_samplers(task: Task) -> None:
+    """Refuse a task that overrides a method which its `sample_start` does not call.
+
+    `sample_start` is called on a copy of the task. If it fails, nothing is refused.
+
+    Raises:
+        ValueError: A method is overridden in vain.
+    """
+    if type(task).sample_start is Task.sample_start:
+        return
+    unused = {
+        name
+        for name in SAMPLERS
+        if _override_level(task, name) < _override_level(task, "sample_start")
+    }
+    if not unused:
+        return
+    probe = copy.copy(task)
+
+    def record(name: str, rng: np.random.Generator) -> object:
+        unused.discard(name)
+        return getattr(task, name)(rng)
+
+    for name in unused:
+        setattr(probe, name, partial(record, name))
+    try:
+        # `sample_start` may call a method in some of the episodes only.
+        for seed in range(_NUM_PROBES):
+            probe.sample_start(np.random.default_rng(seed))
+    except Exception:
+        return
+    if unused:
+        owner = type(task).__mro__[_override_level(task, "sample_start")].__name__
+        raise ValueError(
+            f"{' and '.join(sorted(unused))} of {type(task).__name__} would never be "
+            f"called, because {owner}.sample_start draws without "
+            f"{'it' if len(unused) == 1 else 'them'}: override sample_start instead"
+        )
+
+
+def _override_level(task: Task, name: str) -> int:
+    """Index in the MRO of the class that defines a method; -1 for the object itself."""
+    if name in vars(task):
+        return -1
+    classes = type(task).__mro__
+    return next(level for level, base in enumerate(classes) if name in vars(base))
 
 
 def _fill(row: Doubles, values: object, name: str) -> None:
