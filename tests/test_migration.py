@@ -141,3 +141,40 @@ def test_an_episode_continues_from_an_exact_state():
     env.reset(options={"state": state})
     np.testing.assert_equal(env.step(action)[0], expected)
     env.close()
+
+
+PANDA_GYM_NAMES = {
+    "sim": r"use env\.unwrapped\.torch_env, which has get_state\(\)",
+    "task": r"use env\.unwrapped\.torch_env\.task",
+    "robot": r"use env\.unwrapped\.torch_env\.robot",
+    "save_state": r"use env\.unwrapped\.torch_env\.get_state\(exact=True\)",
+    "render_width": r"argument render_width .* or .*Camera\(width=\.\.\.\)",
+    "render_target_position": r"Camera\(target=\.\.\.\)",
+    "render_yaw": r"Camera\(yaw=\.\.\.\)",
+}
+
+
+@pytest.fixture(scope="module")
+def adapters():
+    made = (
+        gymnasium.make("torch_panda/PandaReach-v3"),
+        gymnasium.make_vec("torch_panda/PandaReach-v3", num_envs=2),
+        SB3VecEnv("PandaReach-v3", num_envs=2),
+    )
+    yield made
+    for env in made:
+        env.close()
+
+
+@pytest.mark.parametrize("name", PANDA_GYM_NAMES)
+def test_attributes_of_panda_gym_are_refused_with_their_replacement(adapters, name):
+    assert hasattr(make_reference("PandaReach-v3").unwrapped, name)
+    for env in adapters:
+        message = f"no attribute '{name}': .*{PANDA_GYM_NAMES[name]}"
+        with pytest.raises(AttributeError, match=message):
+            getattr(env.unwrapped, name)
+        with pytest.raises(AttributeError, match=message):
+            setattr(env.unwrapped, name, 1)
+        with pytest.raises(AttributeError, match=r"no attribute 'wings'$"):
+            _ = env.unwrapped.wings
+        assert env.unwrapped.torch_env.task.reward_type == "sparse"

@@ -210,7 +210,8 @@ class _Batch:
             # Draw it for all kinds, because the published hashes depend on this draw.
             noise.append(generator.uniform(0.0, MAX_NOISE))
         self._noise = torch.tensor(noise, dtype=torch.float32).unsqueeze(1)
-        self._keys = [key for key in env.observation_spec if key != "success"]
+        outcome = {"success", *env.episodes.info_keys}
+        self._keys = [key for key in env.observation_spec if key not in outcome]
         self._observations = env.reset()
         if kind == "play":
             self._goal = self._observations["desired_goal"].clone()

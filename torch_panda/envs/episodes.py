@@ -62,6 +62,7 @@ class Episodes:
         seeds: Seeds of the episodes.
         entries: Shape and dtype of the keys that sensors, task and randomization add to
             the outputs.
+        info_keys: Keys among them that `Task.info` adds. They are no observations.
         goal_indices: Column of ``observation`` of each number of the task's achieved
             goal, or None; see `RobotTaskEnv.goal_indices`.
         goal_dim: Size of ``achieved_goal`` and ``desired_goal``.
@@ -159,6 +160,7 @@ class Episodes:
                 terminate_on_success=terminate_on_success,
             )
             self.entries = self._observer.entries
+            self.info_keys = self._observer.info_keys
             self._randomizer = randomizer
             # Draws the starts of episodes, and holds the goals, the step counts and the
             # state tensors of the running episodes.

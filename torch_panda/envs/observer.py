@@ -1,6 +1,6 @@
 """Observes episodes: state, goals, sensors, reward, success, and how episodes end."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -20,6 +20,16 @@ from torch_panda.tasks import Task
 # for every step.
 _NUM_CHECKED = 20
 
+Hook = Callable[[VectorSimulation], dict[str, Tensor]]
+HOOKS = ("extra_observation", "info")
+"""Hooks of `Task` that return entries by key."""
+
+# Keys that Gymnasium and Stable-Baselines3 write into infos.
+_GYMNASIUM_INFO_KEYS = {
+    "is_success", "final_obs", "final_info", "terminal_observation", "episode",
+    "TimeLimit.truncated",
+}  # fmt: skip
+
 
 class EpisodeObserver:
     """Observes n environments of one robot and one task.
@@ -31,6 +41,7 @@ class EpisodeObserver:
 
     Attributes:
         entries: Shape and dtype of the keys that sensors, task and randomization add.
+        info_keys: Keys among them that `Task.info` adds.
     """
 
     def __init__(
@@ -68,9 +79,16 @@ class EpisodeObserver:
         self._attached_sensors = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
         ]
-        extra = ExtraObserver(task, simulation)
-        self._extra_keys = tuple(extra.entries)
-        observers: list[Observer] = [*self._attached_sensors, extra]
+        hooks = [HookObserver(task, simulation, name) for name in HOOKS]
+        # Functions of the task that return entries, by key; for errors.
+        self._hook_keys = {key: hook.function for hook in hooks for key in hook.entries}
+        self.info_keys = frozenset(hooks[HOOKS.index("info")].entries)
+        if taken := self.info_keys & _GYMNASIUM_INFO_KEYS:
+            raise ValueError(
+                f"{type(task).__name__}.info must not return {sorted(taken)}, because "
+                f"Gymnasium and Stable-Baselines3 use these keys"
+            )
+        observers: list[Observer] = [*self._attached_sensors, *hooks]
         # Keys of states, which sensors and tasks may not observe. Only the sensor
         # "joint_state" may use two of them; see `is_state`.
         reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
@@ -214,9 +232,9 @@ class EpisodeObserver:
         for function, values in functions.items():
             self._check_valid(function, values, values.isfinite(), "finite numbers")
         # Extra entries may be infinite, for example a distance to something unseen.
-        for key in self._extra_keys:
-            function, values = f"{task}.extra_observation[{key!r}]", observed[key]
-            self._check_valid(function, values, ~values.isnan(), "no NaN")
+        for key, name in self._hook_keys.items():
+            values = observed[key]
+            self._check_valid(f"{name}[{key!r}]", values, ~values.isnan(), "no NaN")
         if self._goal_indices is not None:
             numbers = observation[:, self._goal_indices]
             achieved_goal = observed["achieved_goal"]
@@ -290,8 +308,13 @@ class EpisodeObserver:
                 )
 
 
-class ExtraObserver:
-    """Observes the entries of `Task.extra_observation`.
+class HookObserver:
+    """Observes the entries of `Task.extra_observation` or `Task.info`.
+
+    Args:
+        task: The task.
+        simulation: The environments.
+        name: Name of the hook, one of `HOOKS`.
 
     Raises:
         ValueError: An entry does not have n rows.
@@ -299,24 +322,26 @@ class ExtraObserver:
 
     Attributes:
         entries: The entries, by key; empty if the task does not override the hook.
+        function: Name of the task's function, for errors.
     """
 
-    def __init__(self, task: Task, simulation: VectorSimulation) -> None:
-        self._task, self._simulation = task, simulation
-        self._function = f"{type(task).__name__}.extra_observation"
+    def __init__(self, task: Task, simulation: VectorSimulation, name: str) -> None:
+        self._hook: Hook = getattr(task, name)
+        self._simulation = simulation
+        self.function = f"{type(task).__name__}.{name}"
         self.entries: dict[str, Entry] = {}
-        if type(task).extra_observation is Task.extra_observation:
+        if getattr(type(task), name) is getattr(Task, name):
             return
-        with _read_only(self._function, simulation.state.rows):
-            observed = task.extra_observation(simulation)
+        with _read_only(self.function, simulation.state.rows):
+            observed = self._hook(simulation)
         if not isinstance(observed, dict):
             raise TypeError(
-                f"{self._function} must return a dict of tensors, got {observed!r}"
+                f"{self.function} must return a dict of tensors, got {observed!r}"
             )
         for key, value in observed.items():
             shape = tuple(value.shape[1:]) if isinstance(value, Tensor) else ()
             rows = simulation.num_envs
-            check_output(f"{self._function}[{key!r}]", value, (rows, *shape))
+            check_output(f"{self.function}[{key!r}]", value, (rows, *shape))
             self.entries[key] = Entry(shape, _float32_copy(value).dtype)
 
     def observe(self) -> Observed:
@@ -325,10 +350,10 @@ class ExtraObserver:
         Raises:
             ValueError: The task returns other keys than it did at first.
         """
-        observed = self._task.extra_observation(self._simulation)
+        observed = self._hook(self._simulation)
         if observed.keys() != self.entries.keys():
             raise ValueError(
-                f"{self._function} must always return {sorted(self.entries)}, "
+                f"{self.function} must always return {sorted(self.entries)}, "
                 f"got {sorted(observed)}"
             )
         return {key: _float32_copy(value) for key, value in observed.items()}

@@ -11,7 +11,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.envs.observer import Observed
 from torch_panda.envs.state import EXACT_KEYS, PLAIN_KEYS
+from torch_panda.gymnasium_envs.panda_gym import PandaGymErrors
 
 Observation = dict[str, NDArray[Any]]
 
@@ -45,7 +47,8 @@ def action_space(env: RobotTaskEnv) -> spaces.Space[Any]:
 
 def observed_keys(env: RobotTaskEnv) -> list[str]:
     """Keys of observations and goals, in the order of Gymnasium's spaces."""
-    return sorted(set(env.observation_spec.keys()) - _OUTCOME)
+    keys = set(env.observation_spec.keys())
+    return sorted(keys - _OUTCOME - env.episodes.info_keys)
 
 
 def action(values: ArrayLike) -> Tensor:
@@ -86,7 +89,23 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
     }
 
 
-class GoalFunctions:
+def infos(env: RobotTaskEnv, observed: Observed) -> dict[str, NDArray[Any]]:
+    """Infos of all environments, (num_envs, ...) by key: success and `Task.info`."""
+    entries = {key: observed[key].numpy() for key in sorted(env.episodes.info_keys)}
+    return {"is_success": observed["success"].squeeze(1).numpy(), **entries}
+
+
+def info_of(infos: Mapping[str, NDArray[Any]], index: int) -> dict[str, NDArray[Any]]:
+    """The info of one environment.
+
+    Its values are arrays, also those without dimensions, as in panda-gym: torchrl reads
+    the dtype of infos, which a bool does not have, and Gymnasium's vector environments
+    do not stack numpy scalars.
+    """
+    return {key: np.array(values[index]) for key, values in infos.items()}
+
+
+class GoalFunctions(PandaGymErrors):
     """The pure functions of goals that Gymnasium-Robotics' goal environments have.
 
     Attributes:

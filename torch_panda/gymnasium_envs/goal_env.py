@@ -25,7 +25,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     An observation is a dictionary of ``observation``, ``achieved_goal`` and
     ``desired_goal``, float32, and of the entries of cameras and other sensors.
-    ``info["is_success"]`` says whether the goal is reached.
+    ``info["is_success"]`` says whether the goal is reached. The other infos are those
+    of `Task.info`.
 
     Args:
         env: An id, or a `RobotTaskEnv` of batch size []. An environment that is made
@@ -98,7 +99,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         if seed is not None:
             self.torch_env.set_env_seed(0, seed)
         start = self.torch_env.episodes.reset(state=state)
-        return self._observation(start), _info(start)
+        return self._observation(start), self._info(start)
 
     def step(
         self, action: ArrayLike
@@ -110,7 +111,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
             float(after["reward"]),
             bool(after["terminated"]),
             bool(after["truncated"]),
-            _info(after),
+            self._info(after),
         )
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -126,12 +127,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
     def _observation(self, observed: Observed) -> Observation:
         return {key: observed[key][0].numpy() for key in self._keys}
 
-
-def _info(observed: Observed) -> dict[str, Any]:
-    # An array of shape (), as in panda-gym: torchrl reads the dtype of infos, which a
-    # bool does not have, and Gymnasium's vector environments do not stack numpy
-    # scalars.
-    return {"is_success": np.array(observed["success"].item())}
+    def _info(self, observed: Observed) -> dict[str, Any]:
+        return arrays.info_of(arrays.infos(self.torch_env, observed), 0)
 
 
 def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:

@@ -183,16 +183,21 @@ class GoalVectorEnv(
         return {key: observed[key].numpy() for key in self._keys}
 
     def _infos(self, after: Observed, mask: Tensor) -> dict[str, Any]:
-        success = after["success"].squeeze(1) & mask
-        return {"is_success": success.numpy(), "_is_success": mask.clone().numpy()}
+        infos: dict[str, Any] = {}
+        for key, values in arrays.infos(self.torch_env, after).items():
+            # As in Gymnasium, environments without this info have zeros.
+            infos[key] = np.where(_like(mask, values), values, np.zeros_like(values))
+            infos[f"_{key}"] = mask.clone().numpy()
+        return infos
 
     def _final_infos(self, after: Observed, mask: Tensor) -> dict[str, Any]:
         infos: dict[str, Any] = {}
+        own_infos = arrays.infos(self.torch_env, after)
         for index in _indices(mask):
             last = {key: values[index] for key, values in after.items()}
             final = {
                 "final_obs": self._observation(last),
-                "final_info": {"is_success": np.array(last["success"].item())},
+                "final_info": arrays.info_of(own_infos, index),
             }
             infos = self._add_info(infos, final, index)
         return infos
@@ -225,6 +230,11 @@ class GoalVectorEnv(
                 f"{len(seed)} seeds"
             )
         return seed
+
+
+def _like(mask: Tensor, values: NDArray[Any]) -> NDArray[np.bool_]:
+    """A mask (n,) in a shape that broadcasts to values (n, ...)."""
+    return mask.numpy().reshape(-1, *(1,) * (values.ndim - 1))
 
 
 def _indices(mask: Tensor) -> list[int]:

@@ -17,11 +17,12 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.gymnasium_envs.arrays import Observation
+from torch_panda.gymnasium_envs.arrays import Observation, info_of
 from torch_panda.gymnasium_envs.goal_vector_env import GoalVectorEnv
+from torch_panda.gymnasium_envs.panda_gym import PandaGymErrors
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(PandaGymErrors, VecEnv):
     """A `GoalVectorEnv` for Stable-Baselines3.
 
     All environments share one object, ``vector_env``. `get_attr` and `env_method`
@@ -34,6 +35,7 @@ class SB3VecEnv(VecEnv):
 
     Attributes:
         vector_env: The `GoalVectorEnv`.
+        torch_env: The `RobotTaskEnv` behind it.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class SB3VecEnv(VecEnv):
         self.vector_env = GoalVectorEnv(
             env, autoreset_mode=AutoresetMode.SAME_STEP, **arguments
         )
+        self.torch_env = self.vector_env.torch_env
         super().__init__(
             self.vector_env.num_envs,
             self.vector_env.single_observation_space,
@@ -62,7 +65,8 @@ class SB3VecEnv(VecEnv):
                 "set_options is not supported: call vector_env.reset(options=...)"
             )
         observation, infos = self.vector_env.reset(seed=self._seeds)
-        self.reset_infos = [{"is_success": np.array(x)} for x in infos["is_success"]]
+        own_infos = self._own_infos(infos)
+        self.reset_infos = [info_of(own_infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         return observation
 
@@ -76,23 +80,23 @@ class SB3VecEnv(VecEnv):
             self._actions
         )
         done = terminated | truncated
-        # If an episode ended, report the success of its last step. `infos` holds the
-        # success at the start of the next episode.
-        success = np.where(
-            done,
-            infos.get("final_info", {}).get("is_success", False),
-            infos["is_success"],
-        )
+        own_infos = self._own_infos(infos)
         list_of_infos: list[dict[str, Any]] = [
-            {"is_success": np.array(s), "TimeLimit.truncated": bool(t)}
-            for s, t in zip(success, truncated & ~terminated, strict=True)
+            {**info_of(own_infos, index), "TimeLimit.truncated": bool(is_truncated)}
+            for index, is_truncated in enumerate(truncated & ~terminated)
         ]
-        for index in done.nonzero()[0]:
+        # If an episode ended, report the infos of its last step. `own_infos` holds
+        # those of the start of the next episode.
+        for index in done.nonzero()[0].tolist():
+            self.reset_infos[index] = info_of(own_infos, index)
+            list_of_infos[index] |= info_of(self._own_infos(infos["final_info"]), index)
             list_of_infos[index]["terminal_observation"] = infos["final_obs"][index]
-            self.reset_infos[index] = {
-                "is_success": np.array(infos["is_success"][index])
-            }
         return observation, rewards.astype(np.float32), done, list_of_infos
+
+    def _own_infos(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Infos that the environments return in every step, (num_envs, ...) by key."""
+        keys = ("is_success", *self.torch_env.episodes.info_keys)
+        return {key: infos[key] for key in keys}
 
     def close(self) -> None:
         """Free all clients and threads."""

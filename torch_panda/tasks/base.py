@@ -111,8 +111,8 @@ class Task(Configured, ABC):
     shipped tasks are fields of dataclasses, whose defaults are those of the ids that
     end in ``-v1``.
 
-    `randomize`, `reward`, `failure` and `extra_observation` are optional hooks. A hook
-    that a task leaves out is never called, so it costs nothing.
+    `randomize`, `reward`, `failure`, `extra_observation` and `info` are optional hooks.
+    A hook that a task leaves out is never called, so it costs nothing.
 
     Once an environment was built, its task refuses assignments that would have no
     effect. Arguments that the class lists in ``changeable`` may change, because they
@@ -271,6 +271,17 @@ class Task(Configured, ABC):
 
         Returns:
             Tensors (num_envs, ...) by key. A float64 tensor is observed as float32.
+        """
+        return {}
+
+    def info(self, simulation: VectorSimulation) -> dict[str, Tensor]:
+        """Numbers to report in addition to the observation, such as costs. Optional.
+
+        torchrl returns them under ``next``, and in the result of a reset. Gymnasium and
+        Stable-Baselines3 return them in ``info``. They are never observed.
+
+        Returns:
+            Tensors (num_envs, ...) by key, like `extra_observation`.
         """
         return {}
 

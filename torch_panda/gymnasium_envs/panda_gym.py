@@ -1,0 +1,41 @@
+"""Errors for attributes of panda-gym's environments that ours do not have."""
+
+from typing import NoReturn
+
+from torch_panda.gymnasium_envs.rendering import CAMERA_FIELDS
+
+_TORCH_ENV = "env.unwrapped.torch_env"
+_STATE = (
+    f"{_TORCH_ENV}.get_state(exact=True), and reset(options={{'state': state}}) to "
+    "return to it"
+)
+# What to use instead.
+_REPLACEMENTS = {
+    "sim": f"{_TORCH_ENV}, which has get_state() and episodes.simulation",
+    "task": f"{_TORCH_ENV}.task",
+    "robot": f"{_TORCH_ENV}.robot",
+    "save_state": _STATE,
+    "restore_state": _STATE,
+    "remove_state": "nothing: a state is an object, which Python frees",
+} | {
+    name: f"the argument {name} of gymnasium.make, or "
+    f"render_camera=torch_panda.Camera({field}=...)"
+    for name, field in CAMERA_FIELDS.items()
+}
+
+
+class PandaGymErrors:
+    """Names the replacement of an attribute that only panda-gym has."""
+
+    def __getattr__(self, name: str) -> NoReturn:
+        """Raise an error; Python calls this method for missing attributes only."""
+        message = f"{type(self).__name__!r} object has no attribute {name!r}"
+        if name in _REPLACEMENTS:
+            message += f": use {_REPLACEMENTS[name]}"
+        raise AttributeError(message)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Refuse to set an attribute that has an effect in panda-gym only."""
+        if name in _REPLACEMENTS:
+            self.__getattr__(name)
+        super().__setattr__(name, value)
