@@ -4,7 +4,7 @@ import torch_panda
 from torch_panda.registry import find_registration
 
 # One id for each physics. Sparse and dense rewards share theirs, which
-# `test_suite.test_reward_types_share_their_physics` shows for each.
+# `test_suite.test_reward_types_share_their_physics_and_ends` shows for each.
 PHYSICS_IDS = tuple(
     env_id
     for env_id in torch_panda.ENV_IDS

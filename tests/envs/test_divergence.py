@@ -6,8 +6,6 @@ from tensordict import TensorDict
 
 import torch_panda
 
-pytestmark = pytest.mark.usefixtures("loop")
-
 
 def make(on_divergence, **options):
     return torch_panda.make(

@@ -9,8 +9,6 @@ import torch_panda
 from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv
 from torch_panda.bullet.pool import WorkerError
 
-pytestmark = pytest.mark.usefixtures("loop")
-
 
 class FailsOnce(Reach):
     fails = True

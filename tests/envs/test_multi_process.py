@@ -31,7 +31,7 @@ def goals(data):
 
 
 def test_parallel_env_keeps_seeds_and_threads_and_names_a_dead_worker():
-    env = ParallelEnv(2, make_env, mp_start_method="spawn")
+    env = ParallelEnv(2, make_env)
     serial = SerialEnv(2, make_env)
     rollouts = []
     for e in (env, serial):

@@ -1,114 +1,104 @@
-"""An overridden method of a task is called, or an error says what to override."""
+"""Functions that a subclass overrides are called, and changed options take effect."""
 
 import pytest
+import torch
 
-from torch_panda import Drawer, Panda, PegInsertion, Push, RobotTaskEnv
-from torch_panda.tasks import Start
+import torch_panda
+from torch_panda import Panda, Push, RobotTaskEnv
+from torch_panda.bullet import selects_state
+from torch_panda.bullet.selection import selected_columns
 
-
-def make(task):
-    return RobotTaskEnv(robot=Panda(block_gripper=True), task=task, seed=0)
-
-
-class GoalOfADrawer(Drawer):
-    def sample_goal(self, rng):
-        return (0.0, 0.0, 0.06)
+N = 3
 
 
-class HoleInTheMiddle(PegInsertion):
-    def sample_objects(self, rng):
-        return ((0, 0, 0.2, 0, 0, 0, 1), (0, 0, 0, 0, 0, 0, 1))
+class FarPush(Push):
+    """An achieved goal and a success of its own, both displaced by 1 m."""
+
+    goal_entries = None
+
+    def achieved_goal(self, simulation):
+        return super().achieved_goal(simulation) + 1.0
+
+    def success_distance(self, achieved_goal, desired_goal):
+        return self.distance(achieved_goal, desired_goal + 1.0)
 
 
-class StartInTheMiddle(Push):
-    """A user's base class that draws the goal and the objects together."""
+class OwnRobot(Panda):
+    """A robot that moves and observes in the opposite direction."""
 
-    def sample_start(self, rng):
-        return Start((0.1, 0.0, 0.02), ((0.0, 0.0, 0.02, 0.0, 0.0, 0.0, 1.0),))
+    def arm_setpoint(self, action, simulation):
+        return super().arm_setpoint(-action, simulation)
 
-
-class GoalOfAUsersBase(StartInTheMiddle):
-    def sample_goal(self, rng):
-        return (0.1, 0.1, 0.02)
+    def observation(self, simulation):
+        return -super().observation(simulation)
 
 
-@pytest.mark.parametrize(
-    ("task", "message"),
-    [
-        (GoalOfADrawer, r"sample_goal of GoalOfADrawer .* Drawer\.sample_start draws"),
-        (HoleInTheMiddle, r"sample_objects of Hole.* PegInsertion\.sample_start draws"),
-        (GoalOfAUsersBase, r"sample_goal of .* StartInTheMiddle\.sample_start draws"),
-    ],
-)
-def test_an_override_that_is_never_called_is_refused(task, message):
-    with pytest.raises(ValueError, match=message + r".*: override sample_start"):
-        make(task())
+def make(task=None, robot=None):
+    robot, task = robot or Panda(block_gripper=True), task or Push()
+    return RobotTaskEnv(robot=robot, task=task, num_envs=N, seed=0)
 
 
-@pytest.mark.parametrize("name", ["sample_goal", "sample_object_joints"])
-def test_a_function_of_an_object_that_is_never_called_is_refused(name):
-    task = Drawer()
-    setattr(task, name, lambda rng: (0.1,))
-    with pytest.raises(ValueError, match=f"{name} of Drawer would never be called"):
-        make(task)
+def step(env, action):
+    return env.step(env.reset().set("action", torch.full((N, 3), action)))["next"]
 
 
-class Composed(Push):
-    """A user's base class whose `sample_start` calls the goal in some episodes."""
-
-    draws = 0
-
-    def sample_start(self, rng):
-        self.draws += 1
-        objects = self.sample_objects(rng)
-        goal = self.sample_goal(rng) if rng.random() < 0.5 else objects[0][:3]
-        return Start(goal, objects)
+def test_a_tasks_own_goal_and_success_are_used():
+    with make() as env, make(FarPush()) as far:
+        plain, other = step(env, 1.0), step(far, 1.0)
+    moved = plain["achieved_goal"].double() + 1.0
+    assert other["achieved_goal"].allclose(moved.float())
+    assert other["success"].equal(plain["success"])
 
 
-class GoalOfComposed(Composed):
-    def sample_goal(self, rng):
-        return (0.1, 0.1, 0.02)
+def test_a_robots_own_setpoint_and_observation_are_used():
+    with make() as env, make(robot=OwnRobot(block_gripper=True)) as own:
+        plain, other = step(env, 1.0), step(own, -1.0)
+    expected = plain["observation"].clone()
+    expected[:, :6] *= -1
+    assert other["observation"].equal(expected)
 
 
-class Failing(Composed):
-    """Its draws fail until the environment calls `randomize`."""
-
-    ready = False
-
-    def sample_objects(self, rng):
-        if not self.ready:
-            raise RuntimeError("not ready")
-        return super().sample_objects(rng)
-
-
-def test_an_override_that_is_called_is_accepted():
-    with make(GoalOfComposed()) as env:
-        assert env.task.draws == 0  # the check draws on a copy
-        goals = {tuple(env.reset()["desired_goal"].tolist()) for _ in range(20)}
-        assert any(goal[:2] == pytest.approx((0.1, 0.1)) for goal in goals)
-        assert env.task.draws == 20
+@pytest.mark.parametrize("threshold", [0.0, 0.04, math.inf])
+def test_success_and_reward_follow_a_threshold_that_changes_later(threshold):
+    with torch_panda.make("PandaPush-v3", num_envs=N, seed=0) as env:
+        env.task.distance_threshold = threshold
+        td = env.reset()
+        state = env.get_state()
+        state["desired_goal"][1:] = state["object_pose"][1:, 0, :3]
+        state["desired_goal"][1, 0] += 0.03
+        td = env.reset(state, set_state=True)
+        td = env.step(td.set("action", torch.zeros(N, 3)))["next"]
+    distance = (td["achieved_goal"] - td["desired_goal"]).norm(dim=1, keepdim=True)
+    assert td["success"].equal(distance < threshold)
+    assert td["reward"].equal(-(distance > threshold).float())
+    assert td["terminated"].equal(td["success"])
 
 
-def test_a_task_whose_draws_fail_at_first_is_accepted():
-    with make(Failing()) as env:
-        env.task.ready = True
-        env.reset()
+def test_a_wrong_selects_state_is_refused():
+    class Doubled(Push):
+        @selects_state
+        def observation(self, simulation):
+            return 2 * super().observation(simulation)
+
+    with make() as env:
+        simulation = env.episodes.simulation
+        with pytest.raises(ValueError, match="declared by selects_state, so it must"):
+            selected_columns(Doubled().observation, simulation)
 
 
-class WithItsOwnStart(GoalOfADrawer):
-    def sample_start(self, rng):
-        start = super().sample_start(rng)
-        return start._replace(goal=self.sample_goal(rng))
+def test_the_callers_action_is_kept_and_not_changed():
+    with make() as env:
+        start = env.reset()
+        action = torch.full((N, 3), 2.0)
+        env.step(start.set("action", action))
+        assert (action == 2.0).all()
+        action.zero_()
+        state = env.get_state(exact=True)
+        assert (state["actions"] == 1.0).all()
 
 
-def test_a_start_that_calls_the_override_is_accepted():
-    with make(WithItsOwnStart()) as env:
-        goal = env.reset()["desired_goal"]
-        assert goal.tolist() == pytest.approx([0.0, 0.0, 0.06])
-
-
-def test_a_function_of_an_object_is_called():
-    task = Push()
-    task.sample_goal = lambda rng: (0.1, 0.1, 0.02)
-    with make(task) as env:
-        assert env.reset()["desired_goal"].tolist() == pytest.approx([0.1, 0.1, 0.02])
+def test_a_step_refuses_a_locked_tensordict():
+    with make() as env:
+        td = env.reset().set("action", torch.ones(N, 3)).lock_()
+        with pytest.raises(RuntimeError, match="locked"):
+            env.step(td)

@@ -1,12 +1,10 @@
 """-v1 against panda-gym 1.1.0 and -v3 against 3.0.7, bit for bit.
 
-Every -v3 id: those with dense rewards have the physics of the others
-(`test_suite.test_reward_types_share_their_physics`), and rewards of both types are
-compared here.
+Every -v3 id is compared, with rewards of both types. An id with dense rewards has the
+physics of the other (`test_suite.test_reward_types_share_their_physics_and_ends`).
 """
 
 import copy
-import functools
 
 import gymnasium
 import numpy as np
@@ -21,9 +19,8 @@ from tests.panda_gym_reference import make_reference, start
 
 # Our ids that panda-gym has registered; the reference imports panda-gym.
 V3_IDS = [env_id for env_id in PHYSICS_IDS if env_id in gymnasium.registry]
-pytestmark = pytest.mark.usefixtures("loop")
 STEPS = 60
-EPISODES = 4
+EPISODES = 3
 KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -125,9 +122,8 @@ def set_table_friction(reference, friction):
     sim.physics_client.changeDynamics(table, -1, lateralFriction=friction)
 
 
-@functools.cache
 def play_reference(env_id):
-    """Play panda-gym's episodes, with which both loops are compared.
+    """Play panda-gym's episodes.
 
     Returns:
         The start as a state, the results of all steps, and the number of contacts.
@@ -171,7 +167,7 @@ def test_equals_panda_gym(env_id):
     with torch_panda.make(env_id, num_envs=EPISODES, seed=3) as env:
         dense_task = copy.copy(env.task)
         dense_task.reward_type = "dense"
-        ours = env.reset(state.clone(), set_state=True)
+        ours = env.reset(state, set_state=True)
         for step, (observations, theirs) in enumerate(steps):
             if theirs:
                 ours = env.step(ours.set("action", theirs["action"]))["next"]

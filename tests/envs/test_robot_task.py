@@ -251,6 +251,8 @@ def test_a_state_can_be_used_again(env):
     run(env, 20)
     state = env.get_state()
     before = state.clone()
+    run(env, 2)
+    assert (state == before).all()  # not a view of the running simulation
     first = env.reset(state, set_state=True)
     assert set(state.keys()) == set(before.keys())
     assert (state == before).all()
@@ -287,7 +289,12 @@ def test_a_bad_state_is_refused_and_changes_nothing(env, key, change, message):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "end"), [("PandaReach-v1", "truncated"), ("PandaReach-v3", "terminated")]
+    ("env_id", "end"),
+    [
+        ("PandaReach-v1", "truncated"),
+        ("PandaReach-v3", "terminated"),
+        ("PandaReachDense-v3", "terminated"),
+    ],
 )
 def test_an_episode_can_start_from_the_last_state_of_another(env_id, end):
     with torch_panda.make(env_id, num_envs=2, seed=0) as env:
@@ -300,7 +307,8 @@ def test_an_episode_can_start_from_the_last_state_of_another(env_id, end):
         td = env.reset(state, set_state=True)
         assert not td["done"].any()
         td = env.step(td.set("action", torch.zeros(2, 3)))["next"]
-        assert td[end].all()
+        assert td[end].all() and td["done"].all()
+        assert td["success"].all()
 
 
 # ---- bad input ---------------------------------------------------------------

@@ -97,10 +97,7 @@ def test_a_state_transform_passes_states_on():
 WRAPPERS_THAT_DROP_STATES = {
     "transformed": make_counted,
     "transformed, with another state": make_with_state,
-    "serial workers": lambda: SerialEnv(2, make_counted),
     "different serial workers": lambda: SerialEnv(2, [make_counted, make_primed]),
-    "transformed serial": lambda: TransformedEnv(SerialEnv(2, make_env), RewardSum()),
-    "parallel": lambda: ParallelEnv(2, make_env),
     "parallel workers": lambda: ParallelEnv(2, make_counted),
     "parallel workers, with another state": lambda: ParallelEnv(2, make_with_state),
 }

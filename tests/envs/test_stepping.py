@@ -1,8 +1,4 @@
-"""The native loop and the ctypes loop give the same numbers and errors.
-
-Further tests of both loops use the fixture ``loop``: parity with panda-gym, histories,
-divergence.
-"""
+"""Steps in threads: equal numbers, errors that name environments, interrupts, forks."""
 
 import dataclasses
 import multiprocessing
@@ -19,14 +15,7 @@ import torch
 from tensordict import TensorDict
 
 import torch_panda
-from torch_panda import (
-    Panda,
-    PhysicsParams,
-    Push,
-    Randomization,
-    RobotTaskEnv,
-    WorkerError,
-)
+from torch_panda import Panda, PhysicsParams, Push, RobotTaskEnv, WorkerError
 from torch_panda.bullet import (
     BulletError,
     MotorControl,
@@ -37,21 +26,10 @@ from torch_panda.bullet import (
     native,
 )
 
-IDS = (
-    "PandaReachJoints-v3",
-    "PandaPush-v1",
-    "PandaPickAndPlace-v3",
-    "PandaStackJoints-v1",
-)
 N = 3
-RANDOMIZATION = Randomization(object_mass=(0.5, 2.0), joint_position=0.1)
-SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
 
 remove_body = library.bind(
     library.WORK, "b3InitRemoveBodyCommand", c_void_p, c_void_p, c_int
-)
-needs_native = pytest.mark.skipif(
-    native.LIBRARY is None, reason="installed where there was no C compiler"
 )
 
 
@@ -66,9 +44,8 @@ def own_threads():
 
 
 @pytest.fixture
-def env(loop):
+def env():
     with make() as env:
-        assert (env.episodes.simulation._native is None) == (loop == "ctypes")
         yield env
 
 
@@ -76,83 +53,36 @@ def detections(env):
     return [client.num_detections for client in env.episodes.simulation.clients]
 
 
-def observe_two_episodes(env, *, masks):
-    """Observations and states; with masks, some environments step at a time."""
-    generator, observed = torch.Generator().manual_seed(0), []
-    for _episode in range(2):
-        td = env.reset()
-        for _ in range(12):
-            action = torch.rand(env.action_spec.shape, generator=generator) * 3 - 1.5
-            td["action"] = action
-            if masks:
-                td["_step"] = torch.rand(N, 1, generator=generator) < 0.6
-            td = env.step(td)["next"].exclude("_step")
-            observed.append(td)
-            mask = torch.rand(N, 1, generator=generator) < 0.1
-            if masks and mask.any():
-                td = env.reset(td.set("_reset", mask)).exclude("_reset")
-                observed.append(td)
-        observed.append(env.get_state())
-    return observed, detections(env)
+def push(td):
+    towards = td["achieved_goal"] - td["observation"][:, :3]
+    return td.set("action", 20 * towards)
 
 
-@needs_native
-@pytest.mark.parametrize(
-    ("env_id", "options", "masks"),
-    [
-        *((env_id, {}, False) for env_id in IDS),
-        ("PandaPickAndPlace-v1", {"sensors": SENSORS}, False),
-        ("PandaPush-v1", {"physics": "fast", "num_threads": 1}, False),
-        ("PandaPush-v1", {"randomize": RANDOMIZATION}, True),
-        ("PandaDrawer-v1", {}, True),  # an object with a joint
-        ("PandaStack-v1", {}, True),
-        *(
-            ("PandaPickAndPlace-v1", {"robot_options": {"control_type": name}}, False)
-            for name in ("ee_pose", "joint_velocity", "joint_torque")
-        ),
-    ],
-)
-def test_both_loops_give_the_same_numbers(monkeypatch, env_id, options, masks):
-    results = {}
-    for name in ("native", "ctypes"):
-        monkeypatch.setenv(native.LOOP_VARIABLE, name)
-        with make(env_id, **options) as env:
-            results[name] = observe_two_episodes(env, masks=masks)
-    (ours, ours_detected), (theirs, theirs_detected) = results.values()
-    assert ours_detected == theirs_detected
-    for one, other in zip(ours, theirs, strict=True):
-        assert (one == other).all()
+@pytest.mark.skipif(native.LIBRARY is None, reason="there is only one loop")
+def test_both_loops_give_the_same_numbers(monkeypatch):
+    rollouts = []
+    for loop in ("native", "ctypes"):
+        monkeypatch.setenv(native.LOOP_VARIABLE, loop)
+        with make() as env:
+            rollouts.append(env.rollout(8, push))
+    assert (rollouts[0] == rollouts[1]).all()
 
 
-def test_as_many_threads_as_environments_give_the_same_numbers(loop):
-    def push(td):
-        towards = td["achieved_goal"] - td["observation"][:, :3]
-        return td.set("action", 20 * towards)
-
-    def rollout(num_threads):
-        with make(num_envs=16, num_threads=num_threads) as env:
-            return env.rollout(12, push)
-
-    assert (rollout(1) == rollout(16)).all()
-
-
-# Fewer substeps than in a piece, and a number that is not a multiple of a piece.
-@needs_native
+# A step is cut into pieces of 5 substeps.
 @pytest.mark.parametrize("n_substeps", [1, 7])
-def test_clients_stepped_whole_or_in_pieces_give_the_same_numbers(n_substeps):
+def test_the_number_of_threads_does_not_change_the_numbers(n_substeps):
     def rollout(num_threads):
         physics = PhysicsParams(n_substeps=n_substeps)
         with make(num_envs=6, num_threads=num_threads, physics=physics) as env:
-            steps = env.rollout(10, lambda td: td.set("action", torch.ones(6, 3)))
-            return steps, detections(env)
+            return env.rollout(10, push), detections(env)
 
-    (one, one_detected), (two, two_detected) = rollout(1), rollout(2)
-    assert torch.equal(one["next", "observation"], two["next", "observation"])
-    assert one_detected == two_detected
+    (one, one_detected), *others = map(rollout, (1, 2, 6))
+    for other, other_detected in others:
+        assert (one == other).all()
+        assert one_detected == other_detected
 
 
-@needs_native
-def test_both_loops_step_an_arm_alone_alike(monkeypatch):
+def test_an_arm_alone_steps_the_same_in_every_episode():
     """With a single body, the broad phase has no pair that resets its cursor."""
 
     def build(client):
@@ -160,18 +90,16 @@ def test_both_loops_step_an_arm_alone_alike(monkeypatch):
         joints = [joint.number for joint in client.joints(arm) if joint.is_movable]
         return Scene(arm, tuple(joints), ee_link=11)
 
-    results = []
-    for name in ("native", "ctypes"):
-        monkeypatch.setenv(native.LOOP_VARIABLE, name)
-        simulation = VectorSimulation(build, N)
-        for _episode in range(2):
-            simulation.joint_position[:] = torch.linspace(-1, 0, N * 9).view(N, 9)
-            simulation.joint_velocity[:] = 0.0
-            simulation.reset(range(N))
-            simulation.step(MotorControl((50.0,) * 9), np.zeros((N, 9)))
-        results.append((simulation.ee_position.clone(), simulation.ee_velocity.clone()))
-        simulation.close()
-    assert all(map(torch.equal, *results))
+    simulation = VectorSimulation(build, N)
+    positions = []
+    for _episode in range(2):
+        simulation.joint_position[:] = torch.linspace(-1, 0, N * 9).view(N, 9)
+        simulation.joint_velocity[:] = 0.0
+        simulation.reset(range(N))
+        simulation.step(MotorControl((50.0,) * 9), np.zeros((N, 9)))
+        positions.append(simulation.ee_position.clone())
+    simulation.close()
+    assert torch.equal(*positions)
 
 
 # ---- errors --------------------------------------------------------------------------
@@ -214,26 +142,6 @@ def test_an_error_names_the_environment_and_the_others_go_on(env, broken):
     assert env.rollout(5).shape == (N, 5)
 
 
-@needs_native
-def test_after_ctrl_c_in_close_a_second_close_frees_the_rest(monkeypatch):
-    destroyed = []
-
-    def destroy_and_interrupt(loop, destroy=native.LIBRARY.destroy):
-        if not destroyed:
-            destroy(loop)
-        destroyed.append(loop)
-        raise KeyboardInterrupt
-
-    env = make()
-    env.reset()
-    monkeypatch.setattr(native.LIBRARY, "destroy", destroy_and_interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        env.close()
-    env.close()
-    assert len(destroyed) == 1
-    assert all(client.is_closed for client in env.episodes.simulation.clients)
-
-
 def test_a_step_names_the_environment_of_a_closed_client(env):
     env.reset()
     env.episodes.simulation.clients[1].close()
@@ -268,38 +176,29 @@ def test_a_failed_reset_names_its_environment_and_blocks_steps(env):
             step(env)
 
 
-# Both loops have the same checks of arguments.
 @pytest.fixture(scope="module")
 def checked():
     with make() as env:
         yield env
 
 
-def test_a_setpoint_of_another_shape_is_refused(checked):
-    control = checked.robot.motor_control
-    with pytest.raises(ValueError, match=r"must have shape \(3, 5\), got \(3, 4\)"):
-        checked.episodes.simulation.step(control, np.zeros((N, 4)))
-
-
-def test_forces_of_another_robot_are_refused(checked):
-    with pytest.raises(ValueError, match="a force for each of 9 movable joints, got 4"):
-        checked.episodes.simulation.step(MotorControl((1.0,) * 4), np.zeros((N, 4)))
-
-
-def test_inverse_kinematics_without_an_arm_are_refused(checked):
-    control = MotorControl((1.0,) * 9, ik_link=11, ik_orientation=(1.0, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="ik_link needs num_arm_joints"):
-        checked.episodes.simulation.step(control, np.zeros((N, 12)))
-
-
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [("num_arm_joints", 12), ("num_arm_joints", -3), ("ik_link", -1)],
+    ("changes", "size", "message"),
+    [
+        ({}, 4, r"must have shape \(3, 5\), got \(3, 4\)"),
+        ({"forces": (1.0,) * 4}, 5, "a force for each of 9 movable joints, got 4"),
+        ({"num_arm_joints": 0}, 12, "ik_link needs num_arm_joints"),
+        ({"num_arm_joints": 12}, 5, "num_arm_joints must be .* got 12"),
+        ({"ik_link": -1}, 5, "ik_link must be .* got -1"),
+    ],
 )
-def test_a_control_whose_fields_are_out_of_range_is_refused(checked, field, value):
-    control = dataclasses.replace(checked.robot.motor_control, **{field: value})
-    with pytest.raises(ValueError, match=f"{field} must be .* got {value}"):
-        checked.episodes.simulation.step(control, np.zeros((N, control.setpoint_dim)))
+def test_a_control_that_does_not_fit_the_robot_is_refused(
+    checked, changes, size, message
+):
+    """C code would read beyond the end of an array."""
+    control = dataclasses.replace(checked.robot.motor_control, **changes)
+    with pytest.raises(ValueError, match=message):
+        checked.episodes.simulation.step(control, np.zeros((N, size)))
 
 
 @pytest.mark.parametrize("envs", [[N], [-1], [0, 1, 0]])
@@ -317,8 +216,8 @@ def test_clients_that_do_not_exist_or_are_named_twice_are_refused(checked, envs)
 # ---- interrupts, processes, threads --------------------------------------------------
 
 
-def test_a_step_is_finished_before_an_interrupt_is_raised(loop):
-    physics = PhysicsParams(n_substeps=400)
+def test_a_step_is_finished_before_an_interrupt_is_raised():
+    physics = PhysicsParams(n_substeps=200)
     with make(physics=physics) as env:
         env.reset()
         before = detections(env)
@@ -334,7 +233,7 @@ def test_a_step_is_finished_before_an_interrupt_is_raised(loop):
         with pytest.raises(KeyboardInterrupt):
             step(env)
         thread.join()
-        assert detections(env) == [count + 400 for count in before]
+        assert detections(env) == [count + 200 for count in before]
         assert env.get_state()["step_count"].flatten().tolist() == [1] * N
         with make(physics=physics) as other:
             other.reset()
@@ -368,7 +267,7 @@ def test_a_forked_child_has_threads_of_its_own(env):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
-def test_no_thread_is_left_after_close(loop):
+def test_no_thread_is_left_after_close():
     before = own_threads()
     with make() as env:
         env.rollout(3)
@@ -378,10 +277,8 @@ def test_no_thread_is_left_after_close(loop):
         assert time.monotonic() < deadline
 
 
-@needs_native
-def test_denormal_numbers_are_not_flushed_to_zero(monkeypatch):
+def test_denormal_numbers_are_not_flushed_to_zero():
     """torch's setting for the caller's thread must not affect physics."""
-    monkeypatch.setenv(native.LOOP_VARIABLE, "native")
     tiny = 1e-310  # [m/s]
     torch.set_flush_denormal(True)
     try:
@@ -399,7 +296,7 @@ def test_denormal_numbers_are_not_flushed_to_zero(monkeypatch):
     assert (velocity < tiny).all()  # Bullet damps the velocity
 
 
-# ---- which loop ----------------------------------------------------------------------
+# ---- controls in Python --------------------------------------------------------------
 
 
 class OwnControl(Panda):
@@ -412,7 +309,7 @@ class OwnControl(Panda):
         super().control(client, body, setpoint)
 
 
-def test_a_robots_own_control_is_called(loop):
+def test_a_robots_own_control_is_called():
     robots = OwnControl(block_gripper=True), Panda(block_gripper=True)
     states = []
     for robot in robots:
