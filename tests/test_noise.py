@@ -80,6 +80,7 @@ def test_noise_changes_observations_but_not_goals_or_rewards():
         for env in (plain, noisy):
             env.set_seed(0)
         expected, actual = plain.reset(), noisy.reset()
+        assert (actual["observation"] != expected["observation"]).all()
         for _ in range(20):
             for td in (expected, actual):
                 td["action"] = torch.zeros(N, 3)

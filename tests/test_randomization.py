@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from torch_panda import Randomization
+from torch_panda import Randomization, RobotTaskEnv
 from torch_panda.envs.randomization import PARAMETERS
 
 ALL = Randomization(
@@ -40,7 +40,7 @@ def make(randomize=ALL, **options):
     )
 
 
-def test_parameters_are_drawn_per_environment_and_episode(loop):
+def test_parameters_are_drawn_per_environment_and_episode():
     with make() as env:
         check_env_specs(env)
         env.set_seed(0)
@@ -54,7 +54,7 @@ def test_parameters_are_drawn_per_environment_and_episode(loop):
             assert torch.equal(other.reset()["physics_parameters"], expected[:1])
 
 
-def test_episodes_are_reproducible_and_states_exact(loop):
+def test_episodes_are_reproducible_and_states_exact():
     with make() as env, make(num_threads=1) as other:
         push(env)
         env.set_seed(0)
@@ -87,22 +87,79 @@ def test_factors_of_one_change_nothing():
         assert (push(plain) == push(same)).all()
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_every_parameter_changes_what_happens(name):
-    factor = 0.01 if name == "finger_friction" else 0.6
+class Measured(torch_panda.Stack):
+    """Reads the physics of its environment after the randomization changed them."""
 
-    def drop(env):
-        env.reset()
-        state = env.get_state()
-        state["object_pose"][..., 2] += 0.1
-        return push(env, start=env.reset(state, set_state=True))
+    def __init__(self):
+        super().__init__(object_mass=(2.0, 1.0))
+        self.physics = {}
 
-    with make(Randomization(**{name: (factor, factor)})) as env, make(None) as plain:
-        expected, actual = drop(plain), drop(env)
-    assert not torch.equal(actual["observation"], expected["observation"])
-    if name == "object_restitution":
-        height = actual["achieved_goal"][8:, :, 2].amax(0)
-        assert (height > expected["achieved_goal"][8:, :, 2].amax(0) + 0.005).any()
+    def randomize(self, client, bodies, rng):
+        robot = client.bodies[0]
+        others = {*client.bodies} - {robot, *bodies.objects, *bodies.markers}
+        self.physics = {
+            "object_mass": [client.mass(body) for body in bodies.objects],
+            "object_friction": [client.friction(body) for body in bodies.objects],
+            "table_friction": [client.friction(body) for body in sorted(others)],
+            "finger_friction": [client.friction(robot, link) for link in (9, 10)],
+            "object_restitution": [client.restitution(body) for body in bodies.objects],
+            "table_restitution": [client.restitution(body) for body in sorted(others)],
+        }
+
+
+NOMINAL = {
+    "object_mass": [2.0, 1.0],
+    "object_friction": [5.0, 5.0],
+    "table_friction": [0.5, 0.1],  # of the ground and of the table
+    "finger_friction": [1.0, 1.0],
+    "object_restitution": [0.0, 0.0],
+    "table_restitution": [0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("name", [*PARAMETERS[:5], None])
+def test_a_factor_multiplies_the_property_of_its_bodies_alone(name):
+    expected = dict(NOMINAL)
+    if name == "object_restitution":  # 0 times the factor would be 0
+        expected |= {name: [0.6, 0.6], "table_restitution": [1.0, 1.0]}
+    elif name is not None:
+        expected[name] = [0.6 * value for value in NOMINAL[name]]
+    ranges = {} if name is None else {name: (0.6, 0.6)}
+    robot, task = torch_panda.Panda(), Measured()
+    randomize = Randomization(**ranges)
+    with RobotTaskEnv(robot=robot, task=task, randomize=randomize) as env:
+        for _ in range(2):  # factors do not accumulate
+            env.reset()
+            for key, values in expected.items():
+                assert task.physics[key] == pytest.approx(values), key
+
+
+def test_a_factor_of_gravity_changes_how_objects_fall():
+    speeds = []
+    for factor in (1.0, 0.5):
+        with make(Randomization(gravity=(factor, factor))) as env:
+            env.reset()
+            state = env.get_state()
+            state["object_pose"][..., 2] = 1.0
+            td = env.reset(state, set_state=True)
+            env.step(td.set("action", torch.zeros(env.action_spec.shape)))
+            speeds.append(env.get_state()["object_velocity"][:, 0, 2])
+    torch.testing.assert_close(speeds[1], 0.5 * speeds[0], rtol=0.01, atol=0)
+    assert speeds[0] == pytest.approx([-9.81 * 0.04] * 3, rel=0.01)
+
+
+def test_damping_slows_a_falling_arm_down():
+    randomize = Randomization(joint_damping=(5.0, 5.0))
+    options = {"robot_options": {"control_type": "joint_torque"}, "num_envs": 1}
+    speeds = []
+    for physics in (None, randomize):
+        with make(physics, **options) as env:
+            td = env.reset()
+            for _ in range(4):
+                td["action"] = torch.zeros(env.action_spec.shape)
+                td = env.step(td)["next"]
+            speeds.append(env.get_state()["joint_velocity"][0, 1].item())
+    assert 0 < speeds[1] < 0.9 * speeds[0]
 
 
 def test_masses_change_and_a_state_can_set_them():
@@ -157,7 +214,9 @@ def test_joint_positions_start_around_neutral():
             env.robot.neutral_joint_position, dtype=torch.float64
         )
         assert "physics_parameters" not in state
-    assert (offset[:, :7].abs() <= 0.1).all() and (offset[:, :7].abs() > 0).all()
+    arm = offset[:, :7]
+    assert (arm.abs() <= 0.1).all() and (arm > 0).any() and (arm < 0).any()
+    assert len(arm.unique()) == arm.numel()
     assert not offset[:, 7:].any()
 
 

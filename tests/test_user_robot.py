@@ -93,9 +93,11 @@ def pick_and_place(env, steps):
     return td
 
 
-def test_a_tool_has_no_mass(file):
+def test_a_tool_is_at_its_place_and_has_no_mass(file):
     robot = make_gantry(file)
     with RobotTaskEnv(robot=robot, task=Reach()) as env:
+        position = env.reset()["achieved_goal"].tolist()
+        assert position == pytest.approx([0.0, 0.0, 0.3 - 0.065])
         simulation = env.episodes.simulation
         body, client = simulation.scene.robot, simulation.clients[0]
         assert client.mass(body, robot.ee_link) == 0.0

@@ -103,7 +103,7 @@ def push_forward(env):
     return torch.stack(outputs)
 
 
-def test_a_joint_of_an_object_is_state_goal_and_observation(loop):
+def test_a_joint_of_an_object_is_state_goal_and_observation():
     with torch_panda.make(ID, num_envs=3, seed=0) as env:
         check_env_specs(env)
         seen = push_forward(env)
@@ -119,7 +119,7 @@ def test_a_joint_of_an_object_is_state_goal_and_observation(loop):
         assert len(seen[-1]["observation"][:, -2].unique()) == 3
 
 
-def test_the_hooks_of_a_task_are_called(loop):
+def test_the_hooks_of_a_task_are_called():
     with torch_panda.make(ID, num_envs=2, seed=0) as env:
         td = env.reset()
         assert not td["terminated"].any()
@@ -138,7 +138,7 @@ def test_the_hooks_of_a_task_are_called(loop):
         assert not env.reset(td)["done"].any()
 
 
-def test_episodes_and_exact_states_repeat_bit_for_bit(loop):
+def test_episodes_and_exact_states_repeat_bit_for_bit():
     with (
         torch_panda.make(ID, num_envs=3, seed=5) as env,
         torch_panda.make(ID, num_envs=2, seed=5, num_threads=1) as other,

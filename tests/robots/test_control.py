@@ -1,4 +1,4 @@
-"""Actions under each control type, with the compiled loop and with Python's."""
+"""Actions under each control type, grippers, workspaces and bases."""
 
 import math
 from itertools import product
@@ -60,7 +60,31 @@ def test_the_control_type_determines_the_size_of_actions(control_type):
         assert env.action_spec.shape == (1, DIMS[control_type])
 
 
-def test_a_joint_moves_at_the_velocity_of_the_action(loop):
+def test_the_default_scales_of_actions_are_the_published_ones():
+    """5 cm, 0.05 rad, 1.25 rad/s, and the whole torque."""
+    scales = [Panda(control_type=name).action_scale for name in DIMS]
+    assert scales == [0.05, 0.05, 0.05, 1.25, 1.0]
+
+
+def test_an_action_displaces_the_setpoint_by_its_scale():
+    for control_type, size in (("ee", 3), ("joints", 7)):
+        action = torch.linspace(0.6, -0.8, size + 1).unsqueeze(0)
+        with make(control_type=control_type) as env:
+            env.reset()
+            simulation = env.episodes.simulation
+            present = simulation.ee_position
+            if control_type == "joints":
+                present = simulation.joint_position[:, :7]
+            setpoint = env.robot.setpoint(action, simulation)
+            moved = setpoint[:, :size] - present
+            torch.testing.assert_close(moved.float(), 0.05 * action[:, :size])
+            # The fingers are closed, and stay so under a negative number: below 0.
+            expected = torch.full((1, 2), -0.8 * 0.2 / 2, dtype=torch.float64)
+            fingers = setpoint[:, size:]
+            torch.testing.assert_close(fingers, expected, atol=1e-6, rtol=0)
+
+
+def test_a_joint_moves_at_the_velocity_of_the_action():
     with make(control_type="joint_velocity") as env:
         simulation, _ = hold(env, unit(8, 3, 0.4))
         assert simulation.joint_velocity[0, 3] == pytest.approx(0.5, abs=0.02)
@@ -71,7 +95,7 @@ def test_a_joint_moves_at_the_velocity_of_the_action(loop):
         assert simulation.joint_velocity[0, 3] == pytest.approx(0.2, abs=0.02)
 
 
-def test_torques_move_the_arm_as_in_pybullet(loop):
+def test_torques_move_the_arm_as_in_pybullet():
     with make("PandaReach-v1", control_type="joint_torque", action_scale=0.1) as env:
         action = torch.tensor([0.3, -0.2, 0.1, 0.4, 0.0, -0.5, 0.2])
         simulation, _ = hold(env, action, steps=3)
@@ -101,7 +125,7 @@ def test_torques_move_the_arm_as_in_pybullet(loop):
     assert moved.abs().max() > 0.02
 
 
-def test_ee_pose_moves_along_the_world_and_rotates_in_the_hand_frame(loop):
+def test_ee_pose_moves_along_the_world_and_rotates_in_the_hand_frame():
     start = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     with make(control_type="ee_pose") as env:
         simulation, td = hold(env, torch.zeros(7))
@@ -151,14 +175,16 @@ def test_a_smaller_action_scale_moves_the_hand_less():
     assert 0 < near - start < 0.6 * (far - start)
 
 
-def test_the_hand_stays_in_the_workspace():
-    box = ((-0.1, -0.05, 0.15), (0.1, 0.05, 0.25))
-    with make(workspace=box) as env:
-        for action in product((-1.0, 1.0), repeat=3):
-            _, td = hold(env, torch.tensor((*action, 0.0)), 20)
-            position = td["observation"][0, :3]
-            low, high = torch.tensor(box)
-            assert (position > low - 0.02).all() and (position < high + 0.02).all()
+@pytest.mark.parametrize("control_type", ["ee", "ee_pose"])
+def test_the_hand_stays_in_the_workspace(control_type):
+    box = torch.tensor([[-0.1, -0.05, 0.15], [0.1, 0.05, 0.25]])
+    with make(control_type=control_type, workspace=box.tolist()) as env:
+        for direction, corner in zip((-1.0, 1.0), box, strict=True):
+            action = torch.zeros(env.action_spec.shape)
+            action[:, :3] = direction
+            _, td = hold(env, action, 20)
+            error = td["observation"][0, :3] - corner
+            assert error.abs().max() < 0.02  # it gets there, and no farther
 
 
 def test_a_robot_on_a_turned_base_moves_in_the_turned_directions():
@@ -199,6 +225,25 @@ def test_grippers_that_cannot_move_are_refused():
         Gripper(closed=(0.0,), opened=(0.0,), width=0.1)
     with pytest.raises(ValueError, match="width must be finite and above 0"):
         Gripper(closed=(0.0,), opened=(0.1,), width=0.0)
+
+
+def test_a_gripper_changes_the_distance_between_its_fingers():
+    """By 20 cm for an action of 1; at 4 cm, and an action of 0.1, to 6 cm."""
+    gripper = Panda().gripper
+    joints = torch.tensor([[0.025, 0.015]], dtype=torch.float64)
+    width = gripper.fingers_width(joints)
+    torch.testing.assert_close(width, torch.tensor([[0.04]], dtype=torch.float64))
+    setpoint = gripper.setpoint(torch.tensor([[0.1]]), joints)
+    assert setpoint[0].tolist() == pytest.approx([0.03, 0.03], abs=1e-7)
+
+
+def test_fingers_that_follow_match_the_joint_that_leads():
+    gripper = Gripper(closed=(0.8, 0.8), opened=(0.0, 0.0), width=0.1, followers=(1,))
+    joints = torch.tensor([[0.4, 0.7]], dtype=torch.float64)  # the second one lags
+    assert gripper.fingers_width(joints).item() == pytest.approx(0.05)
+    setpoint = gripper.setpoint(torch.tensor([[0.1]]), joints)
+    # The first joint leads to a width of 7 cm. The second goes to the present 5 cm.
+    assert setpoint[0].tolist() == pytest.approx([0.24, 0.4], abs=1e-6)
 
 
 def test_fingers_open_as_wide_as_the_gripper_allows():
