@@ -7,7 +7,6 @@ one process, which is the fastest way on one machine. Several processes are fast
 where the policy or the transforms of the environment are slow Python code.
 """
 
-import os
 from functools import partial
 
 import torch
@@ -16,6 +15,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import ParallelEnv
 
 import torch_panda
+from torch_panda.bullet.pool import num_cores
 from torch_panda.transforms import HindsightRelabel
 
 NUM_WORKERS = 2
@@ -29,7 +29,7 @@ def make_env(seed: int) -> torch_panda.RobotTaskEnv:
     An episode depends on (seed, environment, number of the episode) alone, so two
     workers with the same seed would run the same episodes. The workers share the cores.
     """
-    threads = max(1, (os.cpu_count() or 1) // NUM_WORKERS)
+    threads = max(1, num_cores() // NUM_WORKERS)
     return torch_panda.make(
         "PandaPush-v1", num_envs=NUM_ENVS, num_threads=threads, seed=seed
     )

@@ -20,7 +20,7 @@ def test_the_text_has_versions_and_the_sizes_of_every_environment(capsys):
     main(["info"])
     output = capsys.readouterr().out
     assert re.search(r"pybullet 3\.\d", output)
-    assert "default: one per core" in output
+    assert "default: one per core that this process may use" in output
     push = "PandaPush{-v1,-v3,Dense-v1,Dense-v3}"
     assert f"{push}: observation 18, goal 3, action 3 in [-1, 1], 50 steps" in output
     ids = [

@@ -12,6 +12,7 @@ import torch
 import torch_panda
 from torch_panda.bullet import solver
 from torch_panda.bullet.native import loop_name, loop_problem
+from torch_panda.bullet.pool import num_cores
 from torch_panda.extras import EXTRAS, install_command
 
 _PACKAGES = (
@@ -26,14 +27,6 @@ _PACKAGES = (
     "stable-baselines3",
     "gymnasium-robotics",
 )
-
-
-def num_cores() -> int:
-    """Number of processor cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # macOS
-        return os.cpu_count() or 1
 
 
 def versions() -> dict[str, str]:
@@ -112,8 +105,8 @@ def describe() -> str:
     sections = {
         "versions": [f"{name} {number}" for name, number in versions().items()],
         "threads": [
-            f"default: one per core, here {os.cpu_count()}, and at most one per "
-            f"environment; this process may use {num_cores()} cores"
+            "default: one per core that this process may use, here "
+            f"{num_cores()} of {os.cpu_count()}, and at most one per environment"
         ],
         "stepping": [stepping()],
         "solver": [str(solver.activate())],

@@ -230,8 +230,8 @@ def make(
         env_id: One of `ENV_IDS`, or an id that was registered with `register`.
         num_envs: Number of environments stepped in parallel; the batch size is
             [num_envs]. None makes one environment of batch size [].
-        num_threads: Number of threads that step them; None means one per core, at most
-            ``num_envs``.
+        num_threads: Number of threads that step them; None means one per core that
+            the process may use, at most ``num_envs``.
         seed: Seed of all random draws; None draws one from the operating system.
         device: Device of all outputs; None means the CPU.
         from_pixels: Observe ``pixels``, uint8 (*batch, height, width, 3).

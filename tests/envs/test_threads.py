@@ -5,6 +5,7 @@ Two threads in one Bullet client crash the interpreter, so this test runs in a p
 
 import functools
 import gc
+import os
 import subprocess
 import sys
 import tempfile
@@ -112,3 +113,13 @@ def test_every_call_is_refused_while_another_thread_is_inside(monkeypatch, call)
         may_leave.set()
         thread.join()
         calls[call]()
+
+
+@pytest.mark.parametrize(("num_envs", "num_threads"), [(1, 1), (4, 3)])
+def test_the_default_is_one_thread_per_core_that_the_process_may_use(
+    monkeypatch, num_envs, num_threads
+):
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 5, 9}, raising=False)
+    with torch_panda.make("PandaReach-v1", num_envs=num_envs) as env:
+        assert env.num_threads == num_threads

@@ -8,6 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 Work = Callable[[int], None]
 
 
+def num_cores() -> int:
+    """Number of processor cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS and Windows
+        return os.cpu_count() or 1
+
+
 class _Job:
     """One parallel loop: the indices that threads take, and the errors of the work."""
 

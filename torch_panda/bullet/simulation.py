@@ -1,6 +1,5 @@
 """Many clients of one scene, stepped in parallel."""
 
-import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -14,7 +13,7 @@ from torch_panda.bullet.control import Control, MotorControl
 from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.native_loop import NativeLoop
 from torch_panda.bullet.physics import EXACT, PhysicsParams
-from torch_panda.bullet.pool import Work, WorkerPool
+from torch_panda.bullet.pool import Work, WorkerPool, num_cores
 from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.state import SimulationState
 
@@ -26,7 +25,8 @@ class VectorSimulation:
         build: Function that builds the scene in a client. It is called for one client
             after another and must build the same scene every time.
         num_envs: Number of clients.
-        num_threads: Number of threads; None means one per core, at most ``num_envs``.
+        num_threads: Number of threads, at most ``num_envs``. None means one per core
+            that the process may use.
         physics: Parameters of the integration.
 
     Raises:
@@ -56,7 +56,7 @@ class VectorSimulation:
         physics: PhysicsParams = EXACT,
     ) -> None:
         if num_threads is None:
-            num_threads = os.cpu_count() or 1
+            num_threads = num_cores()
         is_native = loop_name() == "native"
         self.n_substeps = physics.n_substeps
         self.ctrl_dt = physics.ctrl_dt

@@ -30,8 +30,8 @@ from tqdm import tqdm
 
 import torch_panda
 from torch_panda.bullet.native import loop_name
+from torch_panda.bullet.pool import num_cores
 from torch_panda.bullet.solver import SOLVER_VARIABLE
-from torch_panda.info import num_cores
 from torch_panda.learning import files
 from torch_panda.learning.limits import Positive, check_limits
 from torch_panda.learning.user_modules import (
@@ -64,8 +64,8 @@ class Args:
     num_envs: tuple[Positive, ...] = (16,)
     """numbers of environments stepped in parallel"""
     num_threads: Positive | None = None
-    """number of threads of contenders that use threads; None means one per core, and at
-    most one per environment"""
+    """number of threads of contenders that use threads; None means one per core
+    that the process may use, and at most one per environment"""
     others: tuple[Other, ...] = get_args(Other)
     """contenders beside torch_panda. A contender whose libraries are missing is left
     out"""

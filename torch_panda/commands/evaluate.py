@@ -35,7 +35,8 @@ class Args:
     num_envs: Positive = 32
     """number of environments stepped in parallel"""
     num_threads: Positive | None = None
-    """number of threads that step the environments; None means one per core"""
+    """number of threads that step the environments; None means one per core that the
+    process may use"""
     seed: Seed = 1_000
     """seed of the environments"""
     task_options: dict[str, Finite] = field(default_factory=dict)

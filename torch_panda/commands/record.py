@@ -58,7 +58,8 @@ class Args:
     num_envs: Positive = 32
     """number of environments stepped in parallel"""
     num_threads: Positive | None = None
-    """number of threads that step the environments; None means one per core"""
+    """number of threads that step the environments; None means one per core that the
+    process may use"""
     noise_eps: Weight = 0.0
     """standard deviation of Gaussian noise on the executed actions. The file holds the
     expert's actions without noise, which correct the errors that the noise causes

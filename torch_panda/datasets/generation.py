@@ -56,7 +56,8 @@ def generate(
         transitions: Number of transitions, rounded up to whole episodes.
         seed: Seed of the data set.
         num_envs: Number of environments stepped in parallel.
-        num_threads: Number of threads that step them; None means one per core.
+        num_threads: Number of threads that step them; None means one per core
+            that the process may use.
         progress: Called with the number of new transitions after every step.
         **make_options: Further arguments of `torch_panda.make`.
 

@@ -82,7 +82,7 @@ class RobotTaskEnv(EnvBase):
         num_envs: Number of environments stepped in parallel; the batch size is
             [num_envs]. None makes one environment of batch size [].
         num_threads: Number of threads that step the environments; None means one per
-            core, at most ``num_envs``.
+            core that the process may use, at most ``num_envs``.
         seed: Seed of all random draws; None draws one from the operating system. Two
             environments with the same seed play the same episodes, so give each worker
             process a seed of its own.
