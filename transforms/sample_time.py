@@ -53,6 +53,7 @@ class SampleTimeTransform(BufferTransform):
         # transitions of this write.
         self._last_write = 0, 0
 
+    @torch.compiler.disable  # a compiled loop may write too; see `forward`
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Remembers the transitions that are about to be stored."""
         buffer, method = find_buffer()
@@ -117,6 +118,10 @@ class SampleTimeTransform(BufferTransform):
                 "a ConsumingSampler or consume_after_n_samples"
             )
 
+    # A compiled loss may sample. `torch.compile` cannot trace numpy code whose sizes
+    # vary from batch to batch, so break the graph here. This also keeps the call stack
+    # that `find_buffer` reads.
+    @torch.compiler.disable
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Gives sampled transitions other goals."""
         buffer, method = find_buffer()
