@@ -248,7 +248,7 @@ class BufferTransform(envs.Transform):
         self._check_written(batch, keeps_rows=self._keeps_rows)
         check_goals_agree(flat, rewriter)
         goals: Any = [achieved.numpy(force=True)]
-        if any(DESIRED in mixture.weights for mixture in self._get_mixtures()):
+        if self._draws_desired():
             goals.append(desired.numpy(force=True))
         root_goals = None if root_goal is None else root_goal.numpy(force=True)
         is_done = done.numpy(force=True).reshape(-1)
@@ -262,6 +262,10 @@ class BufferTransform(envs.Transform):
     def _get_mixtures(self) -> Collection[Mixture]:
         """Returns the mixtures of strategies from which goals are drawn."""
         return [self._mixture]
+
+    def _draws_desired(self) -> bool:
+        """Returns whether a strategy draws from the desired goals."""
+        return any(DESIRED in mixture.weights for mixture in self._get_mixtures())
 
     def _claim(self, buffer: ReplayBuffer | None) -> None:
         """Binds the transform to the buffer.
@@ -420,9 +424,14 @@ class BufferTransform(envs.Transform):
             return {"memory": self._memory.state(), "generator": random_state}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores the state that `get_extra_state` returned."""
+        """Restores the state that `get_extra_state` returned.
+
+        Raises:
+            ValueError: A strategy draws from the desired goals, but the state lacks
+                them.
+        """
         with self._lock:
-            self._memory.load(state["memory"])
+            self._memory.load(state["memory"], needs_desired=self._draws_desired())
             if state["generator"] is not None:
                 self._generator = self._generator or torch.Generator("cpu")
                 self._generator.set_state(state["generator"])

@@ -293,8 +293,25 @@ class GoalMemory:
             "_free_regions": copy.deepcopy(self._free_blocks),
         }
 
-    def load(self, state: dict[str, Any]) -> None:
-        """Restores a copy of the contents that `state` returned."""
+    def load(self, state: dict[str, Any], *, needs_desired: bool) -> None:
+        """Restores a copy of the contents that `state` returned.
+
+        Args:
+            state: The contents.
+            needs_desired: Whether a strategy draws from the desired goals.
+
+        Raises:
+            ValueError: Desired goals are needed, but the contents lack them.
+        """
+        num_columns = 2 if needs_desired else 1
+        if state["count"] and state["_goals"].shape[1] < num_columns:
+            raise ValueError(
+                "the saved transitions cannot be sampled with the strategy "
+                f"{DESIRED!r}: the desired goals were not saved, because the strategy "
+                f"at that time drew none; load them with a strategy without "
+                f"{DESIRED!r}, or pass the stored rows through prepare() of a new "
+                "transform"
+            )
 
         def to_array(tensor: Tensor) -> NDArray[Any]:
             return tensor.numpy(force=True).copy()
@@ -311,7 +328,10 @@ class GoalMemory:
         self._ring = to_array(state["_ring"]).view(_POSITION).ravel()
         self._trajectories = to_array(state["_table"]).view(_TRAJECTORY).ravel()
         self._free_numbers = [*state["_unused"]]
-        self._goals, self._num_block_rows = to_array(state["_goals"]), state["_used"]
+        # Drop saved desired goals that no strategy draws, because they would not be
+        # saved for later transitions.
+        self._goals = to_array(state["_goals"][:, :num_columns])
+        self._num_block_rows = state["_used"]
         self._free_blocks = copy.deepcopy(state["_free_regions"])
 
     def __getstate__(self) -> dict[str, Any]:
