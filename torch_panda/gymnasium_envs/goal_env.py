@@ -16,6 +16,7 @@ from torch_panda.gymnasium_envs.rendering import (
     check_render_mode,
     take_camera,
 )
+from torch_panda.gymnasium_envs.spec import SpecAttribute, read_json
 from torch_panda.registry import make
 from torch_panda.rendering import Camera
 
@@ -33,7 +34,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
             from an id leaves truncation to the ``TimeLimit`` of ``gymnasium.make``.
         render_mode: "rgb_array" or None.
         render_camera: Camera of `render`; None means panda-gym's view in 720 x 480
-            pixels.
+            pixels. This and the arguments ``camera``, ``physics`` and ``randomize`` may
+            also be mappings of the fields, as they are in an ``EnvSpec`` from JSON.
         **arguments: panda-gym's arguments of the camera: ``render_width``,
             ``render_height``, ``render_target_position``, ``render_distance``,
             ``render_yaw``, ``render_pitch`` and ``render_roll``. If ``env`` is an id,
@@ -52,6 +54,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         "render_modes": list(RENDER_MODES),
         "render_fps": 25,
     }
+    spec = SpecAttribute()
 
     def __init__(
         self,
@@ -62,7 +65,8 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         **arguments: Any,  # noqa: ANN401 (of torch_panda.make)
     ) -> None:
         check_render_mode(render_mode)
-        self._camera = take_camera(render_camera, arguments)
+        arguments = read_json({"render_camera": render_camera, **arguments})
+        self._camera = take_camera(arguments.pop("render_camera"), arguments)
         if isinstance(env, str):
             env = make(env, **{"max_episode_steps": sys.maxsize, **arguments})
         else:

@@ -17,6 +17,7 @@ from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
 from torch_panda.gymnasium_envs.goal_env import check_no_arguments, metadata_of
 from torch_panda.gymnasium_envs.rendering import check_render_mode, take_camera
+from torch_panda.gymnasium_envs.spec import SpecAttribute, read_json
 from torch_panda.registry import make
 from torch_panda.rendering import Camera
 
@@ -54,6 +55,8 @@ class GoalVectorEnv(
         autoreset_mode: When environments are reset.
     """
 
+    spec = SpecAttribute()
+
     def __init__(
         self,
         env: str | RobotTaskEnv,
@@ -67,7 +70,8 @@ class GoalVectorEnv(
         self.closed = True  # nothing needs closing until everything is built
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         check_render_mode(render_mode)
-        self._camera = take_camera(render_camera, arguments)
+        arguments = read_json({"render_camera": render_camera, **arguments})
+        self._camera = take_camera(arguments.pop("render_camera"), arguments)
         if isinstance(env, str):
             env = make(env, num_envs=1 if num_envs is None else num_envs, **arguments)
         else:
