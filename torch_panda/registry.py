@@ -259,7 +259,7 @@ def make(
     options.setdefault("terminate_on_success", registration.terminate_on_success)
     if options.get("max_episode_steps") is None:
         options["max_episode_steps"] = registration.max_episode_steps
-    return RobotTaskEnv(
+    env = RobotTaskEnv(
         robot=registration.make_robot(robot_options),
         task=registration.make_task(task_options),
         num_envs=num_envs,
@@ -277,6 +277,8 @@ def make(
         observe_state=not pixels_only,
         **options,
     )
+    env._env_id = env_id
+    return env
 
 
 def register(

@@ -88,7 +88,93 @@ def test_ctrl_c_leaves_no_incomplete_data_set(tmp_path, monkeypatch):
     assert len(minari.load_dataset("panda/reach-v0")) == 1
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # of missing metadata
+def collect(env_id, *, dataset_id="panda/collected-v0", infos=None, **options):
+    """Two random episodes, in the entries that Minari's `DataCollector` writes.
+
+    By default, a `DataCollector` stores no infos. Tests do not use it, because it needs
+    jax.
+    """
+    env = gymnasium.make(f"torch_panda/{env_id}", max_episode_steps=6, **options)
+    buffers = []
+    for seed in range(2):
+        states, steps, ended = [env.reset(seed=seed)[0]], [], False
+        while not ended:
+            action = np.random.default_rng(seed).uniform(-1, 1, 3).astype(np.float32)
+            state, *outcome, _ = env.step(action)
+            states.append(state)
+            steps.append((action, *outcome))
+            ended = outcome[1] or outcome[2]
+        actions, rewards, terminations, truncations = map(
+            list, zip(*steps, strict=True)
+        )
+        buffers.append(
+            minari.data_collector.EpisodeBuffer(
+                id=seed,
+                seed=seed,
+                observations={key: [x[key] for x in states] for key in states[0]},
+                actions=actions,
+                rewards=rewards,
+                terminations=terminations,
+                truncations=truncations,
+                infos={key: [False] * len(states) for key in infos or ()},
+            )
+        )
+    minari.create_dataset_from_buffers(dataset_id, buffers, env=env, data_format="hdf5")
+    env.close()
+    return minari.storage.get_dataset_path(dataset_id)
+
+
+def read(path, env_id, **options):
+    with torch_panda.make(env_id, num_envs=1, **options) as env:
+        return read_demos(path, env)
+
+
+MISSING_METADATA = pytest.mark.filterwarnings("ignore::UserWarning")
+
+
+@MISSING_METADATA
+@pytest.mark.parametrize("infos", [None, ["is_success"], ["cost"]])
+def test_data_of_minaris_collector_are_read(infos, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    path = collect("PandaReach-v1", infos=infos)
+    demos = read(path, "PandaReach-v1")
+    assert len(demos) == 12
+    success = demos["next", "reward"] == 0
+    assert torch.equal(demos["next", "success"], success)
+    (episode, _) = minari.load_dataset("panda/collected-v0")
+    observed = torch.from_numpy(episode.observations["observation"])
+    assert torch.equal(demos["next", "observation"][:6], observed[1:])
+
+
+@MISSING_METADATA
+def test_data_of_another_environment_are_refused_by_id(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    for recorded_id, env_id in (
+        ("PandaReach-v3", "PandaReach-v1"),
+        ("PandaPush-v1", "PandaSlide-v1"),
+        ("PandaPush-v1", "PandaReach-v1"),
+    ):
+        name = f"panda/{recorded_id}-v0"
+        path = minari.storage.get_dataset_path(name)
+        if not path.exists():
+            path = collect(recorded_id, dataset_id=name)
+        message = f"was recorded in {recorded_id}, but the environment is {env_id}"
+        with pytest.raises(ValueError, match=message):
+            read(path, env_id)
+        assert len(read(path, recorded_id))
+
+
+@MISSING_METADATA
+def test_the_environment_of_collected_data_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    physics = torch_panda.PhysicsParams(n_substeps=4)
+    collect("PandaReach-v1", physics=physics)
+    env = minari.load_dataset("panda/collected-v0").recover_environment()
+    assert env.unwrapped.torch_env.physics == physics
+    env.close()
+
+
+@MISSING_METADATA
 def test_a_data_set_of_another_library_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     episode = minari.data_collector.EpisodeBuffer(

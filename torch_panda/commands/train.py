@@ -98,7 +98,7 @@ def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
     if args.demos is None:
         return Run(args, out)
     with torch_panda.make(args.env_id) as env:
-        demos = read_demos(args.demos, env)
+        demos = read_demos(args.demos, env).select(*STORED_KEYS)
     return Run(args, out, demos, sha256(demos))
 
 
@@ -122,7 +122,7 @@ def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
             with lock_folder(out):
                 files.save(path, generate_data(args).to_dict())
     with torch_panda.make(args.env_id) as env:
-        return read_demos(path, env)
+        return read_demos(path, env).select(*STORED_KEYS)
 
 
 def generate_data(args: OfflineArgs) -> TensorDictBase:

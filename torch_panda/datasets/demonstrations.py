@@ -27,13 +27,14 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
 
     Returns:
         Transitions (n,) of whole episodes, on the device of the environment, episode
-        after episode. Floating-point numbers are float32. Actions are clipped to
+        after episode: the entries `STORED_KEYS`, and ``("next", "success")`` computed
+        from the goals. Floating-point numbers are float32. Actions are clipped to
         [-1, 1], as the environment clips them.
 
     Raises:
-        ValueError: The path holds no demonstrations, their sizes or rewards differ
-            from those of the environment, or the rows of an episode are not in the
-            order of time.
+        ValueError: The path holds no demonstrations, they were recorded in an
+            environment with another id, their sizes or rewards differ from those of
+            the environment, or the rows of an episode are not in the order of time.
     """
     if not path.exists():
         raise ValueError(
@@ -41,9 +42,12 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             "`python -m torch_panda record` wrote, or the folder of a data set "
             "(Minari's is ~/.minari/datasets/ followed by its id)"
         )
+    recorded_id: str | None = None
     try:
         if (name := format_of(path)) is not None:
-            demos = load_format(name).read(path)
+            data_format = load_format(name)
+            demos = data_format.read(path)
+            recorded_id = data_format.read_env_id(path)
         else:
             keys = STORED_KEYS
             content = files.read(
@@ -55,6 +59,12 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     except (AttributeError, LookupError, RuntimeError, TypeError) as error:
         # Entries are missing or are not tensors, or their lengths differ.
         raise ValueError(f"{path} does not hold demonstrations: {error}") from None
+    if None not in (recorded_id, env.env_id) and recorded_id != env.env_id:
+        raise ValueError(
+            f"{path} was recorded in {recorded_id}, but the environment is "
+            f"{env.env_id}: use the data for {recorded_id}, or record data of "
+            f"{env.env_id}"
+        )
     if not len(demos):
         raise ValueError(f"{path} holds no transitions")
     demos = demos.reshape(-1).apply(lambda x: x.float() if x.is_floating_point() else x)
@@ -69,6 +79,8 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     _check_rewards(path, demos, env)
     demos = _sort_episodes(path, demos)
     demos["action"] = demos["action"].clamp(-1.0, 1.0)
+    goals = demos["next", "achieved_goal"], demos["desired_goal"]
+    demos["next", "success"] = env.is_success(*goals)
     return demos.to(env.device)
 
 

@@ -55,7 +55,16 @@ class FormatModule(Protocol):
         """
 
     def read(self, path: Path) -> TensorDict:
-        """Read the transitions (n,) of a data set's folder, with torch_panda's keys."""
+        """Read the transitions (n,) of a data set's folder, with torch_panda's keys.
+
+        The success is not read, because other libraries' scripts rarely store it.
+        """
+
+    def read_env_id(self, path: Path) -> str | None:
+        """Read the id of the recorded environment, without Gymnasium's namespace.
+
+        None means that the data set does not name it.
+        """
 
 
 def load_format(name: Format) -> FormatModule:

@@ -142,7 +142,6 @@ def read(path: Path) -> TensorDict:
         ("collector", "traj_ids"): episode_ids[:-1],
         ("next", "reward"): column("next.reward", torch.float32)[:-1],
         ("next", "terminated"): column("next.terminated", torch.bool)[:-1],
-        ("next", "success"): column("next.success", torch.bool)[:-1],
     }
     for key, values in observed.items():
         data[key], data["next", key] = values[:-1], values[1:]
@@ -155,3 +154,7 @@ def read(path: Path) -> TensorDict:
     last[-1] = True
     transitions["next", "done"] = last.unsqueeze(-1)
     return transitions
+
+
+def read_env_id(path: Path) -> None:
+    """Return None, because the format does not store the id of the environment."""

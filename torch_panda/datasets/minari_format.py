@@ -122,14 +122,12 @@ def read(path: Path) -> TensorDict:
     for episode in minari.MinariDataset(path / "data").iterate_episodes():
         terminated = column(episode.terminations)
         done = terminated | column(episode.truncations)
-        success = column(episode.infos["is_success"])
         data = {
             "action": torch.as_tensor(episode.actions),
             ("collector", "traj_ids"): torch.full((len(done),), int(episode.id)),
             ("next", "reward"): column(episode.rewards).float(),
             ("next", "terminated"): terminated,
             ("next", "done"): done,
-            ("next", "success"): success[1:],
         }
         for key in OBSERVED:
             values = torch.as_tensor(episode.observations[key])
@@ -138,6 +136,12 @@ def read(path: Path) -> TensorDict:
         data["next", "desired_goal"] = data["desired_goal"]
         episodes.append(TensorDict(data, [len(done)]))
     return TensorDict.cat(episodes)
+
+
+def read_env_id(path: Path) -> str | None:
+    """Read the id of the recorded environment; see `FormatModule.read_env_id`."""
+    spec = minari.MinariDataset(path / "data").env_spec
+    return None if spec is None else spec.id.removeprefix("torch_panda/")
 
 
 def states(episode: TensorDictBase, key: str) -> np.ndarray:

@@ -167,6 +167,7 @@ class RobotTaskEnv(EnvBase):
         )
         super().__init__(device=device, batch_size=episodes.batch_shape)
         self._episodes, self._num_envs = episodes, num_envs
+        self._env_id: str | None = None
         self._terminate_on_success = terminate_on_success
         self._goal, self._observe_state = goal, observe_state
         specs = Specs(episodes, device, observe_state=observe_state)
@@ -202,6 +203,11 @@ class RobotTaskEnv(EnvBase):
     def episodes(self) -> Episodes:
         """The same environments as plain torch, without torchrl's interface."""
         return self._episodes
+
+    @property
+    def env_id(self) -> str | None:
+        """Id with which `torch_panda.make` made the environment, else None."""
+        return self._env_id
 
     @property
     def robot(self) -> Robot:
@@ -489,7 +495,8 @@ class RobotTaskEnv(EnvBase):
 
     def __reduce__(self) -> tuple[Any, ...]:
         seed = self.episodes.seeds.seed
-        return _rebuild, (type(self), *self._arguments, seed, self.device)
+        settings = (seed, self.device, self.env_id)
+        return _rebuild, (type(self), *self._arguments, *settings)
 
     # ---- pictures ------------------------------------------------------------------
 
@@ -714,8 +721,10 @@ def _rebuild(
     kwargs: dict[str, Any],
     seed: int | None,
     device: torch.device,
+    env_id: str | None,
 ) -> RobotTaskEnv:
     """Rebuild a pickled environment."""
     env = env_class(*args, **kwargs)
+    env._env_id = env_id
     env.episodes.seeds.restart(seed)
     return env.to(device)
