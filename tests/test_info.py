@@ -31,12 +31,17 @@ def test_the_text_has_versions_and_the_sizes_of_every_environment(capsys):
     assert sorted(ids) == sorted(torch_panda.ENV_IDS)
 
 
-def test_the_text_says_how_to_install_missing_extras(monkeypatch):
+def test_the_text_says_how_to_install_missing_extras(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(info, "find_spec", lambda name: None)
     monkeypatch.setattr(info, "loop_problem", lambda: "there is no C compiler")
     monkeypatch.delenv("DISPLAY", raising=False)
     extras = "\n".join(info.extras())
-    assert "pip install 'torch_panda[viewer]'" in extras
+    assert f"pip install -e '{ROOT}[viewer]'" in extras
+    monkeypatch.chdir(ROOT)
+    assert "pip install -e '.[viewer]'" in "\n".join(info.extras())
+    monkeypatch.setattr("torch_panda.extras._ROOT", Path("/usr/lib/python3"))
+    assert "pip install 'torch_panda[viewer]'" in "\n".join(info.extras())
     monkeypatch.setattr(info.sys, "version_info", (3, 10))
     assert "Minari's format): missing: needs Python 3.11" in "\n".join(info.extras())
     missing = "\n".join(info.missing())

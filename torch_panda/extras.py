@@ -1,6 +1,9 @@
 """Extras of the package and the optional libraries that they install."""
 
+from pathlib import Path
 from typing import NamedTuple
+
+_ROOT = Path(__file__).resolve().parents[1]  # of a clone
 
 
 class Extra(NamedTuple):
@@ -37,8 +40,15 @@ EXTRAS = {
 
 
 def install_command(extra: str) -> str:
-    """The shell command that installs an extra."""
-    return f"pip install 'torch_panda[{extra}]'"
+    """The shell command that installs an extra.
+
+    If the package is in a clone, the command installs it from there again, because
+    pip's index may hold another version.
+    """
+    if not (_ROOT / "pyproject.toml").exists():
+        return f"pip install 'torch_panda[{extra}]'"
+    root = "." if Path.cwd() == _ROOT else _ROOT
+    return f"pip install -e '{root}[{extra}]'"
 
 
 def explain_missing(error: ModuleNotFoundError) -> str | None:

@@ -105,7 +105,7 @@ def test_a_missing_extra_is_one_error_with_its_command(monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "tyro", None)
     message = r"tyro is not installed; it comes with the extra 'learning': "
-    message += r"pip install 'torch_panda\[learning\]'"
+    message += r"pip install -e '.*\[learning\]'"
     with pytest.raises(SystemExit, match=message):
         main(["plot", "."])
 

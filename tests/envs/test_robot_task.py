@@ -370,7 +370,7 @@ def test_reward_functions_pickle_without_the_simulator(env):
 
 def test_a_viewer_without_viser_is_refused(env, monkeypatch):
     monkeypatch.setattr(robot_task, "find_spec", lambda name: None)
-    message = r"^viewers need viser: pip install 'torch_panda\[viewer\]'$"
+    message = r"^viewers need viser: pip install -e '.*\[viewer\]'$"
     with pytest.raises(ImportError, match=message):
         env.open_viewer()
 

@@ -80,7 +80,7 @@ def test_a_resumed_run_continues_its_log(tmp_path, loggers):
 
 def test_a_missing_library_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(logger_module, "find_spec", lambda name: None)
-    message = r"tensorboard is not installed: pip install 'torch_panda\[tensorboard\]'"
+    message = r"tensorboard is not installed: pip install -e '.*\[tensorboard\]'"
     with pytest.raises(SystemExit, match=message):
         train.main(make_args(tmp_path / "run", logger="tensorboard"))
     assert not (tmp_path / "run").exists()
