@@ -1,5 +1,8 @@
 """Physics parameters: their effect, and the values that are refused."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 import torch
 
@@ -102,3 +105,16 @@ def test_substeps_are_whole_numbers():
 def test_an_unknown_preset_is_refused(physics):
     with pytest.raises(ValueError, match=r"one of \('exact', 'fast'\), got"):
         torch_panda.make("PandaReach-v1", physics=physics)
+
+
+@pytest.mark.parametrize("value", [None, "1", (1,)])
+@pytest.mark.parametrize("field", [x.name for x in dataclasses.fields(PhysicsParams)])
+def test_a_parameter_that_is_no_number_is_refused_by_name(field, value):
+    with pytest.raises(TypeError, match=rf"^{field} must be a number, got"):
+        PhysicsParams(**{field: value})
+
+
+def test_parameters_of_numpy_are_accepted():
+    assert PhysicsParams(gravity=np.float32(-1), n_substeps=np.int64(3)).ctrl_dt > 0
+    with pytest.raises(TypeError, match=r"^n_substeps must be an integer, got 2\.5"):
+        PhysicsParams(n_substeps=2.5)

@@ -1,11 +1,10 @@
 """Parameters of Bullet's integration: time step, solver, motors, gravity."""
 
 import math
-import operator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torch_panda.checks import check_not_negative
+from torch_panda.checks import check_finite, check_integer, check_not_negative
 
 PhysicsName = Literal["exact", "fast"]
 
@@ -39,6 +38,7 @@ class PhysicsParams:
 
     Raises:
         ValueError: An argument is out of range.
+        TypeError: An argument is not a number, or not an integer where it counts.
     """
 
     timestep: float = 1 / 500
@@ -51,9 +51,10 @@ class PhysicsParams:
     ik_damping: float = 0.5
 
     def __post_init__(self) -> None:
+        check_finite(**vars(self))
         for name in ("n_substeps", "solver_iterations", "ik_iterations"):
             value = getattr(self, name)
-            if operator.index(value) < 1:
+            if check_integer(name, value) < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         if not 0 < self.timestep < math.inf:
             raise ValueError(
@@ -68,8 +69,6 @@ class PhysicsParams:
             raise ValueError(
                 f"ik_damping must be positive and finite, got {self.ik_damping}"
             )
-        if not math.isfinite(self.gravity):
-            raise ValueError(f"gravity must be finite, got {self.gravity}")
 
     @property
     def ctrl_dt(self) -> float:

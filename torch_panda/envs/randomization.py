@@ -77,6 +77,7 @@ class Randomization:
         ValueError: A range is not (lowest, highest), finite and at least 0, and above 0
             for ``object_mass``; ``joint_position`` is negative; or ``observe`` is true
             without a range.
+        TypeError: ``joint_position`` is not a number.
     """
 
     object_mass: Range | None = None
