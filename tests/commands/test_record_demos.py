@@ -31,8 +31,8 @@ def test_the_saved_action_is_the_one_without_noise(tmp_path):
     assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
 
 
-def test_options_of_the_task_can_be_changed(tmp_path, capsys):
-    args = record_demos.Args("PandaReach-v1", 4, num_envs=4, out=tmp_path / "demos.pt")
+def test_options_of_the_task_can_be_changed(capsys):
+    args = record_demos.Args("PandaReach-v1", 4, num_envs=4)
     for threshold, success in ((0.5, "100.0%"), (1e-9, "  0.0%")):
         args.task_options = {"distance_threshold": threshold}
         record_demos.main(args)
@@ -40,3 +40,14 @@ def test_options_of_the_task_can_be_changed(tmp_path, capsys):
     args.task_options = {"threshold": 1.0}
     with pytest.raises(SystemExit, match=r"accepted are .*distance_threshold"):
         record_demos.main(args)
+
+
+@pytest.mark.parametrize("kind", ["expert", "random"])
+def test_an_existing_file_is_not_overwritten(tmp_path, kind):
+    out = tmp_path / "data.pt"
+    out.write_text("precious")
+    options = {"transitions": 50} if kind == "random" else {"episodes": 1}
+    args = record_demos.Args("PandaReach-v1", kind=kind, out=out, **options)
+    with pytest.raises(SystemExit, match=r"data\.pt exists already: remove it, or"):
+        record_demos.main(args)
+    assert out.read_text() == "precious"

@@ -124,6 +124,11 @@ def check(args: Args) -> None:
             "noise_eps does not work with the format minari, whose episodes hold "
             "the executed actions"
         )
+    has_file = args.out is not None and args.format == "tensors" and args.out.is_file()
+    if has_file and not args.resume:
+        raise ValueError(
+            f"{args.out} exists already: remove it, or choose another --out"
+        )
     last = args.seed + (args.episodes or EPISODES) - 1
     if not is_generated and args.format != "tensors" and last >= 2**63:
         raise ValueError(
