@@ -13,12 +13,14 @@ from tensordict import TensorDict
 import torch_panda
 from tests.commands.runs import After, Kill, points, read_curve, weights
 from tests.devices import DEVICES
+from torch_panda.bullet import FAST
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import curve, training
 from torch_panda.learning.agents.base import LEARNING_RATE
 from torch_panda.learning.evaluation import evaluate_episodes
 from torch_panda.learning.options import Args, check, default_args
+from torch_panda.learning.starts import states_at_objects
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -306,6 +308,45 @@ def test_the_command_line_overrules_the_recipe():
     assert args.desired_ratio > 0
     assert parse(["--random-eps", "0.1", "0.2"]).random_eps == (0.1, 0.2)
     assert parse([]) == Args()
+
+
+def test_physics_and_options_of_the_task_hold_in_all_environments(tmp_path):
+    args = parse(["--physics", "fast", "--task-options", "distance_threshold", "0.25"])
+    run = Run(args, tmp_path)
+    run.close()
+    for env in (run.env, run.curve.env):
+        assert env.physics == FAST
+        assert env.task.distance_threshold == 0.25
+
+
+def test_starts_at_objects_and_demonstrations_have_the_options_of_the_task(
+    tmp_path, monkeypatch, make_demos
+):
+    def make_states(env_id, **options):
+        states.append(states_at_objects(env_id, number=8, **options))
+        return states[0]
+
+    states = []
+    monkeypatch.setattr(training, "states_at_objects", make_states)
+    options = {"obj_xy_range": 0.0, "distance_threshold": 10.0}
+    args = Args(env_id="PandaPush-v1", start_at_object=0.5, task_options=options)
+    train.make_run(args, tmp_path).close()
+    assert states[0]["object_pose"][..., :2].abs().max() < 0.01
+    # The demonstrations succeed only with the task's own threshold.
+    with pytest.raises(ValueError, match="of the rewards differ"):
+        train.make_run(replace(args, demos=make_demos()), tmp_path)
+
+
+def test_runs_from_before_these_options_are_resumed(tmp_path):
+    args = Args(num_envs=2, total_steps=100, updates_per_step=0.0, video=False)
+    args.out = tmp_path
+    train.main(args)
+    state = torch.load(tmp_path / "resume.pt")
+    del state["args"]["physics"], state["args"]["task_options"]
+    torch.save(state, tmp_path / "resume.pt")
+    train.main(replace(args, resume=True))
+    with pytest.raises(SystemExit, match="physics was 'exact' and is now 'fast'"):
+        train.main(replace(args, resume=True, physics="fast"))
 
 
 def test_help_shows_the_defaults_of_the_preset(capsys):

@@ -1,7 +1,9 @@
 """``train --offline`` writes its files, stops, resumes and explains errors."""
 
 import json
+import warnings
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ import torch_panda
 from tests.commands.runs import After, points, read_curve, weights
 from tests.devices import DEVICES
 from tests.learning.gradient_steps import SPACES, fill_normalizer
+from torch_panda.bullet import FAST
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
@@ -126,6 +129,36 @@ def test_generated_data_overwrite_no_file(tmp_path):
     with pytest.raises(SystemExit, match="generated data would overwrite"):
         train.main(make_args(tmp_path))
     assert file.read_text() == "precious"
+
+
+def test_physics_and_options_of_the_task_hold_in_data_and_evaluations(tmp_path):
+    options = {"physics": "fast", "task_options": {"distance_threshold": 10.0}}
+    args = make_args(tmp_path, **options)
+    run = train.make_run(args, tmp_path)
+    run.close()
+    assert (torch.load(tmp_path / "data.pt")["next"]["reward"] == 0).all()
+    for env in (run.env, run.curve.env):
+        assert env.physics == FAST
+        assert env.task.distance_threshold == 10.0
+
+
+class Bare(torch_panda.Reach):
+    observation_layout = None
+
+
+@pytest.mark.parametrize("relative_inputs", ["coarse", "fine"])
+def test_dropped_relative_inputs_are_warned_of(tmp_path, make_demos, relative_inputs):
+    robot = partial(torch_panda.Panda, block_gripper=True)
+    torch_panda.register("Bare-v0", robot=robot, task=Bare)
+    options = {"env_id": "Bare-v0", "data": str(make_demos("Bare-v0"))}
+    args = make_args(tmp_path, relative_inputs=relative_inputs, **options)
+    message = f"without relative inputs .'{relative_inputs}'.* pass --relative-inputs"
+    with pytest.warns(UserWarning, match=message):
+        train.make_run(args, tmp_path).close()
+    args.relative_inputs = "none"
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "learning without")
+        train.make_run(args, tmp_path).close()
 
 
 def test_the_options_are_those_of_the_algorithm():

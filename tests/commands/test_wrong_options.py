@@ -31,6 +31,12 @@ DEMOS = ["--demos", "nofile.pt"]
         ("train", ["--algo", "crl", *DEMOS], "algo crl cannot use demonstrations"),
         ("train", ["--her", "parts"], "--her parts needs goals of several objects"),
         ("train", ["--start-at-object", "0.5"], "needs end-effector control"),
+        ("train", ["--task-options", "goal", "1"], "unexpected keyword .* 'goal'"),
+        (
+            "train",
+            ["--task-options", "goal_range", "nan"],
+            "task_options must be finite",
+        ),
         ("train", ["--out", "/dev/null"], "out must be a folder, got the file"),
         ("train", ["--import", "no.py"], r"cannot import the file no\.py: .*No such"),
         ("evaluate", ["nothing"], "no policy 'nothing': pass the folder of a run"),

@@ -90,6 +90,7 @@ def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
     Raises:
         ValueError: An option does not fit the task or another option, or a file cannot
             be read.
+        TypeError: The task does not have one of the ``task_options``.
         OSError: Generated data cannot be written.
     """
     if isinstance(args, OfflineArgs):
@@ -97,7 +98,7 @@ def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
         return OfflineRun(args, out, data, sha256(data))
     if args.demos is None:
         return Run(args, out)
-    with torch_panda.make(args.env_id) as env:
+    with torch_panda.make(args.env_id, **args.env_options) as env:
         demos = read_demos(args.demos, env).select(*STORED_KEYS)
     return Run(args, out, demos, sha256(demos))
 
@@ -121,7 +122,7 @@ def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
                 )
             with lock_folder(out):
                 files.save(path, generate_data(args).to_dict())
-    with torch_panda.make(args.env_id) as env:
+    with torch_panda.make(args.env_id, **args.env_options) as env:
         return read_demos(path, env).select(*STORED_KEYS)
 
 
@@ -136,6 +137,7 @@ def generate_data(args: OfflineArgs) -> TensorDictBase:
             seed=args.seed,
             num_envs=args.num_envs,
             progress=bar.update,
+            **args.env_options,
         )
     return data.select(*STORED_KEYS).reshape(-1)
 
@@ -168,14 +170,18 @@ def main(args: Args | OfflineArgs) -> None:
         with lock_folder(out):
             write_options(out, args, default, resume=args.resume, **preset)
             finished = run.train(stop)
-    except (ValueError, OSError) as error:
+    except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None
     stop.release()
     run.close()
     if finished and args.video:
         try:
             with torch_panda.make(
-                args.env_id, num_envs=4, seed=args.seed, device=args.device
+                args.env_id,
+                num_envs=4,
+                seed=args.seed,
+                device=args.device,
+                **args.env_options,
             ) as env:
                 record(env, run.agent.policy, out / "video.mp4")
         except KeyboardInterrupt:

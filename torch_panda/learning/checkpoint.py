@@ -109,7 +109,9 @@ class Checkpoint:
         finite = ("agent", "optimizer")
         path = self.out / "resume.pt"
         state = files.read(path, "the state of a run", keys, finite=finite)
-        saved, options = state["args"], fixed_options(self.args)
+        # Runs of earlier versions had no such options.
+        saved = {"task_options": {}, "physics": "exact", **state["args"]}
+        options = fixed_options(self.args)
         steps = options.get("total_steps", 0)
         if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps

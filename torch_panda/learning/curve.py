@@ -3,6 +3,7 @@
 import csv
 import io
 from pathlib import Path
+from typing import Any
 
 import torch
 from torchrl.record.loggers import Logger
@@ -35,6 +36,7 @@ class Curve:
         logger: Also gets each row, under the names of the columns.
         offline: Whether the agent learns offline. If so, steps are gradient steps, and
             the policy is also evaluated from the five `evaluation_tasks`.
+        **env_options: Other arguments of `torch_panda.make`.
     """
 
     def __init__(
@@ -46,12 +48,13 @@ class Curve:
         device: str,
         logger: Logger | None = None,
         offline: bool = False,
+        **env_options: Any,  # noqa: ANN401 (options of `make`)
     ) -> None:
         self.env_id, self.agent, self.out = env_id, agent, out
         self.logger = logger
         self.xlabel = "gradient steps" if offline else "environment steps"
         self.tasks = evaluation_tasks(env_id) if offline else {}
-        self.env = make(env_id, num_envs=NUM_ENVS, device=device)
+        self.env = make(env_id, num_envs=NUM_ENVS, device=device, **env_options)
 
     def begin(self, checkpoint: Checkpoint) -> None:
         """Evaluate the policy of a new run.

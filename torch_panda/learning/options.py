@@ -1,9 +1,10 @@
 """Options of a training run, and checks of their values."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
 from torch_panda.learning.agents import Hyperparameters
 from torch_panda.learning.buffers import Hindsight
@@ -11,6 +12,7 @@ from torch_panda.learning.hyperparameters import Algo
 from torch_panda.learning.limits import (
     Count,
     Factor,
+    Finite,
     Positive,
     Ratio,
     Seed,
@@ -37,6 +39,12 @@ class Args(Hyperparameters):
     achieved goal does not change"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
+    task_options: dict[str, Finite] = field(default_factory=dict)
+    """arguments of the task to change, such as `clearance 0.0005`, also in
+    evaluations"""
+    physics: PhysicsName = "exact"
+    """how Bullet integrates, also in evaluations: "exact" as in panda-gym, or "fast"
+    and coarser"""
     her: Hindsight = "relabel"
     """hindsight goals. "relabel" relabels four of five transitions when they are
     sampled. "parts" does the same with a separate draw for each object's part of the
@@ -93,6 +101,11 @@ class Args(Hyperparameters):
     logger: LoggerName = "none"
     """also log each evaluation to TensorBoard (folder "tensorboard" of the run) or to
     Weights & Biases (project "torch_panda"); curve.csv is always written"""
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Arguments of `torch_panda.make` for all environments of the run."""
+        return {"task_options": self.task_options, "physics": self.physics}
 
 
 # CRL needs these goals: the critic's positive goals are achieved k steps later in the

@@ -199,6 +199,8 @@ def line_label(preset: str, changed: dict[str, object]) -> str:
             parts.append(name)
         elif value in (False, "none", 0):
             parts.append(f"no {name}")
+        elif isinstance(value, dict):
+            parts += [f"{option} {x:g}" for option, x in value.items()]
         elif isinstance(value, list):
             parts.append(f"{name} {' to '.join(f'{x:g}' for x in value)}")
         else:

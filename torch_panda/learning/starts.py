@@ -8,6 +8,7 @@ starts some training episodes in them.
 """
 
 from math import pi
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -31,7 +32,13 @@ OPEN_HAND = (0.0, 0.0, 0.0, 1.0)  # action of a hand that waits with open finger
 PLACED_KEYS = ["joint_position", "joint_velocity", "object_pose", "object_velocity"]
 
 
-def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict:
+def states_at_objects(
+    env_id: str,
+    *,
+    seed: int,
+    number: int = 32,
+    **env_options: Any,  # noqa: ANN401 (options of `make`)
+) -> TensorDict:
     """Make states in which the hand is at an object.
 
     A hand with a blocked gripper stops beside the object. A hand with a free gripper
@@ -50,6 +57,7 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
         env_id: Id of the environment.
         seed: Seed of the objects' positions and of the side on which the hand stops.
         number: Number of attempts.
+        **env_options: Other arguments of `torch_panda.make`.
 
     Returns:
         States (n,) with the entries `PLACED_KEYS` of `RobotTaskEnv.get_state` and
@@ -65,7 +73,10 @@ def states_at_objects(env_id: str, *, seed: int, number: int = 32) -> TensorDict
     def uniform(low: float, high: float) -> torch.Tensor:
         return low + (high - low) * torch.rand(number, 1, generator=generator)
 
-    with make(env_id, num_envs=number, seed=seed) as env, torch.no_grad():
+    with (
+        make(env_id, num_envs=number, seed=seed, **env_options) as env,
+        torch.no_grad(),
+    ):
         geometry = read_geometry(env)
         has_objects = isinstance(env.task, Push | Slide | Stack | Flip)
         if geometry is None or geometry.action is None or not has_objects:

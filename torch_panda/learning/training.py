@@ -15,7 +15,6 @@ import time
 from collections import defaultdict
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -64,6 +63,7 @@ class Run:
             resumed.
 
     Raises:
+        TypeError: The task does not have one of the ``task_options``.
         ValueError: An option does not fit the task or another option, or the run to
             resume cannot be read.
     """
@@ -88,7 +88,7 @@ class Run:
             randomize = Randomization(
                 object_mass=factors, object_friction=factors, table_friction=factors
             )
-        options: dict[str, Any] = {}
+        options = dict(args.env_options)
         if args.continue_after_success:
             options["terminate_on_success"] = False
         self.env = make(
@@ -126,7 +126,7 @@ class Run:
             self.num_demos = int(DEMO_RATIO * args.batch_size)
         env: EnvBase = self.env
         if args.start_at_object:
-            states = states_at_objects(args.env_id, seed=args.seed)
+            states = states_at_objects(args.env_id, seed=args.seed, **args.env_options)
             env = TransformedEnv(env, StartFrom(states, args.start_at_object))
         # A batch [num_envs, steps] begins with a reset of all environments. Episodes
         # that are still running at its end are cut.
@@ -149,6 +149,7 @@ class Run:
             out,
             device=args.device,
             logger=make_logger(args.logger, out, asdict(args)),
+            **args.env_options,
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(

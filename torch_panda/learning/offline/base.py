@@ -61,7 +61,8 @@ class OfflineHyperparameters:
     relative_inputs: RelativeInputs = "fine"
     """additional inputs of the networks. "coarse" adds the offsets from the hand to
     objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
-    so that differences of millimetres count"""
+    so that differences of millimetres count. A task without `observation_layout` has no
+    offsets, and the training warns of this"""
 
 
 class Batch(NamedTuple):

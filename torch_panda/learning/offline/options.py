@@ -1,11 +1,13 @@
 """Options of ``train --offline``, and checks of their values."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
-from torch_panda.learning.limits import Positive, Seed, check_limits
+from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
 from torch_panda.learning.logger import LoggerName, check_logger
 from torch_panda.learning.offline import OFFLINE_AGENTS, OfflineHyperparameters
 from torch_panda.learning.user_modules import Imports
@@ -22,6 +24,12 @@ class OfflineArgs(OfflineHyperparameters):
     its own: `train --offline --algo hiql --help`"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
+    task_options: dict[str, Finite] = field(default_factory=dict)
+    """arguments of the task to change, such as `clearance 0.0005`, in evaluations
+    and generated data"""
+    physics: PhysicsName = "exact"
+    """how Bullet integrates in evaluations and generated data: "exact" as in panda-gym,
+    or "fast" and coarser"""
     data: str = "noisy"
     """data to learn from: "noisy", "play" or "random" generates a data set, see
     `torch_panda.datasets.generate`, and keeps it in data.pt of the run's folder. Any
@@ -52,6 +60,11 @@ class OfflineArgs(OfflineHyperparameters):
     """device of the networks and the data"""
     video: bool = True
     """record a video of 4 episodes at the end"""
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Arguments of `torch_panda.make` for all environments of the run."""
+        return {"task_options": self.task_options, "physics": self.physics}
 
 
 @cache

@@ -7,6 +7,7 @@ bit.
 
 import os
 import time
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 
@@ -36,6 +37,7 @@ class OfflineRun:
         data_hash: Hash of the data, which must be the same when the run is resumed.
 
     Raises:
+        TypeError: The task does not have one of the ``task_options``.
         ValueError: The options do not fit the task, the data or the files.
     """
 
@@ -47,9 +49,18 @@ class OfflineRun:
         torch.set_float32_matmul_precision("medium")  # as in `training.Run`
         torch.manual_seed(args.seed)
         cls = OFFLINE_AGENTS[args.algo]
-        self.env = make(args.env_id, device=args.device)
+        self.env = make(args.env_id, device=args.device, **args.env_options)
+        spaces = read_spaces(self.env)
+        if spaces.geometry is None and args.relative_inputs != "none":
+            warnings.warn(
+                f"learning without relative inputs ({args.relative_inputs!r}), because "
+                "they need a task whose observation_layout and goal_entries name all "
+                "entries of its observations and goals: declare them, or pass "
+                "--relative-inputs none",
+                stacklevel=2,
+            )
         with torch.device(args.device):
-            self.agent = cls(read_spaces(self.env), args)
+            self.agent = cls(spaces, args)
         data = data.to(args.device)
         self.data = OfflineData(
             data, self.env, self.agent.goal_strategies, args.discount
@@ -63,6 +74,7 @@ class OfflineRun:
             device=args.device,
             logger=make_logger(args.logger, out, asdict(args)),
             offline=True,
+            **args.env_options,
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
