@@ -9,6 +9,7 @@ from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import find_urdf, parse_urdf
 from torch_panda.rendering import Camera
 from torch_panda.rendering.mesh_decimation import decimated_urdf
+from torch_panda.rendering.vector_renderer import mesh_cell
 from torch_panda.rendering.visual_client import VisualClient
 
 
@@ -32,6 +33,11 @@ def test_the_arm_looks_the_same_from_afar():
     assert (is_arm != is_coarse_arm).sum() < 0.5 * outline.sum()
     both = is_arm & is_coarse_arm
     assert np.abs(fine - coarse)[both].mean() < 10
+
+
+def test_a_mesh_cell_is_half_a_pixel():
+    assert mesh_cell(Camera(distance=1.0, fov=90, width=50, height=100)) == 0.01
+    assert mesh_cell(Camera()) == 0.0  # would not save time
 
 
 def test_coarse_files_are_small_and_written_once():

@@ -18,6 +18,8 @@ from torch_panda.tasks import Bodies
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
 # panda-gym's view in half its size; above 200 pixels, meshes have all their details.
 WIDTH, HEIGHT = 360, 240
+# Small pictures below have the same size of a pixel, so that they share their coarse
+# meshes.
 CLOSE = Camera(target=(0.0, 0.0, 0.0), distance=0.5, width=60, height=40)
 
 
@@ -68,18 +70,43 @@ def test_targets_are_translucent():
             target=tuple(env.get_state()["desired_goal"].tolist()),
             distance=0.2,
             pitch=-90,
-            width=20,
-            height=20,
+            width=16,
+            height=16,
         )
-        seen = env.render(camera=camera)[10, 10].float()
+        seen = env.render(camera=camera)[8, 8].float()
         state = env.get_state()
         state["desired_goal"] = torch.tensor([0.0, 3.0, 0.02], dtype=torch.float64)
         env.reset(state, set_state=True)
-        behind = env.render(camera=camera)[10, 10].float()
+        behind = env.render(camera=camera)[8, 8].float()
     # 30 % green over the grey table.
     assert behind[0] == behind[1] == behind[2]
     assert seen[0] < behind[0] and seen[0] == seen[2] < seen[1]
     assert seen[0] > 0.7 * behind[0]
+
+
+def test_a_marker_below_the_table_is_hidden():
+    camera = Camera(distance=0.5, pitch=-90, width=40, height=40)
+    pictures = []
+    with torch_panda.make("PandaPush-v1", seed=0) as env:
+        env.reset()
+        state = env.get_state()
+        for place in ((0.1, 0.1, -0.05), (0.0, 3.0, 0.02)):
+            state["desired_goal"] = torch.tensor(place, dtype=torch.float64)
+            env.reset(state, set_state=True)
+            pictures.append(env.render(camera=camera))
+    assert (pictures[0] == pictures[1]).all()
+
+
+def test_an_open_drawer_is_drawn_open():
+    pictures, camera = [], Camera(distance=0.5, pitch=-60, width=60, height=40)
+    with torch_panda.make("PandaDrawer-v1", seed=0) as env:
+        env.reset()
+        state = env.get_state()
+        for opening in (0.0, 0.08):
+            state["object_joint_position"].fill_(opening)
+            env.reset(state, set_state=True)
+            pictures.append(env.render(camera=camera))
+    assert (pictures[0] != pictures[1]).any(-1).sum() > 30
 
 
 class HiddenURDF(torch_panda.Task):
@@ -165,9 +192,9 @@ def test_a_red_cube_is_below_a_green_one_in_stack():
         for index, channel in ((0, 0), (1, 1)):
             position = env.get_state()["object_pose"][index, :3].tolist()
             camera = Camera(
-                target=tuple(position), distance=0.2, pitch=-89, width=9, height=9
+                target=tuple(position), distance=0.2, pitch=-89, width=16, height=16
             )
-            color = env.render(camera=camera)[4, 4]
+            color = env.render(camera=camera)[8, 8]
             assert color.argmax() == channel
             assert color[channel] > 4 * color[channel - 1]
 
@@ -180,9 +207,14 @@ def test_render_draws_the_chosen_environments():
         every = env.render(camera=CLOSE)
         assert every.shape == (5, 40, 60, 3) and every.dtype == torch.uint8
         assert len(every.flatten(1).unique(dim=0)) == 5
+        state = env.get_state()
+        with torch_panda.make("PandaPush-v1") as single:
+            for index in (0, 4):
+                single.reset(state[index], set_state=True)
+                assert (single.render(camera=CLOSE) == every[index]).all()
         assert (env.render([3, 1], camera=CLOSE) == every[[3, 1]]).all()
         assert (env.render(4, camera=CLOSE) == every[4]).all()
-        assert env.render(4, camera=CLOSE, size=(30, 50)).shape == (30, 50, 3)
+        assert env.render(4, camera=CLOSE, size=(42, 50)).shape == (42, 50, 3)
         for wrong in (5, -1, [0, 7]):
             with pytest.raises(
                 ValueError, match="an index of an environment must be from 0 to 4"
@@ -217,10 +249,10 @@ def test_drawing_does_not_change_the_simulation():
 @pytest.mark.parametrize("num_envs", [None, 4])
 def test_torchrl_observes_pictures_of_render(num_envs):
     env = torch_panda.make("PandaPush-v1", num_envs=num_envs, seed=0)
-    transform = PixelRenderTransform(camera=CLOSE, size=(64, 96))
+    transform = PixelRenderTransform(camera=CLOSE, size=(42, 50))
     with closing(env.append_transform(transform)) as recorded:
         rollout = recorded.rollout(3)
         batch = () if num_envs is None else (num_envs,)
-        assert rollout["next", "pixels"].shape == (*batch, 3, 64, 96, 3)
-        picture = env.render(camera=CLOSE, size=(64, 96))
+        assert rollout["next", "pixels"].shape == (*batch, 3, 42, 50, 3)
+        picture = env.render(camera=CLOSE, size=(42, 50))
         assert (rollout["next", "pixels"][..., -1, :, :, :] == picture).all()
