@@ -10,6 +10,8 @@ import torch_panda
 from torch_panda import Camera, CameraSensor, HandCamera
 from torch_panda.rendering import egl
 
+# Most pictures below have the same size of a pixel, so that they share their coarse
+# meshes.
 SIZE = 48
 IMAGES = {"from_pixels": True, "depth": True, "segmentation": True, "render_size": SIZE}
 
@@ -48,7 +50,7 @@ def test_only_requested_images_are_observed():
 
 
 def test_pixels_equal_the_pictures_of_render():
-    camera = Camera(distance=0.8, yaw=80)
+    camera = Camera(yaw=80)
     with make(num_envs=4, num_threads=2, camera=camera) as env:
         td = env.rollout(4)
         assert (
@@ -124,7 +126,7 @@ def test_segmentation_and_depth_show_objects_at_their_positions():
 
 
 def test_markers_are_in_pixels_but_not_in_depth_and_segmentation():
-    camera = Camera(distance=0.5, width=50, height=50)
+    camera = Camera(width=SIZE, height=SIZE)
     with make(num_envs=None, camera=camera, render_size=None) as env:
         td = env.reset()
         state = env.get_state()
@@ -145,7 +147,7 @@ def test_a_pickled_environment_keeps_its_cameras():
 
 
 def test_egl_agrees_with_tiny_renderer_or_raises():
-    camera = Camera(distance=1.2, pitch=-90, width=48, height=48)
+    camera = Camera(pitch=-90, width=SIZE, height=SIZE)
     options = {"num_envs": 2, "camera": camera, "render_size": None}
     try:
         env = make(renderer="egl", **options)
@@ -160,7 +162,7 @@ def test_egl_agrees_with_tiny_renderer_or_raises():
         assert same.float().mean() > 0.95
         for images in (ours, theirs):
             table = images["depth"][images["segmentation"] == ids["table"]]
-            assert table.median() == pytest.approx(1.2, abs=1e-4)
+            assert table.median() == pytest.approx(1.4, abs=1e-4)
         assert ours["pixels"].float().std() > 20
         # A picture does not depend on earlier pictures.
         again = env.reset(env.get_state(), set_state=True)
@@ -181,9 +183,12 @@ def test_an_unknown_renderer_is_refused():
 
 
 def test_a_camera_on_the_hand_sees_the_cube_beside_a_fixed_camera():
-    front = CameraSensor(Camera(width=48, height=48))
+    front = CameraSensor(Camera(width=48, height=48, shadows=False))
     hand = CameraSensor(
-        HandCamera(width=64, height=48), depth=True, segmentation=True, name="wrist"
+        HandCamera(width=64, height=48, shadows=False),
+        depth=True,
+        segmentation=True,
+        name="wrist",
     )
     with torch_panda.make(
         "PandaPickAndPlace-v1", num_envs=2, seed=0, sensors=(front, hand)
@@ -193,7 +198,7 @@ def test_a_camera_on_the_hand_sees_the_cube_beside_a_fixed_camera():
         assert td["pixels"].shape == (2, 48, 48, 3)
         assert td["wrist_pixels"].shape == (2, 48, 64, 3)
         assert td["wrist_depth"].shape == (2, 48, 64, 1)
-        picture = env.render(camera=HandCamera(width=64, height=48))
+        picture = env.render(camera=hand.camera)
         assert (picture == td["wrist_pixels"]).all()
         # The open hand is above the cube, which is in the middle of the picture.
         ids = env.segmentation_ids
@@ -212,6 +217,24 @@ def test_a_camera_on_the_hand_sees_the_cube_beside_a_fixed_camera():
         action = torch.tensor([[0.0, 0.0, 1.0, 0.0]]).expand(2, -1)
         td = env.step(td.set("action", action))["next"]
         assert (td["wrist_pixels"] != before).any()
+
+
+def test_a_camera_on_the_hand_turns_with_it():
+    """The fingers stay at the left and the right of its picture."""
+    camera = HandCamera(width=64, height=48, shadows=False)
+    with make(
+        "PandaReachJoints-v1", num_envs=None, camera=camera, render_size=None
+    ) as env:
+        seen = []
+        env.reset()
+        state = env.get_state()
+        for angle in (0.0, 1.2):
+            state["joint_position"][6] = angle
+            seen.append(env.reset(state, set_state=True)["segmentation"])
+        robot = [picture == env.segmentation_ids["robot"] for picture in seen]
+    assert 200 < robot[0].sum() < 2500
+    for other in (robot[1], robot[0].flip(1)):
+        assert (robot[0] != other).float().mean() < 0.02
 
 
 def test_two_cameras_without_names_are_refused():

@@ -1,5 +1,6 @@
 """Force sensors against Newton's laws: press the table, lift a cube."""
 
+import pybullet
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -7,12 +8,15 @@ from torchrl.envs.utils import check_env_specs
 import torch_panda
 from tests.envs.test_checks import make_kuka
 from torch_panda import Reach, RobotTaskEnv
+from torch_panda.bullet.urdf import find_urdf
 from torch_panda.rotations import rotate
 
 SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
 G = 9.81  # [m/s^2]
-HAND_MASS = 0.81 + 2 * 0.1  # [kg], of hand and fingers in the URDF
-HAND = 8
+MOUNT, HAND = 7, 8  # links
+PARTS = {HAND: 0.81, 9: 0.1, 10: 0.1}  # masses of hand and fingers in the URDF [kg]
+HAND_MASS = sum(PARTS.values())
+FINGERS = (9, 10)  # links
 ARM = 7  # joints
 
 
@@ -63,6 +67,9 @@ def test_forces_balance_when_the_hand_holds_a_cube():
     move(lambda o: top, -1.0, 45)
     loaded = force_on_hand(env, td)
     contact, torque = td["finger_contact"], td["joint_torque"]
+    simulation = env.episodes.simulation
+    arm = simulation.clients[0].state(simulation.scene.robot)
+    beside = [arm.link_pose(link)[1] - td["observation"][8] for link in FINGERS]
     assert td["observation"][9] > 0.15, "the cube must hang in the air"
     env.close()
     # The only force of the cube on the fingers is its weight. The cube still
@@ -71,13 +78,75 @@ def test_forces_balance_when_the_hand_holds_a_cube():
     weight = torch.tensor([0.0, 0.0, -cube * G])
     torch.testing.assert_close(contact.sum(0), weight, atol=0.02, rtol=0)
     # The cube pushes each finger outwards as hard as its motor pushes inwards.
-    assert contact[0, 1] * contact[1, 1] < 0
+    assert (contact[:, 1] * torch.tensor(beside) > 0).all()
     torch.testing.assert_close(contact[:, 1].abs(), -torque[ARM:], rtol=0.01, atol=0)
     # The wrist bears the hand, and later the hand and the cube. The arm accelerates by
     # less than 0.1 m/s^2.
     down = torch.tensor([0.0, 0.0, 1.0])
     for measured, mass in ((free, HAND_MASS), (loaded, HAND_MASS + cube)):
         torch.testing.assert_close(measured, mass * G * down, atol=0.1 * mass, rtol=0)
+
+
+def test_all_contacts_of_a_finger_count():
+    """Together they balance the finger's motor."""
+    generator = torch.Generator().manual_seed(0)
+    with torch_panda.make("PandaPickAndPlace-v1", seed=0, sensors=SENSORS) as env:
+        td = env.reset()
+        for step in range(35):
+            towards = (td["achieved_goal"] - td["observation"][:3]) * 10
+            noise = 0.3 * (2 * torch.rand(3, generator=generator) - 1)
+            grip = torch.tensor([1.0 if step < 13 else -1.0])
+            move = towards + noise if step < 20 else torch.zeros(3)
+            td = env.step(td.set("action", torch.cat((move, grip))))["next"]
+        simulation = env.episodes.simulation
+        contacts = simulation.clients[0].contact_points(simulation.scene.robot)
+    links = [contact.link_a for contact in contacts if contact.normal_force > 1]
+    assert links.count(FINGERS[0]) > 1
+    force, motor = td["finger_contact"][:, 1], td["joint_torque"][ARM:]
+    torch.testing.assert_close(force.abs(), -motor, rtol=0.02, atol=0)
+
+
+def test_the_wrist_bears_the_weight_of_a_tilted_hand():
+    with torch_panda.make("PandaReachJoints-v1", seed=0, sensors=SENSORS) as env:
+        env.reset()
+        state = env.get_state()
+        state["joint_position"][5] += 0.9
+        td = env.reset(state, set_state=True)
+        for _ in range(20):
+            td = env.step(td.set("action", torch.zeros(7)))["next"]
+        simulation = env.episodes.simulation
+        arm = simulation.clients[0].state(simulation.scene.robot)
+    rotation = torch.tensor(arm.link_pose(HAND)[3:].tolist())
+    force, torque = (
+        rotate(rotation, x).double() for x in td["wrist_force_torque"].split(3)
+    )
+    weight = torch.tensor([0.0, 0.0, -G], dtype=torch.float64)
+    torch.testing.assert_close(force, -HAND_MASS * weight, atol=0.01, rtol=0)
+    mount = torch.as_tensor(arm.link_pose(MOUNT)[:3])
+    expected = torch.zeros(3, dtype=torch.float64)
+    for link, mass in PARTS.items():
+        lever = torch.as_tensor(arm.link_pose(link)[:3]) - mount
+        expected -= torch.linalg.cross(lever, mass * weight)
+    assert expected.norm() > 0.3
+    torch.testing.assert_close(torque, expected, atol=0.005, rtol=0)
+
+
+def test_motors_carry_the_arm_at_rest():
+    with torch_panda.make("PandaPush-v1", seed=0, sensors=SENSORS) as env:
+        td = env.reset()
+        for _ in range(20):
+            td = env.step(td.set("action", torch.zeros(3)))["next"]
+        position = env.get_state()["joint_position"].tolist()
+        urdf = find_urdf(env.robot.urdf)
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -G)
+    arm = pybullet.loadURDF(urdf, useFixedBase=True)
+    still = [0.0] * len(position)
+    expected = pybullet.calculateInverseDynamics(arm, position, still, still)
+    pybullet.disconnect(client)
+    torch.testing.assert_close(
+        td["joint_torque"][:ARM], torch.tensor(expected[:ARM]), atol=0.02, rtol=0
+    )
 
 
 def test_sensors_do_not_change_the_physics():
