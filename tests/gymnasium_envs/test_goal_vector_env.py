@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import torch_panda
-from torch_panda.gymnasium_envs import GoalVectorEnv
+from torch_panda.gymnasium_envs import GoalEnv, GoalVectorEnv
 
 NUM_ENVS = 3
 # In Reach-v3, success ends episodes at different times. In the others, the time limit
@@ -72,6 +72,12 @@ def test_values_equal_those_of_sync_vector_env(env_id, limit, mode):
     ours.close()
     theirs.close()
     assert np.sum(ends, axis=0).min() >= 3
+
+
+def test_the_default_autoreset_mode_is_next_step():
+    env = gymnasium.make_vec("torch_panda/PandaReach-v1", num_envs=1)
+    env.close()
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
 
 
 def test_a_reset_starts_masked_environments_from_a_state():
@@ -143,18 +149,51 @@ def test_bad_resets_are_refused(env, arguments, error, message):
     env.step(np.zeros((3, 3)))
 
 
+ID = "PandaReach-v1"
+
+
 @pytest.mark.filterwarnings("error")
-def test_bad_arguments_of_a_vector_env_are_refused():
-    with pytest.raises(ValueError, match="Sometimes"):
-        GoalVectorEnv("PandaReach-v1", autoreset_mode="Sometimes")
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda one, many: GoalEnv(many), ValueError, r"must be \[\], got \[2\]"),
+        (
+            lambda one, many: GoalVectorEnv(one),
+            ValueError,
+            r"must be \[num_envs\], got \[\]",
+        ),
+        (
+            lambda one, many: GoalEnv(one, sed=3, from_pixels=True, render_width=8),
+            TypeError,
+            r"\['from_pixels', 'sed'\] are accepted with an id",
+        ),
+        (
+            lambda one, many: GoalVectorEnv(many, num_envs=2),
+            TypeError,
+            "num_envs.* are accepted with an id",
+        ),
+        (
+            lambda one, many: GoalVectorEnv(ID, autoreset_mode="Sometimes"),
+            ValueError,
+            "Sometimes",
+        ),
+        (
+            lambda one, many: GoalVectorEnv(ID, render_mode="human"),
+            ValueError,
+            "render_mode must be None or one of",
+        ),
+        (
+            lambda one, many: GoalEnv(ID, render_width=0),
+            ValueError,
+            "width must be finite and above 0",
+        ),
+    ],
+)
+def test_bad_arguments_are_refused(call, error, message):
     with (
-        torch_panda.make("PandaReach-v1") as single,
-        pytest.raises(ValueError, match=r"must be \[num_envs\], got \[\]"),
+        torch_panda.make(ID) as one,
+        torch_panda.make(ID, num_envs=2) as many,
+        pytest.raises(error, match=message),
     ):
-        GoalVectorEnv(single)
-    with torch_panda.make("PandaReach-v1", num_envs=2) as batched:
-        for arguments in ({"num_envs": 2}, {"reward_type": "dense"}):
-            (name,) = arguments
-            with pytest.raises(TypeError, match=f"{name}.* are accepted with an id"):
-                GoalVectorEnv(batched, **arguments)
+        call(one, many)
     gc.collect()

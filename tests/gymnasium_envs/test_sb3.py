@@ -17,15 +17,11 @@ def make_vectorised():
     return VecMonitor(SB3VecEnv("PandaReach-v1", num_envs=3))
 
 
-def make_single():
-    return gymnasium.make("torch_panda/PandaReach-v1")
-
-
 def make_dummy():
     return make_vec_env("torch_panda/PandaReach-v1", n_envs=2)
 
 
-@pytest.mark.parametrize("make_env", [make_single, make_dummy, make_vectorised])
+@pytest.mark.parametrize("make_env", [make_dummy, make_vectorised])
 def test_stable_baselines3_trains_with_its_hindsight(make_env):
     env = make_env()
     model = DDPG(
