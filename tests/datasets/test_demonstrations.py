@@ -35,15 +35,6 @@ def test_demonstrations_keep_their_goals(env, make_demos, tmp_path):
     assert len(batch["index"].unique()) > 100
 
 
-def test_demonstrations_of_another_task_are_refused(env, make_demos):
-    path = make_demos("PandaReach-v1")
-    with pytest.raises(
-        ValueError,
-        match="its observation has size 6, that of the environment has size 18",
-    ):
-        read_demos(path, env)
-
-
 @pytest.mark.parametrize("case", ["time first", "pieces", "one id", "without ends"])
 def test_episodes_are_found_in_any_layout(env, make_demos, case):
     path = make_demos()
@@ -62,14 +53,6 @@ def test_episodes_are_found_in_any_layout(env, make_demos, case):
     assert (demos["collector", "traj_ids"] == torch.arange(4)[:, None]).all()
 
 
-def test_shuffled_demonstrations_are_refused(env, make_demos):
-    path = make_demos()
-    content = TensorDict(torch.load(path)).auto_batch_size_(1)
-    torch.save(content[torch.randperm(200)].to_dict(), path)
-    with pytest.raises(ValueError, match="not in the order of time"):
-        read_demos(path, env)
-
-
 def test_demonstrations_of_double_precision_become_float32(env, make_demos):
     path = make_demos()
     content = TensorDict(torch.load(path))
@@ -78,10 +61,28 @@ def test_demonstrations_of_double_precision_become_float32(env, make_demos):
     assert demos["observation"].dtype == demos["action"].dtype == torch.float32
 
 
+def test_actions_beyond_the_limits_are_clipped(env, make_demos):
+    path = make_demos()
+    content = TensorDict(torch.load(path))
+    content["action"] *= 3
+    torch.save(content.to_dict(), path)
+    action = read_demos(path, env)["action"]
+    assert torch.equal(action, content["action"].clamp(-1, 1))
+    assert action.max() == 1
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda x: x.exclude("desired_goal"), "there is no entry 'desired_goal'"),
+        (
+            lambda x: x.set("observation", x["observation"][:, :6]),
+            "its observation has size 6, that of the environment has size 18",
+        ),
+        (
+            lambda x: x.auto_batch_size_(1)[torch.randperm(200)],
+            "not in the order of time",
+        ),
         (lambda x: x.exclude(("next", "reward")), r"no entry \('next', 'reward'\)"),
         (lambda x: x.set("action", x["action"][:-1]), "does not hold demonstrations"),
         (lambda x: x.auto_batch_size_(1)[:0], "holds no transitions"),
@@ -91,7 +92,7 @@ def test_demonstrations_of_double_precision_become_float32(env, make_demos):
         ),
     ],
 )
-def test_incomplete_demonstrations_are_refused(env, make_demos, spoil, message):
+def test_wrong_demonstrations_are_refused(env, make_demos, spoil, message):
     path = make_demos()
     torch.save(spoil(TensorDict(torch.load(path))).to_dict(), path)
     with pytest.raises(ValueError, match=f"^{re.escape(str(path))}.*{message}"):
@@ -140,26 +141,20 @@ def test_a_ratio_of_each_batch_is_demonstrations(make_demos, tmp_path):
     assert len(run.buffer) == 100
 
 
-@pytest.mark.parametrize(
-    ("updates", "expected"), [(40, [0, 12, 24, 36, 40, 40]), (36, [0, 12, 24, 36, 36])]
-)
-def test_imitation_saves_at_intervals_and_at_its_end(
-    make_demos, tmp_path, monkeypatch, updates, expected
-):
+def test_imitation_saves_at_intervals_and_at_its_end(make_demos, tmp_path, monkeypatch):
     monkeypatch.setattr(pretraining, "SAVE_INTERVAL", 12)
-    args = small(make_demos(), total_steps=0, pretrain_updates=updates)
+    args = small(make_demos(), total_steps=0, pretrain_updates=40)
     run = make_run(args, tmp_path)
     saved = []
     run.checkpoint.save = lambda: saved.append(run.progress.pretrained)
     assert run.train()
     run.close()
-    assert sorted(set(saved)) == sorted(set(expected))
+    assert sorted(set(saved)) == [0, 12, 24, 36, 40]
 
 
-@pytest.mark.parametrize("algo", ["td3", "sac"])
-def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
-    options = {"total_steps": 0, "pretrain_updates": 40, "augmentation": "mirror"}
-    args = small(make_demos(), algo=algo, **options)
+def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path):
+    options = {"total_steps": 0, "pretrain_updates": 20, "augmentation": "mirror"}
+    args = small(make_demos(), algo="td3", **options)
 
     whole = make_run(args, tmp_path)
     before = weights(whole)
@@ -168,20 +163,20 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path, algo):
     whole.close()
     changed = {key for key in after if not torch.equal(before[key], after[key])}
     assert changed
-    assert any("target_actor" in key for key in changed) == (algo == "td3")
+    assert any("target_actor" in key for key in changed)
     assert not any("value" in key or "critic" in key for key in changed)
     assert not any("normalizer" in key for key in changed)
     assert [row["step"] for row in whole.progress.curve] == [0, 0]
 
     stopped = make_run(args, tmp_path)
-    assert not stopped.train(After(15))
+    assert not stopped.train(After(7))
     stopped.close()
     assert len(stopped.progress.curve) == 1
     kept, policy = SavedPolicy.read(tmp_path).weights, stopped.agent.policy
     torch.testing.assert_close(dict(kept), dict(policy.state_dict()), rtol=0, atol=0)
     args.resume = True
     resumed = make_run(args, tmp_path)
-    assert resumed.progress.pretrained == 15
+    assert resumed.progress.pretrained == 7
     assert resumed.train()
     resumed.close()
     torch.testing.assert_close(weights(resumed), after, rtol=0, atol=0)

@@ -72,12 +72,65 @@ def test_an_episode_depends_on_its_number_alone():
     assert len(many["desired_goal"][:, 0].unique(dim=0)) == len(starts)
 
 
+def change(values):
+    return ~values if values.dtype == torch.bool else values + 1
+
+
+def test_the_hash_covers_every_entry():
+    data = generate("random", transitions=50)
+    keys = list(data.keys(include_nested=True, leaves_only=True))
+    hashes = {datasets.sha256(data)}
+    for key in keys:
+        for new_key, function in (
+            (key, change),
+            (key, torch.Tensor.double),
+            (key, lambda x: x.unsqueeze(-1)),
+            ("other", lambda x: x),  # the same values under another name
+        ):
+            other = data.clone()
+            del other[key]
+            other[new_key] = function(data[key])
+            hashes.add(datasets.sha256(other))
+    assert len(hashes) == 1 + 4 * len(keys)
+    assert datasets.sha256(data.select(*reversed(keys))) == datasets.sha256(data)
+
+
 def test_the_noise_of_an_episode_has_a_scale_of_its_own():
-    data = generate("noisy", env_id="PandaPush-v1", transitions=400, num_envs=8)
-    expert = torch_panda.experts.make_expert("PandaPush-v1")
+    """Standard deviations are uniform from 0 to 0.5."""
+    data = generate("noisy", env_id="PandaReach-v1", transitions=2000, num_envs=8)
+    expert = torch_panda.experts.make_expert("PandaReach-v1")
     intended = expert(data.exclude("next"))["action"]
-    difference = (data["action"] - intended).std(dim=1).mean(dim=1)
-    assert (difference.max() > 3 * difference.min()) & (difference.max() < 0.6)
+    # Close to the goal, the expert's own actions are far from the limits of actions.
+    near, difference = intended.abs() < 0.2, data["action"] - intended
+    noise = [x[n].std() for x, n in zip(difference, near, strict=True) if n.sum() > 20]
+    noise = torch.stack(noise)
+    assert len(noise) > 30
+    assert noise.min() < 0.08 and 0.38 < noise.max() < 0.55
+    assert 0.17 < noise.mean() < 0.33
+
+
+def segments(episode, key="desired_goal"):
+    """Lengths of the pieces of an episode in which an entry is constant."""
+    changes = (episode[key].diff(dim=0) != 0).any(dim=1).nonzero().flatten() + 1
+    return changes.diff(prepend=torch.tensor([0]), append=torch.tensor([len(episode)]))
+
+
+def test_play_stays_at_each_goal():
+    """For 10 steps in which the goal is reached; then the next goal comes."""
+    data = generate("play", num_envs=2)
+    for episode in data:
+        lengths = segments(episode).tolist()
+        assert len(lengths) >= 4
+        for piece in episode.split(lengths)[:-1]:
+            success = piece["next", "success"].squeeze(-1)
+            assert success[-10:].all()
+            assert len(success) == 10 or not success[-11]
+
+
+def test_play_gives_up_a_goal_after_the_time_of_an_episode():
+    options = {"task_options": {"distance_threshold": 1e-9}}
+    for episode in generate("play", num_envs=2, **options):
+        assert segments(episode).tolist() == [50, 50, 20]
 
 
 def test_play_pursues_goal_after_goal():

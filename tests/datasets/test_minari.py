@@ -10,6 +10,8 @@ import torch
 import torch_panda
 from tests.datasets.recording import record
 from torch_panda.datasets import read_demos
+from torch_panda.datasets.formats import load_format
+from torch_panda.experts import make_expert
 
 minari = pytest.importorskip(
     "minari", reason="needs the extra minari, which takes Python 3.11 or newer"
@@ -49,6 +51,21 @@ def test_episodes_start_again_from_id_and_seed(recorded):
         np.testing.assert_array_equal(episode.infos["is_success"], success)
         assert success[-1]
     env.close()
+
+
+def test_demonstrations_of_minari_are_those_that_were_recorded(recorded):
+    folder, expert = recorded[0] / recorded[1], make_expert("PandaPush-v1")
+    with torch_panda.make("PandaPush-v1", num_envs=1) as env:
+        demos, episodes = read_demos(folder, env), []
+        for seed in (5, 6, 7):
+            env.set_env_seed(0, seed)
+            episodes.append(env.rollout(50, expert)[0])
+    expected = torch.cat(episodes)
+    for key in demos.exclude("collector").keys(include_nested=True, leaves_only=True):
+        assert torch.equal(demos[key], expected[key]), key
+    success = load_format("minari").read(folder)["next", "success"]
+    assert torch.equal(success, expected["next", "success"])
+    assert success.any() and not success.all()
 
 
 def test_torchrl_reads_a_minari_data_set_offline(recorded, tmp_path):
