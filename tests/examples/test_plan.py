@@ -10,7 +10,7 @@ from tensordict import TensorDict
 def small(monkeypatch):
     """Small plans, and the same random draws in every run."""
     torch.manual_seed(0)
-    sizes = {"NUM_CANDIDATES": 12, "OPTIM_STEPS": 2, "HORIZON": 2, "HOLD": 3}
+    sizes = {"NUM_CANDIDATES": 12, "OPTIM_STEPS": 2, "HORIZON": 2, "HOLD": 6}
     for name, value in sizes.items():
         monkeypatch.setattr(plan, name, value)
 
