@@ -61,8 +61,3 @@ def test_every_public_name_is_on_exactly_one_page():
 def test_no_entry_is_repeated():
     names = [name for name, _ in documented()]
     assert [name for name, number in Counter(names).items() if number > 1] == []
-
-
-def test_every_page_is_in_the_navigation():
-    navigation = (DOCS / "mkdocs.yml").read_text()
-    assert [page for page in read_pages() if f": {page}\n" not in navigation] == []
