@@ -12,7 +12,7 @@ from torch_panda import commands
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "torch_panda" / "datasets" / "README.md"
 # In place of the sizes of the guide, which take hours.
-SMALL = {"--transitions": "200", "--total-steps": "20", "--episodes": "10"}
+SMALL = {"--transitions": "200", "--total-steps": "20", "--episodes": "5"}
 
 
 def read_commands():

@@ -45,8 +45,8 @@ for module in ("pybullet", "torch_panda.gymnasium_envs", "torch_panda.learning")
 
 def test_importing_registers_ids_and_is_cheap():
     """At most 0.3 s of CPU time beyond torchrl's, no warnings filter, no output."""
-    seconds = []
-    for _ in range(2):
+    seconds: list[float] = []
+    while len(seconds) < 2 and min(seconds, default=1.0) >= 0.3:  # a second chance
         done = subprocess.run(
             [sys.executable, "-c", IMPORT], capture_output=True, text=True
         )
