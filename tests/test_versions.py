@@ -62,11 +62,3 @@ def test_the_page_lists_all_arguments_that_differ():
 def test_the_defaults_of_a_task_are_those_of_v1(task):
     made = find_registration(f"Panda{task}-v1").make_task()
     assert vars(made) == vars(type(made)())
-
-
-def test_a_mass_out_of_range_is_refused():
-    message = "mass must be finite and at least 0, got -1.0"
-    with pytest.raises(ValueError, match=message):
-        torch_panda.RobotTaskEnv(
-            robot=torch_panda.Panda(), task=torch_panda.Push(object_mass=-1.0)
-        )

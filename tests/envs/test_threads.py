@@ -59,8 +59,9 @@ def test_threads_that_step_at_once_get_errors_and_do_no_harm():
 def test_threads_may_build_environments_of_their_own_at_the_same_time():
     def work(seed):
         with torch_panda.make("PandaPush-v1", num_threads=1, seed=seed) as env:
+            data = env.rollout(2, lambda td: td.set("action", torch.ones(3)))
             env.render(size=8)
-            return env.rollout(2, lambda td: td.set("action", torch.ones(3)))
+            return data
 
     with ThreadPoolExecutor(4) as threads:
         first, *others = threads.map(work, [0, 1, 0, 1, 0, 1])
