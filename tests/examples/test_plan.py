@@ -5,12 +5,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+import torch_panda
+
 
 @pytest.fixture
 def small(monkeypatch):
     """Small plans, and the same random draws in every run."""
     torch.manual_seed(0)
-    sizes = {"NUM_CANDIDATES": 12, "OPTIM_STEPS": 2, "HORIZON": 2, "HOLD": 6}
+    sizes = {"NUM_CANDIDATES": 12, "OPTIM_STEPS": 2, "HORIZON": 2, "HOLD": 3}
     for name, value in sizes.items():
         monkeypatch.setattr(plan, name, value)
 
@@ -41,7 +43,14 @@ def test_forks_continue_as_the_environment_does(small):
 
 
 def test_plans_approach_the_goal(small, monkeypatch):
-    monkeypatch.setattr(plan, "ENV_ID", "PandaReach-v1")
+    options = {"robot_options": {"action_scale": plan.ACTION_SCALE}}
+    monkeypatch.setattr(
+        plan,
+        "make_env",
+        lambda num_envs=None: torch_panda.make(
+            "PandaReach-v1", num_envs=num_envs, seed=0, max_episode_steps=21, **options
+        ),
+    )
     with plan.make_env() as env:
         fork = plan.Fork()
         start = env.reset()
