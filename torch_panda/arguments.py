@@ -31,10 +31,9 @@ class Configured:
     """
 
     changeable: ClassVar[tuple[str, ...]] = ()
-    """Arguments that may change in an environment, added to those of the base classes.
-    """
+    """Arguments that may change in an environment, in addition to the base classes'."""
     _replaceable_methods: ClassVar[frozenset[str]] = frozenset()
-    # What to do instead, by unknown name.
+    # The fix for the error, by unknown name.
     _assignment_advice: ClassVar[Mapping[str, str]] = {}
     _is_frozen = False
 
@@ -137,8 +136,8 @@ class _Names(NamedTuple):
     Attributes:
         arguments: Arguments of the class and of all its base classes.
         changeable: Arguments that may change in an environment.
-        declared: Attributes that the direct subclass of `Configured` declares, such as
-            those of `Task`.
+        declared: Attributes that the direct subclass of `Configured` declares, for
+            example the methods of `Task`.
     """
 
     arguments: frozenset[str]

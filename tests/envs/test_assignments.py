@@ -90,7 +90,7 @@ def test_a_value_changed_before_the_environment_is_checked_when_it_is_made():
         make(task)
 
 
-# ---- what is refused -------------------------------------------------------------
+# ---- refused assignments ---------------------------------------------------------
 
 
 @pytest.mark.parametrize(

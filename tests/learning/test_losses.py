@@ -64,7 +64,7 @@ def states(agent, rows):
 
 
 def target_values(next_values, lowest=-4.0, highest=0.0):
-    """What the critics should return for each row."""
+    """The value that the critics learn for each row, (n,)."""
     targets = []
     for reward, ends, value in zip(REWARDS, ENDS, next_values.tolist(), strict=True):
         if ends:

@@ -139,7 +139,7 @@ def check_samplers(task: Task) -> None:
     `sample_start` is called on a copy of the task. If it fails, nothing is refused.
 
     Raises:
-        ValueError: A method is overridden in vain.
+        ValueError: A method is overridden, but never called.
     """
     if type(task).sample_start is Task.sample_start:
         return

@@ -9,7 +9,7 @@ _STATE = (
     f"{_TORCH_ENV}.get_state(exact=True), and reset(options={{'state': state}}) to "
     "return to it"
 )
-# What to use instead.
+# The replacement of each attribute, for its error.
 _REPLACEMENTS = {
     "sim": f"{_TORCH_ENV}, which has get_state() and episodes.simulation",
     "task": f"{_TORCH_ENV}.task",

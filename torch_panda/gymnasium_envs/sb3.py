@@ -85,8 +85,8 @@ class SB3VecEnv(PandaGymErrors, VecEnv):
             {**info_of(own_infos, index), "TimeLimit.truncated": bool(is_truncated)}
             for index, is_truncated in enumerate(truncated & ~terminated)
         ]
-        # If an episode ended, report the infos of its last step. `own_infos` holds
-        # those of the start of the next episode.
+        # If an episode ended, report the infos of its last step. `own_infos` holds the
+        # infos of the next episode's start.
         for index in done.nonzero()[0].tolist():
             self.reset_infos[index] = info_of(own_infos, index)
             list_of_infos[index] |= info_of(self._own_infos(infos["final_info"]), index)
