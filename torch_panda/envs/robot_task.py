@@ -3,7 +3,7 @@
 import functools
 import inspect
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -12,22 +12,18 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.common import _cache_value
 from torchrl.envs.utils import _update_during_reset
-from torchrl.modules import RandomPolicy
 from typing_extensions import Self
 
 from torch_panda.arguments import argument_names, check_names
-from torch_panda.bullet import PhysicsName, PhysicsParams, native
+from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, OnDivergence, indices
 from torch_panda.envs.goal_observation import GoalName, apply_to_observations
-from torch_panda.envs.next_root import NextRoot
 from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
 from torch_panda.envs.specs import Specs
-from torch_panda.envs.state import EXACT_KEYS, has_nested_state, is_state, unpack_state
-from torch_panda.envs.state_support import StateSupport
+from torch_panda.envs.state import EXACT_KEYS, is_state, unpack_state
 from torch_panda.extras import install_command
 from torch_panda.rendering import Camera, RendererName
 from torch_panda.rendering.camera import resized
@@ -168,6 +164,7 @@ class RobotTaskEnv(EnvBase):
         super().__init__(device=device, batch_size=episodes.batch_shape)
         self._episodes, self._num_envs = episodes, num_envs
         self._env_id: str | None = None
+        self._has_state_transform = False  # `StateTransform` sets it
         self._terminate_on_success = terminate_on_success
         self._goal, self._observe_state = goal, observe_state
         specs = Specs(episodes, device, observe_state=observe_state)
@@ -328,7 +325,8 @@ class RobotTaskEnv(EnvBase):
 
         Raises:
             ValueError: The state is missing or wrong; or ``set_state`` is None and the
-                tensordict holds observations and a state; or torchrl's `TransformedEnv`
+                tensordict holds observations and a state.
+            NotImplementedError: ``set_state`` is true, and torchrl's `TransformedEnv`
                 or `ParallelEnv` would not pass the state on (see `StateTransform`).
             TypeError: An option is unknown, for example ``seed``.
         """
@@ -356,68 +354,25 @@ class RobotTaskEnv(EnvBase):
         Returns:
             The same tensordict, with ``next``.
         """
+        keys = tensordict.keys()
         if (
-            type(tensordict) is not TensorDict
-            or tensordict.batch_size != self.batch_size
-            or tensordict._get_str("_step", None) is not None
-            or tensordict._get_str("next", None) is not None
+            tensordict.batch_size != self.batch_size
+            or "_step" in keys
+            or "next" in keys
         ):
             return super().step(tensordict)
-        # The result is complete already. Skip the checks of torchrl's own step and of
-        # `TensorDict.set`, which together take as long as the rest of this function.
-        return tensordict._set_str(
-            "next", self._step(tensordict), inplace=False, validated=True
-        )
+        # torchrl's own step would complete the result, which is complete already.
+        return tensordict.set("next", self._step(tensordict))
 
-    def any_done(self, tensordict: TensorDictBase) -> bool:
-        """Whether an episode has ended, as in torchrl.
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Draw random actions, as in torchrl, in a third of its time.
 
         Args:
-            tensordict: Holds ``done``. If an episode has ended, ``_reset`` is added.
+            tensordict: The tensordict to write ``action`` into; None makes a new one.
         """
-        done = tensordict._get_str("done", None)
-        if (
-            native.LIBRARY is not None
-            and self.episodes.simulation.is_native
-            and isinstance(done, Tensor)
-            and done.is_cpu
-            and done.is_contiguous()
-            and done.dtype == torch.bool
-            and not native.LIBRARY.environment_any(done.data_ptr(), done.numel())
-        ):
-            return False
-        return bool(super().any_done(tensordict))
-
-    @property
-    @_cache_value
-    def _step_mdp(self) -> NextRoot:
-        """Moves the entries under ``next`` to the root, faster than torchrl does."""
-        return NextRoot(self)
-
-    def rollout(
-        self,
-        max_steps: int,
-        policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
-        callback: Callable[..., Any] | None = None,
-        **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
-    ) -> TensorDictBase:
-        """Collect steps, as in torchrl.
-
-        Args:
-            max_steps: Largest number of steps.
-            policy: Writes ``action``; None draws the random actions of `rand_action`.
-            callback: Called with the environment and the tensordict of each step.
-            **kwargs: Other options of torchrl.
-
-        Returns:
-            The steps, (*batch, time).
-        """
-        if policy is None and kwargs.get("actions") is None:
-            # `RandomPolicy` draws the same actions as `rand_action`. But `rand_action`
-            # makes tensordict look for the package "pandas" at every call. Where it is
-            # not installed, this takes about 0.1 ms per step.
-            policy, kwargs["trust_policy"] = RandomPolicy(self.action_spec), True
-        return super().rollout(max_steps, policy, callback, **kwargs)
+        if tensordict is None:
+            tensordict = TensorDict({}, self.batch_size, device=self.device)
+        return tensordict.set("action", self.action_spec.rand())
 
     def set_env_seed(self, env: int, seed: int) -> None:
         """Seed one environment.
@@ -649,17 +604,21 @@ class RobotTaskEnv(EnvBase):
         return self._emit(self.episodes.reset(envs, state if set_state else None))
 
     @property
-    def _supports_set_state(self) -> StateSupport:  # type: ignore[override]  # bool
-        """Tells torchrl that a reset may start from a state.
+    def _supports_set_state(self) -> bool:  # type: ignore[override]  # an attribute
+        """Whether torchrl's wrappers may pass ``set_state=True`` on.
 
-        torchrl tests the truth of the returned object. This test raises an error if the
-        state would not reach the environment; see `StateSupport`.
+        A `TransformedEnv` would lose the state, unless a `StateTransform` carries it.
+        torchrl then raises `NotImplementedError`.
         """
-        return StateSupport(frozenset(self.episodes.entries))
+        is_transformed = "_inplace_update" in vars(self)  # `TransformedEnv` sets it
+        return self._has_state_transform or not is_transformed
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
-        """Tell `TransformedEnv` whether a tensordict has a state under "state"."""
-        return has_nested_state(tensordict)
+        """Let torchrl's wrappers start from a state with ``set_state=True`` only.
+
+        torchrl would also take the ``step_count`` of a `StepCounter` for a state.
+        """
+        return False
 
     def _set_seed(self, seed: int | None) -> None:
         self.episodes.seeds.restart(seed)

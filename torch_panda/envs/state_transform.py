@@ -1,9 +1,11 @@
 """A transform that carries the state of the environments through torchrl."""
 
+from contextlib import suppress
+
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from torch_panda.envs.robot_task import RobotTaskEnv
 from torch_panda.envs.state import NESTED_STATE
@@ -14,7 +16,8 @@ class StateTransform(Transform):
 
     torchrl's `TransformedEnv` and `ParallelEnv` pass on only the entries of a reset
     that ``state_spec`` names. This transform adds the state to ``state_spec``. It also
-    works in the workers of a `ParallelEnv`::
+    works in the workers of a `ParallelEnv`. Wrapped environments start from a state
+    only with ``set_state=True``. Without it, they start a new episode::
 
         env = TransformedEnv(make(...), Compose(StateTransform(), StepCounter()))
         td = env.rollout(10)[..., -1]
@@ -25,6 +28,16 @@ class StateTransform(Transform):
     Exact states are not supported: specs have fixed shapes, but an exact state gets
     more actions with every step.
     """
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Tell the environment that states reach it from now on."""
+        super().set_container(container)
+        env: object = container
+        with suppress(ValueError):  # a Compose in a Compose without an environment
+            while isinstance(env, (Compose, TransformedEnv)):
+                env = env.container if isinstance(env, Compose) else env.base_env
+            if isinstance(env, RobotTaskEnv):
+                env._has_state_transform = True
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the state to the observed entries."""
