@@ -5,8 +5,6 @@ import torch
 
 import torch_panda
 from torch_panda import Panda, Push, RobotTaskEnv
-from torch_panda.bullet import selects_state
-from torch_panda.bullet.selection import selected_columns
 
 N = 3
 
@@ -74,16 +72,11 @@ def test_success_and_reward_follow_a_threshold_that_changes_later(threshold):
     assert td["terminated"].equal(td["success"])
 
 
-def test_a_wrong_selects_state_is_refused():
-    class Doubled(Push):
-        @selects_state
-        def observation(self, simulation):
-            return 2 * super().observation(simulation)
+def test_an_own_task_that_imports_selects_state_is_told_that_it_is_not_needed():
+    with pytest.warns(FutureWarning, match="no longer needed: delete the import"):
+        from torch_panda.bullet import selects_state
 
-    with make() as env:
-        simulation = env.episodes.simulation
-        with pytest.raises(ValueError, match="declared by selects_state, so it must"):
-            selected_columns(Doubled().observation, simulation)
+    assert selects_state(make) is make
 
 
 def test_the_callers_action_is_kept_and_not_changed():

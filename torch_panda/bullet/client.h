@@ -9,7 +9,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { LOOP_VERSION = 5 }; /* native.py refuses a library of another version */
+enum { LOOP_VERSION = 6 }; /* native.py refuses a library of another version */
 
 typedef void *handle;          /* of a client, a command or a status */
 typedef const double *doubles; /* input */
@@ -147,35 +147,6 @@ int client_reset(struct batch *batch, int env);
 
 /* Take up to `piece` substeps of a step. Return 1 if substeps remain, else 0. */
 int client_take_piece(struct batch *batch, int env, int piece);
-
-struct gripper { /* Gripper of gripper.py, if it has two joints */
-    int column; /* of the first joint's position in the row of a client */
-    float scale;
-    double weights[2], offset, closed[2], per_width[2];
-};
-
-/* Data from which the library computes Robot.setpoint. A setpoint has the targets of the
-   hand or the arm, then the targets of the fingers. */
-struct actuation {
-    int row_size;
-    int column, num_displaced; /* numbers in the row that an action displaces */
-    int has_limits, num_resting, has_gripper;
-    float scale; /* displacement of an action of 1 */
-    double lowest[3], highest[3];
-    doubles resting; /* setpoints of joints that an action does not move */
-    struct gripper gripper;
-};
-
-enum { WIDTH = -1 }; /* the column of the distance between the fingers */
-struct observation { /* the entries that EpisodeObserver of observer.py observes */
-    int row_size, size, goal_size;
-    const int *columns, *goal_columns; /* of entries in the row of a client */
-    struct gripper gripper;
-    int compares_distance; /* whether success is a distance below the threshold */
-    double distance_threshold;
-    int terminate_on_success;
-    int64_t max_episode_steps;
-};
 
 /* LOOP_VERSION of the sources from which the library was compiled. */
 int loop_version(void);

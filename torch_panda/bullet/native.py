@@ -17,10 +17,8 @@ from ctypes import (
     Structure,
     c_char_p,
     c_double,
-    c_float,
     c_int,
     c_int64,
-    c_size_t,
     c_void_p,
 )
 from pathlib import Path
@@ -31,7 +29,7 @@ from torch_panda.bullet.library import bind
 
 # Version of the C sources, as ``loop_version`` in client.h: the library must have been
 # compiled from sources of this version.
-VERSION = 5
+VERSION = 6
 
 # "native": threads of C. "ctypes": threads of Python that call Bullet through ctypes.
 LoopName = Literal["native", "ctypes"]
@@ -179,64 +177,10 @@ class Batch(Structure):
     )
 
 
-class Gripper(Structure):
-    """``struct gripper``."""
-
-    _fields_ = (
-        ("column", c_int),
-        ("scale", c_float),
-        ("weights", c_double * 2),
-        ("offset", c_double),
-        ("closed", c_double * 2),
-        ("per_width", c_double * 2),
-    )
-
-
-class Actuation(Structure):
-    """``struct actuation``."""
-
-    _fields_ = (
-        ("row_size", c_int),
-        ("column", c_int),
-        ("num_displaced", c_int),
-        ("has_limits", c_int),
-        ("num_resting", c_int),
-        ("has_gripper", c_int),
-        ("scale", c_float),
-        ("lowest", c_double * 3),
-        ("highest", c_double * 3),
-        ("resting", POINTER(c_double)),
-        ("gripper", Gripper),
-    )
-
-
-class Observation(Structure):
-    """``struct observation``."""
-
-    _fields_ = (
-        ("row_size", c_int),
-        ("size", c_int),
-        ("goal_size", c_int),
-        ("columns", POINTER(c_int)),
-        ("goal_columns", POINTER(c_int)),
-        ("gripper", Gripper),
-        ("compares_distance", c_int),
-        ("distance_threshold", c_double),
-        ("terminate_on_success", c_int),
-        ("max_episode_steps", c_int64),
-    )
-
-
-# Entry of `Observation.columns` for the distance between the fingers, which is not a
-# column of the state.
-WIDTH = -1
-
-
 class Library:
     """The functions of the library.
 
-    Calls release the GIL, except those of functions whose names start with
-    ``environment_``. These are so short that releasing the GIL would take longer.
+    Calls release the GIL.
 
     Args:
         path: Path of the compiled file.
@@ -246,7 +190,7 @@ class Library:
     """
 
     def __init__(self, path: str) -> None:
-        work, cheap = ctypes.CDLL(path), ctypes.PyDLL(path)
+        work = ctypes.CDLL(path)
         self.path = path
         try:
             self.version: int = work.loop_version()
@@ -265,26 +209,6 @@ class Library:
         self.reset = bind(work, "loop_reset", c_int, c_void_p, integers, c_int)
         self.reset_one = bind(work, "client_reset", c_int, POINTER(Batch), c_int)
         self.destroy = bind(work, "loop_destroy", None, c_void_p)
-        self.environment_begin_step = bind(
-            cheap,
-            "environment_begin_step",
-            c_int,
-            *(c_void_p, c_void_p, c_int, c_void_p, c_int),
-        )
-        self.environment_any = bind(cheap, "environment_any", c_int, c_void_p, c_size_t)
-        self.environment_setpoints = bind(
-            cheap,
-            "environment_setpoints",
-            None,
-            *(POINTER(Actuation), c_void_p, c_int, c_void_p, c_void_p),
-        )
-        self.environment_observe = bind(
-            cheap,
-            "environment_observe",
-            c_int,
-            *(POINTER(Observation), c_void_p, c_int),
-            *(c_void_p,) * 10,
-        )
 
 
 def load() -> Library | str:

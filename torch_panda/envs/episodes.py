@@ -14,7 +14,6 @@ from torch_panda.bullet import (
     PhysicsParams,
     ThreadGuard,
     VectorSimulation,
-    native,
     read_physics,
 )
 from torch_panda.checks import (
@@ -35,7 +34,6 @@ from torch_panda.envs.start import EpisodeStarts, check_samplers
 from torch_panda.envs.state import StartState, read_state
 from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
-from torch_panda.robots.compiled_setpoints import CompiledSetpoints
 from torch_panda.sensors import Entry, Sensor, read_sensors
 from torch_panda.tasks import Task
 
@@ -114,10 +112,7 @@ class Episodes:
         self.robot, self.task = robot, task
         self._control = robot.controller
         self.batch_shape = () if num_envs is None else (n,)
-        self._action_shape = torch.Size((*self.batch_shape, robot.action_dim))
-        self._action_template = torch.zeros(
-            n, robot.action_dim, dtype=torch.float32, device="cpu"
-        )
+        self._action_shape = (*self.batch_shape, robot.action_dim)
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.on_divergence = on_divergence
         self.physics = read_physics(physics)
@@ -134,9 +129,6 @@ class Episodes:
             build, n, num_threads=num_threads, physics=self.physics
         )
         try:
-            self._compiled_setpoints = None
-            if CompiledSetpoints.applies(robot, self.simulation):
-                self._compiled_setpoints = CompiledSetpoints(robot, self.simulation)
             self.renderer = VectorRenderer(self.simulation, renderer=renderer)
             randomizer = DomainRandomizer(
                 randomize, robot, task, self.simulation, self.physics
@@ -370,40 +362,13 @@ class Episodes:
 
     def _begin_step(self, action: Tensor | None, step_mask: Tensor | None) -> Tensor:
         """Check an action and count a step; return the clipped action, a new tensor."""
-        step_count = self._starts.step_count
-        # For float32 actions on the CPU, C code is faster than torch. It returns 0 if a
-        # number is not finite. Then `check_action` raises the error.
-        if (
-            native.LIBRARY is not None
-            and self.simulation.is_native
-            and step_mask is None
-            and isinstance(action, Tensor)
-            and action.shape == self._action_shape
-            and action.dtype == torch.float32
-            and action.is_cpu
-            and action.is_contiguous()
-        ):
-            # Faster than `torch.empty` with a shape and a dtype.
-            clipped = torch.empty_like(self._action_template)
-            is_finite = native.LIBRARY.environment_begin_step(
-                action.data_ptr(),
-                clipped.data_ptr(),
-                clipped.numel(),
-                step_count.data_ptr(),
-                self.num_envs,
-            )
-            if is_finite:
-                return clipped
-        action = check_action(action, tuple(self._action_shape))
-        step_count += 1 if step_mask is None else step_mask
-        return action.clamp(-1.0, 1.0).float()
+        action = check_action(action, self._action_shape)
+        self._starts.step_count += 1 if step_mask is None else step_mask
+        return action
 
     def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
         """Advance the physics by one step; return the environments that diverged."""
-        if self._compiled_setpoints is None:
-            setpoint = self.robot.setpoint(action, self.simulation).numpy()
-        else:
-            setpoint = self._compiled_setpoints(action)
+        setpoint = self.robot.setpoint(action, self.simulation).numpy()
         return self.simulation.step(self._control, setpoint, envs)
 
     def _read_state(self, state: Mapping[str, Any], envs: list[int]) -> StartState:

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.checks import check_output
-from torch_panda.envs.compiled_observer import CompiledObserver, Observed
 from torch_panda.envs.randomization import PHYSICS_KEYS, DomainRandomizer
 from torch_panda.envs.state import BODY_KEYS, EXACT_KEYS
 from torch_panda.rendering import VectorRenderer
@@ -19,6 +18,9 @@ from torch_panda.tasks import Task
 # The first 20 observations are checked for NaN and infinity. The check is too expensive
 # for every step.
 _NUM_CHECKED = 20
+
+Observed = dict[str, Tensor]
+"""Observed entries of all environments, (n, ...) by key, in new tensors."""
 
 Hook = Callable[[VectorSimulation], dict[str, Tensor]]
 HOOKS = ("extra_observation", "info")
@@ -67,14 +69,8 @@ class EpisodeObserver:
         # A hook that the task does not override is never called.
         self._has_reward = type(task).reward is not Task.reward
         self._has_failure = type(task).failure is not Task.failure
+        self._may_terminate = terminate_on_success or self._has_failure
         self._check_functions()
-        self._compiled = CompiledObserver.make(
-            robot,
-            task,
-            simulation,
-            max_episode_steps=max_episode_steps,
-            terminate_on_success=terminate_on_success,
-        )
         # Sensors also follow resets and steps; the other observers only observe.
         self._attached_sensors = [
             sensor.attach(simulation, renderer, robot) for sensor in sensors
@@ -133,16 +129,8 @@ class EpisodeObserver:
                 where `Task.goal_entries` declares it.
             TypeError: A sensor does not return tensors.
         """
-        if self._compiled is None:
-            observed, has_outcome = self._observe_goals(goal), False
-        else:
-            observed, has_outcome = self._compiled.observe(goal, step_count)
-        # `has_outcome` says whether C code computed success, end flags and reward; see
-        # `CompiledObserver.observe`. C code does not call the task's hooks.
-        if not has_outcome or self._has_reward or self._has_failure:
-            self._add_outcome(observed, step_count, action)
-        if action is None:
-            observed.pop("reward", None)
+        observed = self._observe_goals(goal)
+        self._add_outcome(observed, step_count, action)
         for observer in self._observers:
             values = observer.observe()
             if self._num_to_check:
@@ -176,10 +164,13 @@ class EpisodeObserver:
         task, simulation = self._task, self._simulation
         goals = observed["achieved_goal"], observed["desired_goal"]
         success = task.is_success(*goals)
-        ends = success if self._terminate_on_success else torch.zeros_like(success)
+        terminated = (
+            success if self._terminate_on_success else torch.zeros_like(success)
+        )
         if self._has_failure:
-            ends = ends | task.failure(simulation)
-        terminated = ends & (step_count > 0)  # no episode ends before its first step
+            terminated = terminated | task.failure(simulation)
+        if self._may_terminate:  # no episode ends before its first step
+            terminated = terminated & (step_count > 0)
         truncated = step_count >= self._max_episode_steps
         observed |= {
             "success": success,

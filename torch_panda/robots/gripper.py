@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import native
 from torch_panda.checks import check_above_zero, check_finite
 
 
@@ -74,21 +73,6 @@ class Gripper:
     def fingers_width(self, joints: Tensor) -> Tensor:
         """Distance between the fingers [m], (n, 1), for joints (n, num_joints)."""
         return (joints * self._weights).sum(dim=1, keepdim=True) + self._offset
-
-    def describe(self, column: int) -> native.Gripper:
-        """Description for the C code of this gripper, which must have two joints.
-
-        Args:
-            column: Column of the first joint's position in the rows of the state.
-        """
-        return native.Gripper(
-            column,
-            self.scale,
-            tuple(self._weights.tolist()),
-            self._offset,
-            tuple(self._closed.tolist()),
-            tuple(self._per_width.tolist()),
-        )
 
     def setpoint(self, action: Tensor, joints: Tensor) -> Tensor:
         """Setpoints of the joints for actions.

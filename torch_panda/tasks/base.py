@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.arguments import Configured
-from torch_panda.bullet import PhysicsClient, VectorSimulation, selects_state
+from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.checks import check_choice, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 
@@ -307,14 +307,10 @@ class Task(Configured, ABC):
             )
         return _poses(goal)
 
-    @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """The task's part of the observation, (num_envs, observation_dim) float64.
 
-        The robot's part precedes it in ``observation``. The default is empty. If this
-        method and `achieved_goal` only copy numbers of the state, a task may decorate
-        both with `bullet.selects_state`. C code then does their work, which saves about
-        50 microseconds per step.
+        The robot's part precedes it in ``observation``. The default is empty.
         """
         return simulation.ee_position[:, :0]
 

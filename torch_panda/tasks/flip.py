@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual, selects_state
+from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION, rotate, rotation_distance
 from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Task
@@ -93,13 +93,11 @@ class Flip(Task):
         position = sample_on_table(rng, self.obj_xy_range, height=CUBE_SIZE / 2)
         return ((*position, *NO_ROTATION),)
 
-    @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, quaternion and velocities of the cube, (num_envs, 13)."""
         pose, velocity = simulation.object_pose[:, 0], simulation.object_velocity[:, 0]
         return torch.cat((pose, velocity), dim=1)
 
-    @selects_state
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Orientation of the cube, quaternion xyzw, (num_envs, 4)."""
         return simulation.object_pose[:, 0, 3:]

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation, selects_state
+from torch_panda.bullet import PhysicsClient, Sphere, VectorSimulation
 from torch_panda.checks import check_not_negative
 from torch_panda.tasks.base import Bodies, GoalEntries, Task
 from torch_panda.tasks.table import TABLE_FRICTION, create_table
@@ -54,7 +54,6 @@ class Reach(Task):
         x, y = rng.uniform(-half, half, size=2)
         return float(x), float(y), rng.uniform(0.0, self.goal_range)
 
-    @selects_state
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Position of the end-effector, (num_envs, 3)."""
         return simulation.ee_position

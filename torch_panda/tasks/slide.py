@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
-from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation, selects_state
+from torch_panda.bullet import Cylinder, PhysicsClient, VectorSimulation
 from torch_panda.checks import check_above_zero, check_finite, check_not_negative
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks.base import (
@@ -114,12 +114,10 @@ class Slide(Task):
         position = sample_on_table(rng, self.obj_xy_range, height=PUCK_START_HEIGHT)
         return ((*position, *NO_ROTATION),)
 
-    @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, Euler angles and velocities of the puck, (num_envs, 12)."""
         return object_observation(simulation, 0)
 
-    @selects_state
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Position of the puck, (num_envs, 3)."""
         return simulation.object_pose[:, 0, :3]

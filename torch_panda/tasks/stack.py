@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual, selects_state
+from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.bullet.shapes import GREEN, RED, Color
 from torch_panda.checks import check_above_zero, check_not_negative
 from torch_panda.rotations import NO_ROTATION
@@ -111,12 +111,10 @@ class Stack(Task):
             for height in (LOWER_HEIGHT, UPPER_HEIGHT)
         )
 
-    @selects_state
     def observation(self, simulation: VectorSimulation) -> Tensor:
         """Position, Euler angles and velocities of both cubes, (num_envs, 24)."""
         return simulation.object_state.flatten(1)
 
-    @selects_state
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Positions of both cubes, (num_envs, 6)."""
         return simulation.object_pose[:, :, :3].flatten(1)
