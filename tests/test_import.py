@@ -21,7 +21,7 @@ LAYERS = (
     ("sensors",),
     ("envs", "noise"),
     ("registry",),
-    ("experts", "gymnasium_envs"),
+    ("experts", "gymnasium_envs", "testing"),
     ("learning",),
     ("datasets",),
     ("info",),

@@ -230,35 +230,6 @@ def check_action(action: object, shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(clipped.astype(np.float32, copy=False))
 
 
-def check_output(
-    function: str,
-    value: object,
-    shape: tuple[int, ...],
-    dtype: torch.dtype | None = None,
-) -> None:
-    """Check the tensor that a function of a robot or task returned.
-
-    Args:
-        function: Name of the function, for the error.
-        value: The returned value.
-        shape: The shape that the tensor must have.
-        dtype: The dtype that the tensor must have; None accepts any.
-
-    Raises:
-        ValueError: The tensor has another shape or dtype.
-        TypeError: The value is not a tensor.
-    """
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{function} must return a tensor, got {value!r}")
-    if tuple(value.shape) != shape:
-        raise ValueError(
-            f"{function} must return shape {shape}, got {tuple(value.shape)}"
-        )
-    if dtype is not None and value.dtype != dtype:
-        name = str(dtype).removeprefix("torch.")
-        raise ValueError(f"{function} must return {name}, got {value.dtype}")
-
-
 def check_rows(
     name: str, is_valid: Tensor, envs: Sequence[int], requirement: str
 ) -> None:

@@ -41,10 +41,6 @@ class Flipped(Undeclared):
     goal_entries = GoalEntries("task", (11, 10, 9))
 
 
-class Wrong(Undeclared):
-    goal_entries = GoalEntries("task", (0, 1, 2))
-
-
 class OtherRobot(Panda):
     def observation(self, simulation):
         return super().observation(simulation).flip(1)
@@ -61,11 +57,6 @@ def test_a_declaration_holds_for_the_functions_that_it_describes():
 
 
 def test_wrong_goal_entries_are_refused():
-    with (
-        RobotTaskEnv(robot=Panda(), task=Wrong()) as env,
-        pytest.raises(ValueError, match=r"Wrong.goal_entries says, but they differ"),
-    ):
-        env.reset()
     short = type("Short", (Push,), {"goal_entries": GoalEntries("task", (0, 1))})
     with pytest.raises(ValueError, match=r"Short.goal_entries must name 3 numbers of"):
         RobotTaskEnv(robot=Panda(), task=short())

@@ -167,38 +167,21 @@ def task_with(function):
 
 
 @pytest.mark.parametrize(
-    ("function", "error", "message"),
+    ("function", "message"),
     [
-        (lambda s, sim: sim.ee_position, TypeError, r"Own\.info must return a dict"),
-        (lambda s, sim: {"cost": 1.0}, TypeError, r"info\['cost'\] must return a tens"),
-        (lambda s, sim: {"cost": sim.ee_position[0]}, ValueError, "must return shape"),
-        (
-            lambda s, sim: {"observation": sim.ee_position},
-            ValueError,
-            "the environment's own keys",
-        ),
+        (lambda s, sim: {"cost": 1.0}, r"info\['cost'\] must return a tensor"),
+        (lambda s, sim: {"cost": sim.ee_position[0]}, "must return shape"),
+        (lambda s, sim: {"observation": sim.ee_position}, "environment's own keys"),
         (
             lambda s, sim: {"is_success": sim.ee_position},
-            ValueError,
             "because Gymnasium and Stable-Baselines3 use these keys",
         ),
-        (
-            lambda s, sim: {"cost": sim.ee_position.mul_(2)},
-            ValueError,
-            "must not change",
-        ),
+        (lambda s, sim: {"cost": sim.ee_position.mul_(2)}, "must not change"),
     ],
 )
-def test_wrong_infos_are_refused(function, error, message):
-    with pytest.raises(error, match=message):
+def test_wrong_infos_are_refused(function, message):
+    with pytest.raises(ValueError, match=message):
         make(task_with(function), num_envs=2)
-
-
-def test_nan_in_the_first_infos_is_named():
-    task = task_with(lambda s, sim: {"cost": sim.ee_velocity * 0 / 0})
-    message = r"Own\.info\['cost'\] must return no NaN"
-    with make(task) as env, pytest.raises(ValueError, match=message):
-        env.reset()
 
 
 def test_an_info_that_is_a_view_of_the_state_is_copied():

@@ -9,6 +9,8 @@ and `--preset sample-efficient` use the recipes of the task in
 `torch_panda.learning.recipes`.
 
 With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
+
+`torch_panda.testing.check_task` checks the task before the training begins.
 """
 
 from collections.abc import Sequence
@@ -43,6 +45,8 @@ from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.training import Run
 from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.learning.video import record
+from torch_panda.registry import find_registration
+from torch_panda.testing import check_task
 
 PROG = "python -m torch_panda train"
 DATA_FILE = "data.pt"  # file of a run's folder with the data that it generated
@@ -160,6 +164,10 @@ def main(args: Args | OfflineArgs) -> None:
             check(args)
             preset, default = {}, default_args(args.preset, args.env_id, args.algo)
         check_folder(out, resume=args.resume)
+        registration = find_registration(args.env_id)
+        check_task(
+            registration.make_task(args.task_options), robot=registration.make_robot()
+        )
         run = make_run(args, out)
         is_tuned = isinstance(args, Args) and args.preset == "tuned"
         if is_tuned and not find_recipe(args.env_id):

@@ -1,0 +1,212 @@
+"""Problems of the functions of a robot and a task: wrong tensors, changes in place."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_panda.bullet import VectorSimulation
+from torch_panda.robots import Robot
+from torch_panda.tasks import Task
+
+
+class Function(NamedTuple):
+    """A function of a robot or a task, and the tensors that it must return.
+
+    Attributes:
+        name: Name of the function, for the descriptions of problems.
+        call: Calls the function with its arguments.
+        shape: Shape of the returned tensor.
+        dtype: dtype of the returned tensor; None accepts any.
+        is_hook: Whether the function returns a dict of tensors instead of one tensor.
+            Then ``shape`` is the beginning of their shapes.
+        inputs: Tensors that the function must not change.
+    """
+
+    name: str
+    call: Callable[[], Any]
+    shape: tuple[int, ...]
+    dtype: torch.dtype | None = None
+    is_hook: bool = False
+    inputs: tuple[Tensor, ...] = ()
+
+    def check(self) -> tuple[Any, list[str]]:
+        """Call the function.
+
+        Returns:
+            The returned value, and its problems, one line each.
+        """
+        # Changes in place increment this counter, also changes of a view of the tensor.
+        versions = [tensor._version for tensor in self.inputs]
+        value = self.call()
+        problems = []
+        if [tensor._version for tensor in self.inputs] != versions:
+            problems.append(
+                f"{self.name} must not change goals or the state of the simulation in "
+                f"place: change a copy, such as tensor.clone()"
+            )
+        if not self.is_hook:
+            problems += find_tensor_problems(self.name, value, self.shape, self.dtype)
+        elif not isinstance(value, dict):
+            problems.append(
+                f"{self.name} must return a dict of tensors, got {_class(value)}"
+            )
+        else:
+            for key, entry in value.items():
+                tail = tuple(entry.shape[1:]) if isinstance(entry, Tensor) else ()
+                name, shape = f"{self.name}[{key!r}]", (*self.shape, *tail)
+                problems += find_tensor_problems(name, entry, shape)
+        return value, problems
+
+
+def list_functions(
+    robot: Robot,
+    task: Task,
+    simulation: VectorSimulation,
+    *,
+    action: Tensor | None = None,
+    goals: tuple[Tensor, Tensor] | None = None,
+) -> list[Function]:
+    """List the functions that an environment calls in resets and steps.
+
+    Args:
+        robot: The robot.
+        task: The task. A hook that it does not override is left out.
+        simulation: The environments.
+        action: Argument of `Task.reward`, (n, action_dim); None means zeros.
+        goals: Achieved and desired goals for the functions of goals, (n, goal_dim)
+            each; None means zeros.
+    """
+    n, state = simulation.num_envs, simulation.state.rows
+    if action is None:
+        action = torch.zeros(n, robot.action_dim, dtype=torch.float32, device="cpu")
+    if goals is None:
+        zeros = torch.zeros(n, task.goal_dim, dtype=torch.float32, device="cpu")
+        goals = zeros, zeros.clone()
+    reads_state = partial(Function, inputs=(state,))
+    reads_goals = partial(Function, inputs=goals)
+    owner = type(task).__name__
+    functions = [
+        reads_state(
+            f"{type(robot).__name__}.observation",
+            partial(robot.observation, simulation),
+            (n, robot.observation_dim),
+        ),
+        reads_state(
+            f"{owner}.observation",
+            partial(task.observation, simulation),
+            (n, task.observation_dim),
+        ),
+        reads_state(
+            f"{owner}.achieved_goal",
+            partial(task.achieved_goal, simulation),
+            (n, task.goal_dim),
+        ),
+        reads_goals(
+            f"{owner}.is_success",
+            partial(task.is_success, *goals),
+            (n, 1),
+            torch.bool,
+        ),
+        reads_goals(
+            f"{owner}.compute_reward", partial(task.compute_reward, *goals), (n, 1)
+        ),
+    ]
+    if markers := simulation.scene.markers:
+        goal = goals[1].double()
+        functions.append(
+            Function(
+                f"{owner}.marker_pose",
+                partial(task.marker_pose, goal),
+                (n, len(markers), 7),
+                inputs=(goal,),
+            )
+        )
+    reward = partial(task.reward, simulation, action, *goals)
+    optional = {
+        "reward": Function("", reward, (n, 1), inputs=(state, *goals)),
+        "failure": reads_state(
+            "", partial(task.failure, simulation), (n, 1), torch.bool
+        ),
+    }
+    for hook in ("extra_observation", "info"):
+        call = partial(getattr(task, hook), simulation)
+        optional[hook] = reads_state("", call, (n,), is_hook=True)
+    functions += [
+        function._replace(name=f"{owner}.{name}")
+        for name, function in optional.items()
+        if getattr(type(task), name) is not getattr(Task, name)
+    ]
+    return functions
+
+
+def find_problems(
+    robot: Robot,
+    task: Task,
+    simulation: VectorSimulation,
+    goal_indices: tuple[int, ...] | None,
+) -> list[str]:
+    """Compare the functions of a robot and a task with the sizes that they declare.
+
+    Args:
+        robot: The robot.
+        task: The task.
+        simulation: The environments.
+        goal_indices: Columns of the observation that hold the achieved goal, or None.
+
+    Returns:
+        The problems, one line each.
+    """
+    functions = list_functions(robot, task, simulation)
+    problems = [line for function in functions for line in function.check()[1]]
+    return problems + find_goal_entries_problems(robot, task, goal_indices)
+
+
+def find_goal_entries_problems(
+    robot: Robot, task: Task, goal_indices: tuple[int, ...] | None
+) -> list[str]:
+    """Compare `Task.goal_entries` with the sizes of goal and observation."""
+    if goal_indices is None:
+        return []
+    size = robot.observation_dim + task.observation_dim
+    is_inside = all(0 <= index < size for index in goal_indices)
+    if len(goal_indices) == task.goal_dim and is_inside:
+        return []
+    return [
+        f"{type(task).__name__}.goal_entries must name {task.goal_dim} numbers of an "
+        f"observation, got {task.goal_entries}; the robot's part has "
+        f"{robot.observation_dim} numbers, and the task's part has "
+        f"{task.observation_dim}"
+    ]
+
+
+def find_tensor_problems(
+    name: str,
+    value: object,
+    shape: tuple[int, ...],
+    dtype: torch.dtype | None = None,
+) -> list[str]:
+    """Compare a returned value with the shape and the dtype that it must have.
+
+    Args:
+        name: Name of the function, for the descriptions of problems.
+        value: The returned value.
+        shape: The shape that the tensor must have.
+        dtype: The dtype that the tensor must have; None accepts any.
+    """
+    if not isinstance(value, Tensor):
+        return [f"{name} must return a tensor, got {_class(value)}"]
+    problems = []
+    if tuple(value.shape) != shape:
+        problems.append(f"{name} must return shape {shape}, got {tuple(value.shape)}")
+    if dtype is not None and value.dtype != dtype:
+        expected = str(dtype).removeprefix("torch.")
+        problems.append(f"{name} must return {expected}, got {value.dtype}")
+    return problems
+
+
+def _class(value: object) -> str:
+    """Class of a value, on one line."""
+    return "None" if value is None else f"a {type(value).__name__}"
