@@ -91,33 +91,29 @@ def test_make_says_what_to_use_with_an_id_of_a_user(env_id):
 def test_options_of_task_and_robot_are_checked():
     with pytest.raises(
         TypeError,
-        match="task_options of PandaPush-v1 got an unexpected keyword argument "
-        "'threshold'; did you mean 'distance_threshold'",
+        match="Push got an unexpected keyword argument 'threshold'; did you mean "
+        "'distance_threshold'",
     ):
         torch_panda.make("PandaPush-v1", task_options={"threshold": 0.1})
-    with pytest.raises(TypeError, match="robot_options of PandaPush-v1 must be a map"):
-        torch_panda.make("PandaPush-v1", robot_options="joints")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
+    ("arguments", "message"),
     [
-        ({"env_id": "PandaPush-v1"}, ValueError, "ships; choose another one"),
-        ({"env_id": "Two words"}, ValueError, "cannot be an id"),
-        ({"robot": Panda()}, TypeError, "robot must be a class or a function"),
-        ({"task": Push()}, TypeError, "task must be a class or a function"),
-        ({"max_episode_steps": 0}, ValueError, "max_episode_steps must be"),
+        ({"env_id": "PandaPush-v1"}, "ships; choose another one"),
+        ({"env_id": "Two words"}, "cannot be an id"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be"),
     ],
 )
-def test_wrong_registrations_are_refused(arguments, error, message):
+def test_wrong_registrations_are_refused(arguments, message):
     accepted = {"env_id": "Shove-v0", "robot": Panda, "task": Push}
-    with pytest.raises(error, match=message):
+    with pytest.raises(ValueError, match=message):
         torch_panda.register(**(accepted | arguments))
 
 
 def test_an_unknown_id_is_named_with_a_similar_one_and_the_accepted_ones(env_id):
     message = (
-        r"'PandaPsh-v1'; did you mean PandaPush-v1.*accepted ids are Panda\{Reach,.*"
+        r"'PandaPsh-v1'; did you mean 'PandaPush-v1'.*accepted ids are Panda\{Reach,.*"
         "registered ids are .*Unversioned.*import the module"
     )
     with pytest.raises(ValueError, match=message):

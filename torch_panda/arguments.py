@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from importlib import import_module
 from typing import Any, ClassVar, NamedTuple
 
@@ -39,8 +39,9 @@ class Configured:
 
     def __new__(cls, *args: object, **arguments: object) -> Self:
         """Refuse unknown arguments, and defaults that have no effect."""
-        if arguments:
-            check_call(cls.__name__, cls, arguments)
+        # A constructor with ``**options`` passes them on, so Python checks these.
+        if not _has_options(inspect.signature(cls.__init__).parameters):
+            check_names(cls.__name__, arguments, argument_names(cls))
         _check_defaults(cls)
         return super().__new__(cls)
 
@@ -111,7 +112,7 @@ class Configured:
         if name in vars(self) or (hasattr(type(self), name) and not is_method):
             return
         options = argument_names(type(self))
-        hint = _suggestion(name, options)
+        hint = suggest(name, options)
         if name in self._assignment_advice:
             hint = f"{self._assignment_advice[name]}; "
         raise AttributeError(
@@ -186,29 +187,10 @@ def load_class(package: str, path: str) -> Any:  # noqa: ANN401 (any class)
     return getattr(import_module(f"{package}.{module}"), name)
 
 
-def check_call(
-    owner: str, function: Callable[..., object], names: Iterable[str]
-) -> None:
-    """Refuse arguments that a function or class does not have.
-
-    A function with ``**options`` accepts any name, so it is not checked here.
-
-    Args:
-        owner: Name of the function, for the error.
-        function: Function or class that is going to be called.
-        names: Names of the arguments in the call.
-
-    Raises:
-        TypeError: A name is not accepted.
-    """
-    # Before Python 3.11, the signature of a class was that of `Configured.__new__`, if
-    # the class inherited its `__init__`.
-    called = function
-    if isinstance(function, type):
-        called = function.__init__  # type: ignore[misc]  # of this very class
-    parameters = inspect.signature(called).parameters
-    if not _has_options(parameters):
-        check_names(owner, names, [name for name in parameters if name != "self"])
+def suggest(name: str, accepted: Collection[str]) -> str:
+    """The question "did you mean ...?" for an error; empty if no name is similar."""
+    similar = difflib.get_close_matches(name, accepted, n=1)
+    return f"did you mean {similar[0]!r}? " if similar else ""
 
 
 def check_names(
@@ -231,7 +213,7 @@ def check_names(
     for name in names:
         if name in accepted:
             continue
-        hint = _suggestion(name, accepted)
+        hint = suggest(name, accepted)
         if advice and name in advice:
             hint = f"{advice[name]}; "
         # The wording is Python's own, because torchrl's GymEnv looks for it and then
@@ -265,9 +247,3 @@ def _own_arguments(owner: type) -> list[str]:
 
 def _has_options(parameters: Mapping[str, inspect.Parameter]) -> bool:
     return any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
-
-
-def _suggestion(name: str, accepted: Collection[str]) -> str:
-    """A question for the most similar accepted name; empty if none is similar."""
-    similar = difflib.get_close_matches(name, accepted, n=1)
-    return f"did you mean {similar[0]!r}? " if similar else ""

@@ -1,17 +1,16 @@
 """Registry: ids of environments, `make` and `register`."""
 
-import difflib
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import gymnasium
 import torch
 
-from torch_panda.arguments import argument_names, check_call, check_names, load_class
+from torch_panda.arguments import argument_names, check_names, load_class, suggest
 from torch_panda.bullet.shapes import BLUE
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
@@ -21,7 +20,6 @@ from torch_panda.sensors import Sensor, read_keywords
 from torch_panda.tasks import Task
 from torch_panda.tasks.peg_insertion import GRASP_WIDTH
 
-RobotOrTask = TypeVar("RobotOrTask", Robot, Task)
 Options = Mapping[str, Any]
 
 
@@ -48,11 +46,11 @@ class Registration(NamedTuple):
         Raises:
             TypeError: The robot does not have one of these arguments.
         """
-        return _call(self.robot, f"robot_options of {self.env_id}", options)
+        return self.robot(**options or {})
 
     def make_task(self, options: Options | None = None) -> Task:
         """Make the task of the id; see `make_robot`."""
-        return _call(self.task, f"task_options of {self.env_id}", options)
+        return self.task(**options or {})
 
 
 class Family(NamedTuple):
@@ -307,18 +305,12 @@ def register(
     Raises:
         ValueError: The id belongs to torch_panda or is invalid for Gymnasium, or
             ``max_episode_steps`` is below 1.
-        TypeError: ``robot`` or ``task`` cannot be called, or ``max_episode_steps`` is
-            None and ``task`` needs arguments.
+        TypeError: ``max_episode_steps`` is None and ``task`` needs arguments.
     """
     if env_id in ENV_IDS:
         raise ValueError(
             f"{env_id!r} is an id that torch_panda ships; choose another one"
         )
-    for name, factory in (("robot", robot), ("task", task)):
-        if not callable(factory):
-            raise TypeError(
-                f"{name} must be a class or a function that makes one, got {factory!r}"
-            )
     check_positive(max_episode_steps=max_episode_steps)
     steps = max_episode_steps or task().max_episode_steps
     registration = Registration(env_id, robot, task, steps, terminate_on_success)
@@ -337,8 +329,7 @@ def find_registration(env_id: str) -> Registration:
     """
     if isinstance(env_id, str) and env_id in _REGISTRATIONS:
         return _REGISTRATIONS[env_id]
-    similar = difflib.get_close_matches(str(env_id), _REGISTRATIONS, n=3)
-    hint = f"did you mean {' or '.join(similar)}? " if similar else ""
+    hint = suggest(str(env_id), _REGISTRATIONS)
     own = ", ".join(sorted(_REGISTRATIONS.keys() - set(ENV_IDS)))
     raise ValueError(
         f"unknown environment id {env_id!r}; {hint}accepted ids are {_id_patterns()}"
@@ -423,13 +414,3 @@ def _check_options(registration: Registration, options: Options) -> None:
     if "reward_type" in advice and dense_id in ENV_IDS:
         advice["reward_type"] += f", or the id {dense_id} for dense rewards"
     check_names("make", unknown, accepted, advice)
-
-
-def _call(
-    factory: Callable[..., RobotOrTask], owner: str, options: Options | None
-) -> RobotOrTask:
-    """Make a robot or a task with these arguments."""
-    if options is not None and not isinstance(options, Mapping):
-        raise TypeError(f"{owner} must be a mapping, got {options!r}")
-    check_call(owner, factory, options or {})
-    return factory(**options or {})

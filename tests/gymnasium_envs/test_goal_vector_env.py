@@ -131,7 +131,6 @@ def env():
         ({"options": {"mask": 1}}, ValueError, "only accepted option is .state"),
         ({"options": {"state": {}}}, ValueError, "must have entries, got none"),
         ({"options": {"state": {"object": [0]}}}, ValueError, "unknown entries .'obje"),
-        ({"options": {"state": None}}, TypeError, "must be a mapping to arrays"),
         ({"options": {"reset_mask": [True] * 3}}, TypeError, "array of bool"),
         ({"options": {"reset_mask": np.ones(3)}}, TypeError, "array of bool"),
         (

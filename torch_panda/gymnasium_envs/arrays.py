@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
@@ -65,7 +64,6 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
     Raises:
         ValueError: An option has another name, or the state has no entries or unknown
             ones.
-        TypeError: The state is not a mapping of names to arrays of numbers.
     """
     if unknown := set(options) - {"state"}:
         raise ValueError(
@@ -74,8 +72,6 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
     if "state" not in options:
         return None
     state = options["state"]
-    if not isinstance(state, Mapping | TensorDictBase):
-        raise TypeError(f"the state must be a mapping to arrays, got {state!r}")
     if not state.keys():
         raise ValueError("the state must have entries, got none")
     unknown_keys = set(state.keys()).difference(PLAIN_KEYS, EXACT_KEYS)

@@ -15,7 +15,6 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
-from torch_panda.arguments import check_call
 from torch_panda.bullet import PhysicsParams
 from torch_panda.envs.randomization import Randomization
 from torch_panda.rendering import Camera, HandCamera
@@ -85,7 +84,6 @@ def read_json(options: Mapping[str, Any]) -> dict[str, Any]:
             cls: Any = {"physics": PhysicsParams, "randomize": Randomization}.get(name)
             if name in _CAMERAS:
                 cls = HandCamera if "eye" in value else Camera
-            check_call(name, cls, value)
             read[name] = cls(**{key: _to_tuple(entry) for key, entry in value.items()})
     return read
 

@@ -1,7 +1,6 @@
 """Cameras: where they are and what they see."""
 
 import dataclasses
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -141,16 +140,12 @@ def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
         size: Height and width, or one number for both [pixels]; None keeps the size.
 
     Raises:
-        ValueError: The size is neither an integer nor a pair of integers.
+        ValueError: The size is not one or two numbers, or one of them is below 1.
+        TypeError: A number is not an integer.
     """
     if size is None:
         return camera
-    try:
-        height, width = map(operator.index, np.broadcast_to(size, 2))
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"a size must be an integer or (height, width) [pixels], got {size!r}"
-        ) from None
+    height, width = np.broadcast_to(size, 2).tolist()
     return dataclasses.replace(camera, height=height, width=width)
 
 

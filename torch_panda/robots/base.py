@@ -1,6 +1,7 @@
 """A robot arm on a fixed base."""
 
 import math
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
@@ -18,7 +19,6 @@ from torch_panda.checks import (
     check_above_zero,
     check_choice,
     check_finite,
-    check_integer,
     check_not_negative,
     check_quaternion,
     check_vector,
@@ -139,7 +139,7 @@ class Robot(Configured):
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
         self.joint_forces = tuple(map(float, joint_forces))
-        self.ee_link = check_integer("ee_link", ee_link)
+        self.ee_link = operator.index(ee_link)
         x, y, z, w = ee_orientation
         self.ee_orientation = (float(x), float(y), float(z), float(w))
         num_fingers = 0 if gripper is None else gripper.num_joints

@@ -51,8 +51,6 @@ def read_keywords(
     Raises:
         ValueError: The keywords contradict each other, or a size is out of range.
     """
-    if isinstance(sensors, str):
-        return sensors  # `read_sensors` refuses it.
     if not (from_pixels or depth or segmentation):
         if camera is not None or render_size is not None:
             raise ValueError(
@@ -69,20 +67,13 @@ def read_sensors(sensors: Sequence[Sensor | str], robot: Robot) -> tuple[Sensor,
 
     Raises:
         ValueError: A name is unknown, or the robot cannot have a sensor.
-        TypeError: An item is neither a sensor nor a name.
     """
-    if isinstance(sensors, str):
-        raise ValueError(
-            f"sensors must be a sequence, such as ({sensors!r},), got {sensors!r}"
-        )
     for sensor in sensors:
         if isinstance(sensor, str) and sensor not in sensors_of(robot):
             raise ValueError(
                 f"sensors must be among {sensors_of(robot)} for this robot, or Sensor "
                 f"objects, got {sensor!r}"
             )
-        if not isinstance(sensor, Sensor | str):
-            raise TypeError(f"a sensor must be a Sensor or a name, got {sensor!r}")
     read = [SENSORS[item] if isinstance(item, str) else item for item in sensors]
     for sensor in read:
         sensor.check(robot)
