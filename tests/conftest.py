@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import torch_panda
-from torch_panda.bullet import native
 
 
 def pytest_configure():
@@ -39,15 +38,6 @@ def few_starts():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torch_panda.learning.evaluation_tasks.NUM_STARTS", 11)
         yield
-
-
-@pytest.fixture(params=["native", "ctypes"])
-def loop(request, monkeypatch):
-    """Steps through either loop: whatever a test finds must hold for both."""
-    if request.param == "native" and native.LIBRARY is None:
-        pytest.skip("installed where there was no C compiler")
-    monkeypatch.setenv(native.LOOP_VARIABLE, request.param)
-    return request.param
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import torch
 
 import torch_panda
 from torch_panda.bullet import solver
-from torch_panda.bullet.native import loop_name, loop_problem
+from torch_panda.bullet.loop import load_library
 from torch_panda.bullet.pool import num_cores
 from torch_panda.extras import EXTRAS, install_command
 
@@ -42,6 +42,8 @@ def versions() -> dict[str, str]:
 
 def environments() -> list[str]:
     """Ids, sizes and number of steps, a line for each robot, task and control type."""
+    if _loop_problem():
+        return ["none can be made, see missing"]
     families: dict[str, list[str]] = {}
     for env_id in torch_panda.ENV_IDS:
         families.setdefault(re.sub(r"(Dense)?-v\d+$", "", env_id), []).append(env_id)
@@ -80,8 +82,8 @@ def extras() -> list[str]:
 def missing() -> list[str]:
     """Features that do not work here, with the reason or the fix, a line for each."""
     lines = []
-    if problem := loop_problem():
-        lines.append(f"the native loop: {problem}")
+    if problem := _loop_problem():
+        lines.append(f"environments: {problem}")
     if find_spec("eglRenderer") is None:
         lines.append('renderer="egl": this build of pybullet lacks the EGL plugin')
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
@@ -93,11 +95,13 @@ def missing() -> list[str]:
     return lines or ["nothing"]
 
 
-def stepping() -> str:
-    """Loop that steps the environments."""
-    if loop_name() == "native":
-        return "native: threads of C"
-    return "ctypes: slower threads of Python; a C compiler at installation helps"
+def _loop_problem() -> str | None:
+    """Why no environment can be made here; None if they can."""
+    try:
+        load_library()
+    except ImportError as error:
+        return str(error)
+    return None
 
 
 def describe() -> str:
@@ -108,7 +112,6 @@ def describe() -> str:
             "default: one per core that this process may use, here "
             f"{num_cores()} of {os.cpu_count()}, and at most one per environment"
         ],
-        "stepping": [stepping()],
         "solver": [str(solver.activate())],
         "extras": extras(),
         "missing": missing(),

@@ -1,7 +1,7 @@
 """Euler angles, in Python and in C, equal pybullet's."""
 
 import math
-from ctypes import CDLL, c_double
+from ctypes import c_double
 
 import numpy as np
 import pybullet
@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torch_panda.bullet import native
 from torch_panda.bullet.euler import euler_angles
+from torch_panda.bullet.loop import load_library
 
 angle = st.floats(-math.pi, math.pi)
 
 
-def native_angles(*quaternion):
+def c_angles(*quaternion):
     angles = (c_double * 3)()
-    CDLL(native.LIBRARY.path).euler_angles((c_double * 4)(*quaternion), angles)
+    load_library().euler_angles((c_double * 4)(*quaternion), angles)
     return list(angles)
 
 
-FUNCTIONS = [euler_angles] if native.LIBRARY is None else [euler_angles, native_angles]
+FUNCTIONS = [euler_angles, c_angles]
 
 
 def assert_equals_pybullet(roll, pitch, yaw):

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import pytest
 
 from torch_panda.__main__ import main
-from torch_panda.bullet.native import LIBRARY
 from torch_panda.commands import bench
 
 
@@ -21,7 +20,7 @@ def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
     options += ["--steps", "2", "--others", "bare-bullet", "--plot", str(picture)]
     main(["bench", *options])
     rows = table_rows(capsys.readouterr().out)
-    names = ["torch_panda", "bare Bullet, C threads"][: 1 if LIBRARY is None else 2]
+    names = ["torch_panda", "bare Bullet, C threads"]
     # Threads beyond the number of environments would have nothing to do.
     expected = [["PandaPush-v3", n, n, name] for n in ("2", "1") for name in names]
     assert [row[:4] for row in rows] == expected
@@ -38,8 +37,6 @@ def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
     ],
 )
 def test_every_installed_contender_can_step(name):
-    if name == "bare-bullet" and LIBRARY is None:
-        pytest.skip("the native loop was not compiled")
     setting = bench.Setting("PandaReach-v3", num_envs=2, num_threads=1)
     try:
         contender = bench.CONTENDERS[name].make(setting)

@@ -23,7 +23,6 @@ from torch_panda.bullet import (
     VectorSimulation,
     capi,
     library,
-    native,
 )
 
 N = 3
@@ -58,22 +57,9 @@ def push(td):
     return td.set("action", 20 * towards)
 
 
-@pytest.mark.skipif(native.LIBRARY is None, reason="there is only one loop")
-def test_both_loops_give_the_same_numbers(monkeypatch):
-    rollouts = []
-    for loop in ("native", "ctypes"):
-        monkeypatch.setenv(native.LOOP_VARIABLE, loop)
-        with make() as env:
-            rollouts.append(env.rollout(8, push))
-    assert (rollouts[0] == rollouts[1]).all()
-
-
-# A step is cut into pieces of 5 substeps.
-@pytest.mark.parametrize("n_substeps", [1, 7])
-def test_the_number_of_threads_does_not_change_the_numbers(n_substeps):
+def test_the_number_of_threads_does_not_change_the_numbers():
     def rollout(num_threads):
-        physics = PhysicsParams(n_substeps=n_substeps)
-        with make(num_envs=6, num_threads=num_threads, physics=physics) as env:
+        with make(num_envs=6, num_threads=num_threads) as env:
             return env.rollout(10, push), detections(env)
 
     (one, one_detected), *others = map(rollout, (1, 2, 6))

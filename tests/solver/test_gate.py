@@ -85,7 +85,7 @@ def test_the_gate_stays_closed_for_another_version_of_pybullet(closed, monkeypat
 
 
 def test_the_gate_stays_closed_without_a_compiled_library(closed, monkeypatch):
-    monkeypatch.setattr(gate, "_LIBRARY", "torch_panda.bullet.solver.missing")
+    monkeypatch.setattr(gate, "_LIBRARY", gate._LIBRARY.with_name("missing.so"))
     assert "the packed solver is not compiled" in reason()
 
 

@@ -1,7 +1,8 @@
 """Declarations of Bullet's C API, which pybullet's extension module exports.
 
 Every statement binds one function of ``PhysicsClientC_API.h`` (pybullet 3.2.7) with its
-name, its result type and its argument types. This file has no logic.
+name, its result type and its argument types. This file has no logic. C code calls the
+same functions through a table; see ``structs.py``.
 """
 
 import ctypes
@@ -148,14 +149,21 @@ class CameraImage(ctypes.Structure):
     )
 
 
+class Doubles(c_void_p):
+    """``const double *``: a ctypes array of numbers, or its address."""
+
+
+class Floats(c_void_p):
+    """``float *``: a ctypes array of numbers, or its address."""
+
+
 # Functions that `_work` declares release the GIL during a call, and those that `_cheap`
 # declares keep it; see library.py.
 _work = partial(bind, WORK)
 _cheap = partial(bind, CHEAP)
 _client = _command = _status = c_void_p
-# An array of numbers is passed as a ctypes array or as an address.
-_doubles = _floats = c_void_p
-_address = POINTER(c_void_p)
+_doubles, _floats = Doubles, Floats
+_address = POINTER(c_void_p)  # output: the address of an array of doubles
 _vector = (c_double,) * 3
 _quaternion = (c_double,) * 4
 
@@ -306,7 +314,7 @@ ik_result = _cheap(
     _status,
     POINTER(c_int),
     POINTER(c_int),
-    _doubles,
+    POINTER(c_double),  # output: positions of the joints
 )
 
 # State

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from typing_extensions import Self
 
-from torch_panda.bullet import building, capi, library, native
+from torch_panda.bullet import building, capi, library, structs
 from torch_panda.bullet.blueprint import (
     Blueprint,
     Command,
@@ -87,7 +87,7 @@ class PhysicsClient:
 
     Attributes:
         connection: The connection to Bullet, for commands that this class lacks.
-        native: The struct through which the C threads of `NativeLoop` use the client.
+        struct: The struct through which C code uses the client; see `Loop`.
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
@@ -96,7 +96,7 @@ class PhysicsClient:
 
         solver.activate()
         self.connection = connect()
-        self.native = native.Client(self.connection.handle, 0)
+        self.struct = structs.Client(handle=self.connection.handle)
         self._physics = physics
         self._bodies: list[int] = []
         self._blueprint: list[Command] = []
@@ -138,7 +138,7 @@ class PhysicsClient:
 
     def close(self) -> None:
         """Free the world. Closing again does nothing."""
-        self.native.handle = None
+        self.struct.handle = None
         self.connection.close()
 
     def __enter__(self) -> Self:
@@ -609,20 +609,6 @@ class PhysicsClient:
             command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
         )
 
-    def apply_torques(self, body: int, torques: Doubles) -> None:
-        """Apply torques [N m] to the first ``len(torques)`` movable joints of a body.
-
-        The torques act in the next substep only.
-        """
-        command = capi.motor_init(
-            self.connection.handle, body, capi.CONTROL_MODE_TORQUE
-        )
-        for k, torque in enumerate(torques):
-            capi.motor_set_torque(command, U_OFFSET + k, torque)
-        self.connection.submit_quick(
-            command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "apply torques"
-        )
-
     def step(self, count: int = 1) -> None:
         """Advance the world by ``count`` substeps."""
         handle = self.connection.handle
@@ -631,7 +617,7 @@ class PhysicsClient:
         command = capi.step_init(handle)
         expected = capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED
         for _ in range(count):
-            self.native.num_detections += 1
+            self.struct.num_detections += 1
             check_status(capi.submit(handle, command), expected, "step")
 
     def detect_collisions(self, count: int = 1) -> None:
@@ -640,7 +626,7 @@ class PhysicsClient:
             return
         handle = self.connection.handle
         command = capi.detect_init(handle)
-        self.native.num_detections += count
+        self.struct.num_detections += count
         for _ in range(count):  # one command for all detections, as in `step`
             status = capi.submit(handle, command)
         check_status(
@@ -654,7 +640,7 @@ class PhysicsClient:
     @property
     def num_detections(self) -> int:
         """Number of collision detections so far; every substep has one."""
-        return self.native.num_detections
+        return self.struct.num_detections
 
     def state(self, body: int, *, link_velocities: bool = False) -> BodyState:
         """The state of a body: base, joints, links, and forces in the joints."""

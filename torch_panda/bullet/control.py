@@ -21,8 +21,8 @@ ArmMode = Literal["position", "velocity", "torque"]
 class MotorControl:
     """Drives all movable joints of a robot to setpoints.
 
-    It is a `Control` that the native loop can also carry out in C. The arm's joints are
-    the first joints of the robot.
+    It is a `Control` that C threads carry out; see `Loop`. The arm's joints are the
+    first joints of the robot.
 
     A setpoint is a row of numbers. Its first part is for the arm. Without ``ik_link``,
     it has one number per joint of the arm: positions [rad], velocities [rad/s] or
@@ -60,13 +60,13 @@ class MotorControl:
     def _pose_dim(self) -> int:
         return 7 if self.ik_orientation is None else 3
 
-    def check(self, setpoint: Doubles, num_envs: int, num_joints: int) -> None:
-        """Make sure that this control fits the setpoints and joints of the robots.
+    def check(self, num_joints: int) -> None:
+        """Make sure that this control fits a robot with this number of joints.
 
         Raises:
-            ValueError: The number of forces or the shape of the setpoints is wrong,
-                ``num_arm_joints`` or ``ik_link`` is out of range, or ``ik_link`` is
-                used with velocities, with torques or without an arm.
+            ValueError: The number of forces is wrong, ``num_arm_joints`` or ``ik_link``
+                is out of range, or ``ik_link`` is used with velocities, with torques or
+                without an arm.
         """
         if self.ik_link is not None and self.arm_mode != "position":
             raise ValueError(
@@ -89,14 +89,19 @@ class MotorControl:
             )
         if self.ik_link is not None and self.ik_link < 0:
             raise ValueError(f"ik_link must be None or at least 0, got {self.ik_link}")
-        if setpoint.shape != (num_envs, self.setpoint_dim):
-            raise ValueError(
-                f"the setpoint must have shape {(num_envs, self.setpoint_dim)}, "
-                f"got {setpoint.shape}"
-            )
 
     def __call__(self, client: PhysicsClient, body: int, setpoint: Doubles) -> None:
-        """Set the motors of one client's robot."""
+        """Set the motors of one client's robot, for a control written in Python.
+
+        Raises:
+            ValueError: Setpoints are torques. Bullet applies a torque in one substep
+                only, and this function is called once per step.
+        """
+        if self.arm_mode == "torque":
+            raise ValueError(
+                'a control written in Python cannot use arm_mode "torque": Bullet '
+                "applies a torque in one substep only"
+            )
         joints = setpoint
         if self.ik_link is not None:
             pose = setpoint[: self._pose_dim]
@@ -106,23 +111,4 @@ class MotorControl:
             joints[self.num_arm_joints :] = setpoint[self._pose_dim :]
         # The first joint that is driven to a position.
         first = 0 if self.arm_mode == "position" else self.num_arm_joints
-        velocities = np.zeros(first)
-        if self.arm_mode == "velocity":
-            velocities = setpoint[:first]
-        forces = self.forces
-        if self.arm_mode == "torque":
-            # The motor must not brake a joint that a torque drives.
-            forces = (0.0,) * first + forces[first:]
-        client.control_joints(body, joints[first:], forces, velocities)
-
-    def advance(
-        self, client: PhysicsClient, body: int, setpoint: Doubles, count: int
-    ) -> None:
-        """Take ``count`` substeps, with the setpoint's torques if it has any."""
-        if self.arm_mode != "torque":
-            client.step(count)
-            return
-        torques = setpoint[: self.num_arm_joints]
-        for _ in range(count):  # Bullet applies a torque in one substep only
-            client.apply_torques(body, torques)
-            client.step()
+        client.control_joints(body, joints[first:], self.forces, joints[:first])

@@ -1,17 +1,17 @@
 """Many clients of one scene, stepped in parallel."""
 
 from collections.abc import Callable, Sequence
+from ctypes import pointer
 
 import numpy as np
 
 from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.body_state import Doubles
-from torch_panda.bullet.broad_phase import BroadPhase
+from torch_panda.bullet.broad_phase import plan_restoration
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
-from torch_panda.bullet.native import loop_name
-from torch_panda.bullet.native_loop import NativeLoop
+from torch_panda.bullet.loop import Loop, load_library
 from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool, num_cores
 from torch_panda.bullet.scene import Scene
@@ -32,10 +32,7 @@ class VectorSimulation:
     Raises:
         BulletError: ``build`` built a different scene in a later client.
         TypeError: ``build`` did not return a `Scene`.
-        ImportError: The C library was compiled from other sources.
-        ValueError: The environment variable ``TORCH_PANDA_LOOP`` is neither "native"
-            (threads of C step the clients) nor "ctypes" (Python threads step them),
-            or it is "native" and the C library is missing.
+        ImportError: The C library is missing, or was compiled from other C files.
 
     Attributes:
         scene: Body ids of the scene.
@@ -57,16 +54,14 @@ class VectorSimulation:
     ) -> None:
         if num_threads is None:
             num_threads = num_cores()
-        is_native = loop_name() == "native"
+        load_library()  # raises before scenes are built, which takes long
         self.n_substeps = physics.n_substeps
         self.ctrl_dt = physics.ctrl_dt
         self._physics = physics
         self._scene_builder = build
         self._clients: list[PhysicsClient] = []
-        self._broad_phases: dict[int, BroadPhase] = {}
         self._pool = WorkerPool(min(num_threads, num_envs))
         self._indices = frozenset(range(num_envs))
-        self._native: NativeLoop | None = None
         try:
             client = PhysicsClient(physics=physics)
             self._clients.append(client)
@@ -76,10 +71,6 @@ class VectorSimulation:
             for _ in range(1, num_envs):
                 self._clients.append(PhysicsClient(physics=physics))
                 self._build_same_scene(self._clients[-1])
-            # This is half of the work of building a client, so use all threads. The
-            # scenes above are built one by one, because users write that code.
-            self._pool.run(self._plan_resets, range(num_envs))
-            self._pool.close()  # the compiled loop has its own threads
             self.state = state = SimulationState(self.scene, num_envs)
             # Tasks, robots and sensors read these tensors as attributes of the
             # simulation.
@@ -96,16 +87,19 @@ class VectorSimulation:
             self.object_joint_position = state.object_joint_position
             self.object_joint_velocity = state.object_joint_velocity
             self.marker_pose = state.marker_pose
-            if is_native:
-                self._native = NativeLoop(
-                    self._clients,
-                    self.scene,
-                    self.state,
-                    physics=physics,
-                    num_threads=self.num_threads,
-                )
+            self._loop = Loop(
+                self._clients,
+                self.scene,
+                state,
+                physics=physics,
+                num_threads=self.num_threads,
+            )
+            # This is half of the work of building a client, so use all threads. The
+            # scenes above are built one by one, because users write that code.
+            self._pool.run(self._plan_resets, range(num_envs))
+            self._pool.close()  # steps use the threads of the loop
         except BaseException:
-            self.close()
+            self._free_clients()
             raise
 
     @property
@@ -117,11 +111,6 @@ class VectorSimulation:
     def num_threads(self) -> int:
         """Number of threads."""
         return self._pool.num_threads
-
-    @property
-    def is_native(self) -> bool:
-        """Whether the compiled loop steps the clients."""
-        return self._native is not None
 
     @property
     def clients(self) -> Sequence[PhysicsClient]:
@@ -140,8 +129,8 @@ class VectorSimulation:
     ) -> list[int]:
         """Set the motors, advance time and read the state.
 
-        If the native loop is in use and ``control`` is a `MotorControl`, threads of C
-        do this. Otherwise Python threads do it. Both compute the same numbers.
+        For a `MotorControl`, threads of C do this without Python. For a control written
+        in Python, threads of Python call it and then advance time.
 
         Args:
             control: Control of the robots.
@@ -157,33 +146,27 @@ class VectorSimulation:
             ValueError: ``control`` does not fit the setpoints or the robot, or
                 ``envs`` has an index twice or one that is out of range.
         """
-        if envs is not None:
-            self._check_indices(envs)
+        stepped = range(self.num_envs) if envs is None else envs
+        self._check_indices(stepped)
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
-            control.check(setpoint, self.num_envs, len(self.scene.joints))
-            if self._native is not None:
-                # After a second Ctrl-C, the pool's threads may still use clients; see
-                # `WorkerPool.run`.
-                self._pool.wait()
-                return self._native.step(control, setpoint, envs)
+            self._loop.step(control, setpoint, stepped)
+        else:
+            self._step_in_python(control, setpoint, stepped)
+        return sorted(set(self.diverged()).intersection(stepped))
+
+    def _step_in_python(
+        self, control: Control, setpoint: Doubles, envs: Sequence[int]
+    ) -> None:
+        """Step with a control that is written in Python; see `step`."""
 
         def step_one(env: int) -> None:
             client = self._clients[env]
             control(client, self.scene.robot, setpoint[env])
-            if isinstance(control, MotorControl):
-                # Bullet applies a torque in one substep only, so `advance` sets the
-                # torques again before each substep.
-                control.advance(
-                    client, self.scene.robot, setpoint[env], self.n_substeps
-                )
-            else:
-                client.step(self.n_substeps)
-            self.state.read(env, client)
+            client.step(self.n_substeps)
+            self._loop.read(env)
 
-        stepped = range(self.num_envs) if envs is None else envs
-        self._pool.run(step_one, stepped)
-        return sorted(set(self.diverged()).intersection(stepped))
+        self._pool.run(step_one, envs)
 
     def run(self, work: Work, envs: Sequence[int]) -> None:
         """Call ``work(env)`` for some environments in the simulation's threads.
@@ -202,7 +185,7 @@ class VectorSimulation:
         the state that Bullet reports.
 
         The reset also restores Bullet's broad phase, so that an episode depends on its
-        start and its actions only. See `BroadPhase`.
+        start and its actions only. See ``broad_phase.py``.
 
         Args:
             envs: Indices of the clients to reset.
@@ -215,21 +198,13 @@ class VectorSimulation:
             ValueError: ``envs`` has an index twice or one that is out of range.
         """
         self._check_indices(envs)
-        if self._native is not None and randomize is None:
-            self._pool.wait()
-            self._native.reset(envs)
+        if randomize is None:
+            self._loop.reset(envs)
             return
 
         def reset_one(env: int) -> None:
-            if randomize is not None:
-                randomize(env)
-            if self._native is not None:
-                self._native.reset_one(env)
-                return
-            client = self._clients[env]
-            self._broad_phases[env].restore()
-            self.state.place_bodies(env, client)
-            self.state.read(env, client)
+            randomize(env)
+            self._loop.reset_one(env)
 
         self._pool.run(reset_one, envs)
 
@@ -242,15 +217,16 @@ class VectorSimulation:
         self._clients[env].close()
         client = self._clients[env] = PhysicsClient(physics=self._physics)
         self._build_same_scene(client)
+        self._loop.replace(env, client)
         self._plan_resets(env)
-        if self._native is not None:
-            self._native.replace(env, client)
 
     def close(self) -> None:
         """Free all clients and end all threads. Closing again does nothing."""
+        self._loop.close()
+        self._free_clients()
+
+    def _free_clients(self) -> None:
         self._pool.close()
-        if self._native is not None:
-            self._native.close()
         for client in self._clients:
             client.close()
 
@@ -273,8 +249,10 @@ class VectorSimulation:
             )
 
     def _plan_resets(self, env: int) -> None:
-        """Find out how to restore the broad phase of a client that was just built."""
-        self._broad_phases[env] = BroadPhase(self._clients[env])
+        """Plan the resets of a client that was just built."""
+        plan = plan_restoration(self._clients[env])
+        self._clients[env].struct.broad_phase = pointer(plan)
+        self._loop.restore(env)
 
     def _check_indices(self, envs: Sequence[int]) -> None:
         """Refuse indices with which threads of C would crash the interpreter.

@@ -1,10 +1,7 @@
 """The state of all clients of a simulation, in tensors."""
 
-import numpy as np
 import torch
 
-from torch_panda.bullet.client import PhysicsClient
-from torch_panda.bullet.euler import euler_angles
 from torch_panda.bullet.scene import Scene
 from torch_panda.checks import all_finite
 
@@ -38,20 +35,12 @@ class SimulationState:
         marker_pose: (num_envs, n_markers, 7), poses to which a reset moves the markers.
         ee_column: Column of ``rows`` at which ``ee_state`` begins.
         rows: (num_envs, k), contiguous. All tensors except ``marker_pose`` are views of
-            ``rows``. Their order is that of ``client_row`` in ``client.c``.
+            ``rows``. Their order is that of ``client_row`` in ``csrc/client.c``.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
         n_joints, n_objects = len(scene.joints), len(scene.objects)
-        self._scene = scene
-        # Objects with joints: body id, joint indices, and columns in the tensors.
-        self._jointed_objects: list[tuple[int, tuple[int, ...], slice]] = []
-        n_object_joints = 0
-        for body, joints in zip(scene.objects, scene.object_joints, strict=True):
-            if joints:
-                columns = slice(n_object_joints, n_object_joints + len(joints))
-                self._jointed_objects.append((body, joints, columns))
-                n_object_joints += len(joints)
+        n_object_joints = sum(map(len, scene.object_joints))
         arm = (n_joints, n_joints, 3, 3, 4)
         sizes = (*arm, 7 * n_objects, n_object_joints, n_object_joints, 12 * n_objects)
         # One tensor, so that one operation checks whether all numbers are finite.
@@ -76,61 +65,9 @@ class SimulationState:
         self.marker_pose = torch.zeros(
             num_envs, len(scene.markers), 7, dtype=torch.float64, device="cpu"
         )
-        # Views of the same memory as numpy arrays, for `read`, because indexing arrays
-        # is faster than indexing tensors.
-        ends = np.cumsum(sizes)[:-1]
-        self._parts = [np.split(row, ends) for row in self.rows.numpy()]
 
     def diverged(self) -> list[int]:
         """Indices of the clients whose state is not finite."""
         if all_finite(self.rows):
             return []
         return (~self.rows.isfinite()).any(dim=1).nonzero().flatten().tolist()
-
-    def place_bodies(self, env: int, client: PhysicsClient) -> None:
-        """Move the bodies of a client to the state in the tensors."""
-        scene = self._scene
-        positions = self.joint_position[env].tolist()
-        velocities = self.joint_velocity[env].tolist()
-        # One by one and in panda-gym's order, because the state of Bullet's broad phase
-        # depends on the order.
-        for joint, position, velocity in zip(
-            scene.joints, positions, velocities, strict=True
-        ):
-            client.set_joint(scene.robot, joint, position, velocity)
-        markers = self.marker_pose[env].tolist()
-        for body, pose in zip(scene.markers, markers, strict=True):
-            client.set_base(body, pose[:3], pose[3:])
-        poses = self.object_pose[env].tolist()
-        velocities = self.object_velocity[env].tolist()
-        for body, pose, velocity in zip(scene.objects, poses, velocities, strict=True):
-            client.set_base(body, pose[:3], pose[3:], velocity[:3], velocity[3:])
-        positions = self.object_joint_position[env].tolist()
-        velocities = self.object_joint_velocity[env].tolist()
-        for body, joints, columns in self._jointed_objects:
-            client.set_joints(body, joints, positions[columns], velocities[columns])
-
-    def read(self, env: int, client: PhysicsClient) -> None:
-        """Copy the state of a client into the tensors."""
-        scene = self._scene
-        joints, speeds, ee_position, ee_velocity, ee_orientation, *objects = (
-            self._parts[env]
-        )
-        poses, object_joints, object_speeds, states = objects
-        state = client.state(scene.robot, link_velocities=True)
-        joints[:] = state.joint_positions
-        speeds[:] = state.joint_velocities
-        pose = state.link_pose(scene.ee_link)
-        ee_position[:], ee_orientation[:] = pose[:3], pose[3:]
-        ee_velocity[:] = state.link_velocity(scene.ee_link)[:3]
-        for k, body in enumerate(scene.objects):
-            state = client.state(body)
-            pose = poses[7 * k : 7 * k + 7]
-            pose[:] = state.base_pose
-            angles = euler_angles(*pose[3:].tolist())
-            observed = (*pose[:3], *angles, *state.base_velocity)
-            states[12 * k : 12 * k + 12] = observed
-        for body, _, columns in self._jointed_objects:
-            state = client.state(body)
-            object_joints[columns] = state.joint_positions
-            object_speeds[columns] = state.joint_velocities

@@ -29,7 +29,6 @@ from torchrl.envs import EnvBase, GymEnv, ParallelEnv
 from tqdm import tqdm
 
 import torch_panda
-from torch_panda.bullet.native import loop_name
 from torch_panda.bullet.pool import num_cores
 from torch_panda.bullet.solver import SOLVER_VARIABLE
 from torch_panda.learning import files
@@ -168,13 +167,11 @@ def _make_ours(setting: Setting, **options: Any) -> Environments:  # noqa: ANN40
 
 
 def _make_bare_bullet(setting: Setting) -> Environments:
-    """Make environments that only run our native loop with Bullet's own solver.
+    """Make environments that only run our loop in C, with Bullet's own solver.
 
     The first episode computes its setpoints from random actions. Later episodes repeat
     these setpoints, and then only the loop is measured.
     """
-    if loop_name() != "native":
-        raise RuntimeError("torch_panda was installed without its native loop")
     env = _make_env(setting)
     env.reset()
     simulation, control = env.episodes.simulation, env.robot.motor_control

@@ -8,7 +8,7 @@ used only if all of these conditions hold; otherwise Bullet's own functions run:
 2. The process runs on x86-64 Linux. Compilers for other platforms fuse a multiplication
    with an addition, which rounds differently.
 3. The installed pybullet has the supported version.
-4. torch_panda was installed with its C library, compiled from sources of this version.
+4. The C library of the solver was compiled, from sources of this version.
 5. pybullet's extension module has the symbols that are needed, and each table of
    virtual functions (vtable) has exactly one slot with the function to replace.
 6. In a known scene, Bullet's objects have the layout that ``bullet_types.h`` declares.
@@ -23,12 +23,12 @@ data. No machine code is changed.
 
 import ctypes
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import sys
 import threading
 from ctypes import c_void_p
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 from torch_panda.bullet import library
@@ -45,7 +45,8 @@ SolverName = Literal["packed", "bullet"]
 # Environment variable, read when the first client of the process is created.
 SOLVER_VARIABLE = "TORCH_PANDA_SOLVER"
 
-_LIBRARY = "torch_panda.bullet.solver._solver"
+# setuptools gives the library this name, see pyproject.toml.
+_LIBRARY = Path(__file__).with_name("_solver.abi3.so")
 _SOLVER = "_ZTV27btMultiBodyConstraintSolver"
 _MOTOR = "_ZTV21btMultiBodyJointMotor"
 _LIMIT = "_ZTV31btMultiBodyJointLimitConstraint"
@@ -203,14 +204,9 @@ def check_version() -> None:
 
 def load_library() -> SolverLibrary:
     """Load the compiled library."""
-    # The file has the name of an extension module, because setuptools builds it.
-    spec = importlib.util.find_spec(_LIBRARY)
-    if spec is None or spec.origin is None:
-        raise GateError(
-            "the packed solver is not compiled: install a C compiler, then install "
-            "torch_panda again"
-        )
-    return SolverLibrary(spec.origin)
+    if not _LIBRARY.is_file():
+        raise GateError("the packed solver is not compiled: install torch_panda again")
+    return SolverLibrary(str(_LIBRARY))
 
 
 def find_replacements(path: str) -> list[Replacement]:

@@ -1,8 +1,5 @@
 /* A step of one client: set the motors of its robot, advance time by substeps, and copy
-   the state into the caller's memory.
-
-   Without the compiled library, control.py, client.py and state.py give the same
-   commands from Python and compute the same numbers. */
+   the state into the caller's memory. */
 
 #include "client.h"
 
@@ -96,13 +93,13 @@ static int apply_torques(struct batch *batch, int env) {
                          "apply torques") != NULL;
 }
 
-static int advance(struct batch *batch, int env, int num_substeps) {
+static int advance(struct batch *batch, int env) {
     struct client *client = batch->clients[env];
     int has_torques = batch->control->arm_mode == TORQUES;
     /* One command serves all substeps: it lies in the client's command buffer, and a
        substep does not overwrite this buffer. Other commands do. */
     handle command = batch->bullet->step_init(client->handle);
-    for (; client->num_substeps < num_substeps; client->num_substeps++) {
+    for (int k = 0; k < batch->scene->num_substeps; k++) {
         client->num_detections++;
         if (has_torques) { /* Bullet applies a torque in one substep only */
             if (!apply_torques(batch, env)) return 0;
@@ -151,16 +148,11 @@ void euler_angles(doubles quaternion, double *angles) {
     angles[2] = atan2(2 * (x * y + w * z), ww + xx - yy - zz);
 }
 
-static size_t row_size(const struct scene *scene) {
-    return 2 * scene->num_joints + 10 + (7 + STATE_SIZE) * scene->num_objects +
-           2 * scene->num_object_joints;
-}
-
 struct row client_row(const struct batch *batch, int env) {
     const struct scene *scene = batch->scene;
     int n = scene->num_joints, num_objects = scene->num_objects;
     int num_object_joints = scene->num_object_joints;
-    size_t size = row_size(scene);
+    size_t size = 2 * n + 10 + (7 + STATE_SIZE) * num_objects + 2 * num_object_joints;
     struct row row;
     row.joint_position = batch->state + env * size;
     row.joint_velocity = row.joint_position + n;
@@ -174,7 +166,7 @@ struct row client_row(const struct batch *batch, int env) {
     return row;
 }
 
-int client_read_state(struct batch *batch, int env) {
+int client_read(struct batch *batch, int env) {
     const struct scene *scene = batch->scene;
     struct row row = client_row(batch, env);
     struct body_state body;
@@ -200,32 +192,15 @@ int client_read_state(struct batch *batch, int env) {
     return 1;
 }
 
-static int is_finite(const struct batch *batch, int env) {
-    size_t size = row_size(batch->scene);
-    for (size_t k = 0; k < size; k++)
-        if (!isfinite(batch->state[env * size + k])) return 0;
-    return 1;
-}
-
 int client_is_open(struct batch *batch, int env) {
     int is_closed = batch->clients[env]->handle == NULL;
     batch->failures[env] = (struct failure){is_closed ? CLIENT_CLOSED : 0, 0, NULL};
     return !is_closed;
 }
 
-static int begin_step(struct batch *batch, int env) {
+int client_step(struct batch *batch, int env) {
     double joints[MAX_DEGREES_OF_FREEDOM];
     return client_is_open(batch, env) && find_joints(batch, env, joints) &&
-           set_motors(batch, env, joints);
-}
-
-int client_take_piece(struct batch *batch, int env, int piece) {
-    int begin = batch->clients[env]->num_substeps, all = batch->scene->num_substeps;
-    int end = piece < all - begin ? begin + piece : all;
-    if (begin == 0 && !begin_step(batch, env)) return 0;
-    if (!advance(batch, env, end)) return 0;
-    if (end < all) return 1;
-    if (client_read_state(batch, env) && !is_finite(batch, env))
-        batch->failures[env].expected = DIVERGED;
-    return 0;
+           set_motors(batch, env, joints) && advance(batch, env) &&
+           client_read(batch, env);
 }
