@@ -2,7 +2,6 @@
 
 import math
 import operator
-import os
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -13,8 +12,6 @@ from torch import Tensor
 
 # Largest deviation of a quaternion's length from 1.
 QUATERNION_TOLERANCE = 1e-3
-
-_GIGABYTE = 1e9
 
 
 # ---- numbers and names -------------------------------------------------------
@@ -163,24 +160,6 @@ def check_device(device: torch.device | str | int | None) -> torch.device:
             f"{device!r}: {reason}"
         ) from None
     return usable
-
-
-def check_memory(num_envs: int, bytes_per_env: float) -> None:
-    """Check that the machine has the memory for a number of environments.
-
-    Raises:
-        ValueError: The environments would take more than the physical memory.
-    """
-    if sys.platform == "win32":  # Windows has no os.sysconf
-        return
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    needed = num_envs * bytes_per_env
-    if needed > memory:
-        raise ValueError(
-            f"num_envs={num_envs} would take about {needed / _GIGABYTE:,.0f} GB of "
-            f"memory, {bytes_per_env / 1e6:.0f} MB each; this machine has "
-            f"{memory / _GIGABYTE:,.0f} GB"
-        )
 
 
 # ---- tensors -----------------------------------------------------------------

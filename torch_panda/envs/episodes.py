@@ -21,7 +21,6 @@ from torch_panda.checks import (
     check_choice,
     check_instance,
     check_integer,
-    check_memory,
     check_positive,
 )
 from torch_panda.envs.builder import build_scene
@@ -38,9 +37,6 @@ from torch_panda.sensors import Entry, Sensor, read_sensors
 from torch_panda.tasks import Task
 
 OnDivergence = Literal["raise", "reset"]
-
-# Memory of an environment, measured with the Panda and a cube.
-_BYTES_PER_ENV = 44e6
 
 
 class Episodes:
@@ -100,7 +96,6 @@ class Episodes:
         check_choice("on_divergence", on_divergence, get_args(OnDivergence))
         check_choice("goal", goal, get_args(GoalName))
         n = num_envs or 1
-        check_memory(n, _BYTES_PER_ENV)
         self.goal_indices = find_goal_indices(robot, task)
         if goal == "observation" and self.goal_indices is None:
             raise ValueError(

@@ -1,7 +1,7 @@
 """Renders many environments in parallel."""
 
 import math
-import sys
+import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -78,7 +78,7 @@ class VectorRenderer:
         if self._gl_thread is None:
             for renderer in renderers:
                 renderer.close()
-        elif not sys.is_finalizing():  # else Python has ended the thread already
+        elif threading.main_thread().is_alive():  # else Python has ended all threads
             self._gl_thread.run(lambda k: renderers[k].close(), range(len(renderers)))
             self._gl_thread.close()
 
