@@ -7,7 +7,11 @@ one process, which is the fastest way on one machine. Several processes are fast
 where the policy or the transforms of the environment are slow Python code.
 """
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
+from multiprocessing.process import BaseProcess
+from signal import SIGTERM
 
 import torch
 from torchrl.collectors import MultiSyncCollector
@@ -18,16 +22,14 @@ import torch_panda
 from torch_panda.bullet.pool import num_cores
 from torch_panda.transforms import HindsightRelabel
 
-NUM_WORKERS = 2
-NUM_ENVS = 4  # simulations in each worker
+NUM_WORKERS, NUM_ENVS = 2, 4  # NUM_ENVS simulations in each worker
 TOTAL_STEPS = 3_200
 
 
 def make_env(seed: int) -> torch_panda.RobotTaskEnv:
     """The environments of one worker.
 
-    An episode depends on (seed, environment, number of the episode) alone, so two
-    workers with the same seed would run the same episodes. The workers share the cores.
+    Two workers with the same seed would run the same episodes. All share the cores.
     """
     threads = max(1, num_cores() // NUM_WORKERS)
     return torch_panda.make(
@@ -36,11 +38,7 @@ def make_env(seed: int) -> torch_panda.RobotTaskEnv:
 
 
 def roll_out() -> torch.Tensor:
-    """Step a ParallelEnv, and return the goals of its first episodes.
-
-    Returns:
-        (workers, environments, 3), positions [m].
-    """
+    """Step a ParallelEnv; return the first goals [m], (workers, environments, 3)."""
     makers = [partial(make_env, seed=worker) for worker in range(NUM_WORKERS)]
     env = ParallelEnv(NUM_WORKERS, makers)
     try:
@@ -68,13 +66,32 @@ def collect() -> TensorDictReplayBuffer:
         total_frames=TOTAL_STEPS,
     )
     try:
-        for data in collector:
-            buffer.extend(data.reshape(-1))
-            success = buffer.sample()["next", "success"].float().mean()
-            print(f"{len(buffer)} steps: {success:.0%} of a relabelled batch succeed")
+        with name_dead_workers(collector.procs):
+            for data in collector:
+                buffer.extend(data.reshape(-1))
+                success = buffer.sample()["next", "success"].float().mean()
+                print(f"{len(buffer)} steps: {success:.0%} of a batch succeed")
     finally:
         collector.shutdown()
     return buffer
+
+
+@contextmanager
+def name_dead_workers(processes: Sequence[BaseProcess]) -> Iterator[None]:
+    """Context manager that makes the error of a killed worker name the worker.
+
+    torchrl notices a killed worker within about a second and ends the others. If one
+    takes longer than 0.1 s to end, the error of torchrl 0.14 does not name any.
+    """
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        for index, process in enumerate(processes):
+            with suppress(ValueError):  # torchrl closes the processes that it ends
+                if process.exitcode not in (None, 0, -SIGTERM):  # it sends SIGTERM
+                    text = f"worker {index} (process {process.pid}) died with exit code"
+                    raise RuntimeError(f"{text} {process.exitcode}") from error
+        raise
 
 
 if __name__ == "__main__":  # worker processes import this file

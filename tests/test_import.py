@@ -15,7 +15,7 @@ import torch_panda
 PACKAGE = Path(torch_panda.__file__).parent
 # Folders and modules of the package. Each imports only from those before it.
 LAYERS = (
-    ("arguments", "checks", "extras", "policies", "rotations", "workers"),
+    ("arguments", "checks", "extras", "policies", "rotations"),
     ("bullet",),
     ("rendering", "robots", "tasks"),
     ("sensors",),

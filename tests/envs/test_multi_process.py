@@ -6,11 +6,11 @@ import time
 
 import pytest
 import torch
+from parallel import name_dead_workers
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv
 
 from tests.envs.multi_process import NUM_ENVS, go_for_the_goal, make_env
-from torch_panda.workers import name_dead_workers
 
 STEPS = 5
 PATIENCE = 60  # [s], within which a death must be noticed; torchrl's timeout is hours
