@@ -7,6 +7,7 @@ import shutil
 import zlib
 from pathlib import Path
 
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 _SOURCES = Path(__file__).parent
@@ -29,3 +30,12 @@ class BuildLibraries(build_ext):
             if extension.name == "torch_panda.bullet._loop":
                 extension.define_macros.append(("LOOP_VERSION", f"{version}u"))
         super().build_extensions()
+
+
+class Wheel(bdist_wheel):
+    """Builds one wheel for all versions of Python 3, because no C file uses Python."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        """Tag of the wheel: Python, its binary interface, and the platform."""
+        _, _, platform = super().get_tag()
+        return "py3", "none", platform
