@@ -49,7 +49,6 @@ FILTER_DYNAMIC = (1, -1)
 FILTER_STATIC = (2, -1 ^ 2)
 
 # enum for b3JointControlCommandInit2
-CONTROL_MODE_TORQUE = 1
 CONTROL_MODE_POSITION_VELOCITY_PD = 2
 
 # enum JointFeedbackMode
@@ -171,9 +170,6 @@ _quaternion = (c_double,) * 4
 connect_direct = _work("b3ConnectPhysicsDirect", _client)
 disconnect = _work("b3DisconnectSharedMemory", None, _client)
 submit = _work("b3SubmitClientCommandAndWaitStatus", _status, _client, _command)
-submit_quick = _cheap(  # for commands that take about a microsecond
-    "b3SubmitClientCommandAndWaitStatus", _status, _client, _command
-)
 status_type = _cheap("b3GetStatusType", c_int, _status)
 
 # World

@@ -23,7 +23,6 @@ from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState, Doubles
 from torch_panda.bullet.building import ORIGIN
 from torch_panda.bullet.connection import (
     BulletError,
-    check_status,
     connect,
     doubles,
     shared_doubles,
@@ -118,8 +117,11 @@ class PhysicsClient:
         Raises:
             ImportError: The codes differ.
         """
+        command = capi.detect_init(self.connection.handle)
+        expected = capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED
+        self.struct.num_detections += 1
         try:
-            self.detect_collisions()
+            self.connection.submit(command, expected, "detect collisions")
         except BulletError as error:
             raise library.wrong_pybullet(f"its status codes differ: {error}") from None
 
@@ -435,7 +437,7 @@ class PhysicsClient:
         command = capi.dynamics_init(self.connection.handle)
         for name, value in changes.items():
             _DYNAMICS_SETTERS[name](command, body, link, value)
-        self.connection.submit_quick(
+        self.connection.submit(
             command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
         )
         self._record(SetPhysics("set_dynamics", (body, link, *numbers.values())))
@@ -605,35 +607,20 @@ class PhysicsClient:
         for k, force in enumerate(forces):
             capi.motor_set_kd(command, U_OFFSET + k, VELOCITY_GAIN)
             capi.motor_set_force(command, U_OFFSET + k, force)
-        self.connection.submit_quick(
+        self.connection.submit(
             command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
         )
 
     def step(self, count: int = 1) -> None:
         """Advance the world by ``count`` substeps."""
-        handle = self.connection.handle
         # One command serves all substeps: it lies in the client's command buffer, and a
         # substep does not overwrite this buffer.
-        command = capi.step_init(handle)
-        expected = capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED
+        command = capi.step_init(self.connection.handle)
         for _ in range(count):
             self.struct.num_detections += 1
-            check_status(capi.submit(handle, command), expected, "step")
-
-    def detect_collisions(self, count: int = 1) -> None:
-        """Run collision detection ``count`` times without advancing time."""
-        if count < 1:
-            return
-        handle = self.connection.handle
-        command = capi.detect_init(handle)
-        self.struct.num_detections += count
-        for _ in range(count):  # one command for all detections, as in `step`
-            status = capi.submit(handle, command)
-        check_status(
-            status,
-            capi.CMD_PERFORM_COLLISION_DETECTION_COMPLETED,
-            "detect collisions",
-        )
+            self.connection.submit(
+                command, capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED, "step"
+            )
 
     # ---- observing the world -----------------------------------------------------
 

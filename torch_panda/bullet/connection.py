@@ -1,5 +1,6 @@
-"""The connection to one client of Bullet: its handle, and checked commands."""
+"""Checked commands to one client of Bullet, and the guard against a second thread."""
 
+import threading
 from collections.abc import Sequence
 from ctypes import Array, c_double
 
@@ -61,16 +62,11 @@ class Connection:
         Raises:
             BulletError: The client is closed, or Bullet answered with a different code.
         """
-        status: int = capi.submit(self.handle, command)
-        return check_status(status, expected, action)
-
-    def submit_quick(self, command: int, expected: int, action: str) -> int:
-        """Submit a cheap command: keep the GIL, because releasing it costs more.
-
-        The arguments, the result and the errors are those of `submit`.
-        """
-        status: int = capi.submit_quick(self.handle, command)
-        return check_status(status, expected, action)
+        status: int | None = capi.submit(self.handle, command)
+        code = capi.status_type(status) if status else None
+        if status is None or code != expected:
+            raise refusal(action, code, expected)
+        return status
 
     def close(self) -> None:
         """Free the client. Closing again does nothing."""
@@ -80,22 +76,33 @@ class Connection:
             capi.disconnect(handle)
 
 
+class ThreadGuard:
+    """A context manager that one thread at a time may enter.
+
+    Two threads in one Bullet client crash the interpreter. The thread that is inside
+    may enter again.
+
+    Raises:
+        BulletError: Another thread is inside.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            raise BulletError(
+                "another thread is using this environment: it serves one thread at a "
+                "time, so make an environment for each thread"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
 def connect() -> Connection:
     """Create a client without a window (pybullet's ``DIRECT``)."""
     return Connection(capi.connect_direct())
-
-
-def check_status(status: int | None, expected: int, action: str) -> int:
-    """Return a status unchanged if its code is the expected one.
-
-    Raises:
-        BulletError: Bullet answered with a different code, or not at all.
-    """
-    code = capi.status_type(status) if status else None
-    if code != expected:
-        raise refusal(action, code, expected)
-    assert status is not None
-    return status
 
 
 def refusal(action: str, code: int | None, expected: int) -> BulletError:

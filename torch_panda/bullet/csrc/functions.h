@@ -10,7 +10,6 @@ struct functions {
     handle (*connect_direct)(void);
     void (*disconnect)(handle);
     handle (*submit)(handle, handle);
-    handle (*submit_quick)(handle, handle);
     int (*status_type)(handle);
     handle (*physics_init)(handle);
     int (*physics_set_gravity)(handle, double, double, double);
