@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -162,51 +161,11 @@ def check_device(device: torch.device | str | int | None) -> torch.device:
     return usable
 
 
-# ---- tensors -----------------------------------------------------------------
-
-
 def all_finite(values: Tensor) -> bool:
     """Whether all numbers are finite."""
     # The sum is finite only if all numbers are, and computing it is faster than calling
     # `isfinite`. But a sum of finite numbers may overflow, so `isfinite` decides then.
     return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
-
-
-def check_action(action: object, shape: tuple[int, ...]) -> Tensor:
-    """Return an action clipped to [-1, 1], (n, action_dim) float32, a new tensor.
-
-    Args:
-        action: The action, (*batch_shape, action_dim), of a floating-point dtype.
-        shape: The shape that the action must have.
-
-    Raises:
-        ValueError: The action is not a tensor, has another shape, or is not finite.
-        TypeError: The action has an integer dtype.
-    """
-    if not isinstance(action, Tensor):
-        raise ValueError(
-            f"the action must be a tensor of shape {shape}, got {action!r}"
-        )
-    if tuple(action.shape) != shape:
-        raise ValueError(
-            f"the action must have shape {shape}, got {tuple(action.shape)}"
-        )
-    if not action.dtype.is_floating_point:
-        raise TypeError(
-            f"the action must have a floating-point dtype, got {action.dtype}: pass "
-            "action.float()"
-        )
-    if action.dtype == torch.bfloat16:  # unknown to NumPy
-        action = action.float()
-    # NumPy takes half of the time of torch for so few numbers.
-    array = action.detach().cpu().numpy().reshape(-1, shape[-1])
-    if not np.isfinite(array).all():
-        env = int((~np.isfinite(array)).any(axis=1).argmax())
-        raise ValueError(
-            f"the action of environment {env} is not finite: {array[env].tolist()}"
-        )
-    clipped = np.minimum(np.maximum(array, -1.0), 1.0)
-    return torch.from_numpy(clipped.astype(np.float32, copy=False))
 
 
 def check_rows(

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 import torch_panda
 from tests.envs.test_parity import choose_actions
-from torch_panda.envs import history
+from torch_panda.envs import exact_states
 
 NUM_ENVS = 4
 
@@ -118,7 +118,7 @@ def test_a_wrong_exact_state_is_refused(change, message):
 
 
 def test_episodes_without_end_are_forgotten(monkeypatch):
-    monkeypatch.setattr(history, "_MAX_STEPS", 10)
+    monkeypatch.setattr(exact_states, "_MAX_STEPS", 10)
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
         td = env.reset().set("action", torch.zeros(2, 3))
         for _ in range(10):
@@ -133,7 +133,7 @@ def test_episodes_without_end_are_forgotten(monkeypatch):
 
 
 def test_an_endless_episode_does_not_cost_the_others_their_exact_states(monkeypatch):
-    monkeypatch.setattr(history, "_MAX_STEPS", 10)
+    monkeypatch.setattr(exact_states, "_MAX_STEPS", 10)
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
         td = env.reset().set("action", torch.zeros(2, 3))
         for step in range(12):
@@ -152,6 +152,6 @@ def test_long_histories_are_forgotten_with_their_episodes():
     ) as env:
         torch.manual_seed(0)
         env.rollout(1101, break_when_any_done=False)
-        assert len(env.episodes._history._steps) < 1100
+        assert len(env.episodes._exact_states._steps) < 1100
         state = env.get_state(exact=True)
         assert state["num_actions"].flatten().tolist() == [1, 1]

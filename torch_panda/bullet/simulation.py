@@ -1,9 +1,11 @@
 """Many clients of one scene, stepped in parallel."""
 
+import copy
 from collections.abc import Callable, Sequence
 from ctypes import pointer
 
 import numpy as np
+from typing_extensions import Self
 
 from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.body_state import Doubles
@@ -71,26 +73,11 @@ class VectorSimulation:
             for _ in range(1, num_envs):
                 self._clients.append(PhysicsClient(physics=physics))
                 self._build_same_scene(self._clients[-1])
-            self.state = state = SimulationState(self.scene, num_envs)
-            # Tasks, robots and sensors read these tensors as attributes of the
-            # simulation.
-            self.joint_position = state.joint_position
-            self.joint_velocity = state.joint_velocity
-            self.ee_position = state.ee_position
-            self.ee_velocity = state.ee_velocity
-            self.ee_state = state.ee_state
-            self.ee_orientation = state.ee_orientation
-            self.object_pose = state.object_pose
-            self.object_state = state.object_state
-            self.object_velocity = state.object_velocity
-            self.object_euler = state.object_euler
-            self.object_joint_position = state.object_joint_position
-            self.object_joint_velocity = state.object_joint_velocity
-            self.marker_pose = state.marker_pose
+            self._use_state(SimulationState(self.scene, num_envs))
             self._loop = Loop(
                 self._clients,
                 self.scene,
-                state,
+                self.state,
                 physics=physics,
                 num_threads=self.num_threads,
             )
@@ -121,6 +108,32 @@ class VectorSimulation:
     def blueprint(self) -> Blueprint:
         """The commands that built the scene, the same in every client."""
         return self._blueprint
+
+    def with_state(self, state: SimulationState) -> Self:
+        """A view with other tensors, for functions that read the state of a simulation.
+
+        It shares the clients. A step or a reset does not write into its tensors.
+        """
+        view = copy.copy(self)
+        view._use_state(state)
+        return view
+
+    def _use_state(self, state: SimulationState) -> None:
+        """Make the tensors that tasks, robots and sensors read attributes."""
+        self.state = state
+        self.joint_position = state.joint_position
+        self.joint_velocity = state.joint_velocity
+        self.ee_position = state.ee_position
+        self.ee_velocity = state.ee_velocity
+        self.ee_state = state.ee_state
+        self.ee_orientation = state.ee_orientation
+        self.object_pose = state.object_pose
+        self.object_state = state.object_state
+        self.object_velocity = state.object_velocity
+        self.object_euler = state.object_euler
+        self.object_joint_position = state.object_joint_position
+        self.object_joint_velocity = state.object_joint_velocity
+        self.marker_pose = state.marker_pose
 
     # ---- steps and resets --------------------------------------------------------
 

@@ -1,47 +1,74 @@
 """Runs episodes of a robot and a task in plain torch, without torchrl."""
 
+import math
+import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torch_panda.bullet import (
     BulletError,
+    PhysicsClient,
     PhysicsName,
     PhysicsParams,
+    Scene,
     ThreadGuard,
     VectorSimulation,
     read_physics,
 )
+from torch_panda.bullet.body_state import Doubles
 from torch_panda.checks import (
-    check_action,
+    QUATERNION_TOLERANCE,
+    all_finite,
     check_choice,
     check_instance,
     check_integer,
     check_positive,
+    check_rotations,
+    check_seed,
 )
-from torch_panda.envs.builder import build_scene
+from torch_panda.envs.exact_states import ExactStates, Replay
 from torch_panda.envs.goal_observation import GoalName, GoalObserver, find_goal_indices
-from torch_panda.envs.history import History
-from torch_panda.envs.observer import EpisodeObserver, Observed
-from torch_panda.envs.randomization import DomainRandomizer, Randomization
-from torch_panda.envs.seeds import EpisodeSeeds
-from torch_panda.envs.start import EpisodeStarts, check_samplers
-from torch_panda.envs.state import StartState, read_state
+from torch_panda.envs.randomization import (
+    PHYSICS_KEYS,
+    DomainRandomizer,
+    Randomization,
+)
+from torch_panda.envs.state import BODY_KEYS, EXACT_KEYS, read_state
+from torch_panda.envs.task_problems import find_problems, find_uncalled_samplers
 from torch_panda.rendering import RendererName, VectorRenderer, check_renderer
 from torch_panda.robots import Robot
-from torch_panda.sensors import Entry, Sensor, read_sensors
-from torch_panda.tasks import Task
+from torch_panda.sensors import (
+    Entry,
+    JointState,
+    Observer,
+    Sensor,
+    join_entries,
+    read_sensors,
+)
+from torch_panda.tasks import Bodies, Task
 
 OnDivergence = Literal["raise", "reset"]
+
+Observed = dict[str, Tensor]
+"""Observed entries of all environments, (n, ...) by key, in new tensors."""
+
+# Keys that Gymnasium and Stable-Baselines3 write into infos.
+_GYMNASIUM_INFO_KEYS = {
+    "is_success", "final_obs", "final_info", "terminal_observation", "episode",
+    "TimeLimit.truncated",
+}  # fmt: skip
 
 
 class Episodes:
     """Runs the episodes of n environments of one robot and one task.
 
+    It owns the number, the step count, the goal and the start of every episode.
     `RobotTaskEnv` explains the arguments.
 
     All tensors are on the CPU and have n rows. Only actions and states that a caller
@@ -52,8 +79,11 @@ class Episodes:
 
     Attributes:
         simulation: The Bullet clients and their state.
-        renderer: Draws the environments.
-        seeds: Seeds of the episodes.
+        renderer: Renders the environments.
+        goal: Desired goals of the running episodes, (n, task.goal_dim) float64.
+        step_count: Number of steps of the running episodes, (n, 1) int64.
+        seed: The seed of the constructor or of the last `set_seed`; None means that it
+            was drawn from the operating system.
         entries: Shape and dtype of the keys that sensors, task and randomization add to
             the outputs.
         info_keys: Keys among them that `Task.info` adds. They are no observations.
@@ -84,7 +114,6 @@ class Episodes:
     ) -> None:
         check_instance("robot", robot, Robot)
         check_instance("task", task, Task)
-        check_samplers(task)
         if randomize is not None:
             check_instance("randomize", randomize, Randomization)
         check_positive(
@@ -95,7 +124,7 @@ class Episodes:
         check_renderer(renderer)
         check_choice("on_divergence", on_divergence, get_args(OnDivergence))
         check_choice("goal", goal, get_args(GoalName))
-        n = num_envs or 1
+        _raise_problems(find_uncalled_samplers(task))
         self.goal_indices = find_goal_indices(robot, task)
         if goal == "observation" and self.goal_indices is None:
             raise ValueError(
@@ -105,67 +134,131 @@ class Episodes:
                 'declaring them again; set Task.goal_entries, or use goal="task"'
             )
         self.robot, self.task = robot, task
-        self._control = robot.controller
-        self.batch_shape = () if num_envs is None else (n,)
-        self._action_shape = (*self.batch_shape, robot.action_dim)
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
+        self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
         self.physics = read_physics(physics)
-        self.seeds = EpisodeSeeds(n, seed)
+        self._control = robot.controller
+        # Optional hooks of the task are called only if it overrides them.
+        self._has_reward = type(task).reward is not Task.reward
+        self._has_failure = type(task).failure is not Task.failure
+        n = num_envs or 1
+        self.batch_shape = () if num_envs is None else (n,)
         self.is_closed = False
         self._guard = ThreadGuard()
         # Environments that need a reset: new ones, and those whose last reset failed.
         self._needs_reset = set(range(n))
+        self.seed = seed
+        self._streams: list[tuple[int, int]] = []  # (seed, index) by environment
+        self._episode_numbers = [0] * n  # of the next episodes
+        self.set_seed(seed)
         sensors = read_sensors(sensors, robot)
         # With a bound method, the simulation would refer back to this object, and the
         # cycle of references would keep a forgotten environment alive.
-        build = partial(build_scene, robot, task, sensors)
-        self.simulation = VectorSimulation(
+        build = partial(_build_scene, robot, task, sensors)
+        self.simulation = simulation = VectorSimulation(
             build, n, num_threads=num_threads, physics=self.physics
         )
         try:
-            self.renderer = VectorRenderer(self.simulation, renderer=renderer)
-            randomizer = DomainRandomizer(
-                randomize, robot, task, self.simulation, self.physics
+            _raise_problems(find_problems(robot, task, simulation, self.goal_indices))
+            self.renderer = VectorRenderer(simulation, renderer=renderer)
+            self._randomizer = DomainRandomizer(
+                randomize, robot, task, simulation, self.physics
             )
+            self.goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
+            self.step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
             self.goal_dim = task.goal_dim
             self._goal_observer: GoalObserver | None = None
             if goal == "observation" and self.goal_indices is not None:
                 self.goal_dim = robot.observation_dim + task.observation_dim
                 self._goal_observer = GoalObserver(
-                    robot, task, self.simulation, build, self.physics, self.goal_indices
+                    robot, task, simulation, build, self.physics, self.goal_indices
                 )
-            self._observer = EpisodeObserver(
-                robot,
-                task,
-                self.simulation,
-                self.renderer,
-                sensors=sensors,
-                randomizer=randomizer,
-                goal_indices=self.goal_indices,
-                max_episode_steps=self.max_episode_steps,
-                terminate_on_success=terminate_on_success,
-            )
-            self.entries = self._observer.entries
-            self.info_keys = self._observer.info_keys
-            self._randomizer = randomizer
-            # Draws the starts of episodes, and holds the goals, the step counts and the
-            # state tensors of the running episodes.
-            self._starts = EpisodeStarts(
-                robot, task, self.simulation, randomizer, self.seeds
-            )
-            self._history = History(self._starts.state(), robot.action_dim)
+            self._add_observers(sensors)
+            self._exact_states = ExactStates(self._state(), robot.action_dim)
             # From now on, changes of most arguments would have no effect.
             robot.freeze()
             task.freeze()
         except BaseException:
-            self.simulation.close()
+            simulation.close()
             raise
+
+    def _add_observers(self, sensors: Sequence[Sensor]) -> None:
+        """Find the entries that sensors, hooks and randomization add to the outputs."""
+        task, simulation = self.task, self.simulation
+        # Sensors also follow resets and steps; the other observers only observe.
+        self._sensors = [
+            sensor.attach(simulation, self.renderer, self.robot) for sensor in sensors
+        ]
+        info = HookObserver(task, simulation, "info")
+        extra = HookObserver(task, simulation, "extra_observation")
+        self.info_keys = frozenset(info.entries)
+        if taken := self.info_keys & _GYMNASIUM_INFO_KEYS:
+            raise ValueError(
+                f"{type(task).__name__}.info must not return {sorted(taken)}, because "
+                f"Gymnasium and Stable-Baselines3 use these keys"
+            )
+        # Keys of states, which sensors and tasks may not observe. Only the sensor
+        # "joint_state" may use two of them; see `is_state`.
+        reserved = {*BODY_KEYS, *PHYSICS_KEYS, *EXACT_KEYS}
+        if any(isinstance(sensor, JointState) for sensor in sensors):
+            reserved -= {"joint_position", "joint_velocity"}
+        observers: list[Observer] = [*self._sensors, extra, info]
+        # The randomizer may observe a reserved key, so add its entries after the check
+        # of `join_entries`.
+        self.entries = join_entries(observers, reserved) | self._randomizer.entries
+        observers.append(self._randomizer)
+        self._observers = [observer for observer in observers if observer.entries]
 
     @property
     def num_envs(self) -> int:
         """Number of environments, n."""
-        return self.simulation.num_envs
+        return len(self._episode_numbers)
+
+    # ---- seeds -------------------------------------------------------------------
+
+    def set_seed(self, seed: int | None) -> None:
+        """Restart the sequence of episodes of all environments.
+
+        Raises:
+            ValueError: The seed is negative.
+            TypeError: The seed is not an integer.
+        """
+        number = secrets.randbits(63) if seed is None else check_seed(seed)
+        self.seed = None if seed is None else number
+        self._streams = [(number, env) for env in range(self.num_envs)]
+        self._episode_numbers = [0] * self.num_envs
+
+    def set_env_seed(self, env: int, seed: int) -> None:
+        """Seed one environment; see `RobotTaskEnv.set_env_seed`."""
+        if not 0 <= env < self.num_envs:
+            raise ValueError(f"env must be from 0 to {self.num_envs - 1}, got {env}")
+        self._streams[env] = (check_seed(seed), 0)
+        self._episode_numbers[env] = 0
+
+    def seed_state(self) -> dict[str, Any]:
+        """Seeds and episode numbers, as plain numbers for `load_seed_state`."""
+        return {
+            "seed": self.seed,
+            "streams": [list(stream) for stream in self._streams],
+            "episodes": list(self._episode_numbers),
+        }
+
+    def load_seed_state(self, state: Mapping[str, Any]) -> None:
+        """Continue with the seeds and episode numbers that `seed_state` returned.
+
+        Raises:
+            ValueError: The state belongs to a different number of environments.
+        """
+        streams, numbers = state["streams"], state["episodes"]
+        if len(numbers) != self.num_envs:
+            raise ValueError(
+                f"the state_dict holds {len(numbers)} environments, but this one has "
+                f"{self.num_envs}: make it with num_envs={len(numbers)}"
+            )
+        self.seed = state["seed"]
+        self._streams = [(seed, index) for seed, index in streams]
+        self._episode_numbers = list(numbers)
 
     # ---- start, act, observe -----------------------------------------------------
 
@@ -194,24 +287,18 @@ class Episodes:
             self._check_open()
             chosen = range(self.num_envs) if envs is None else envs
             envs = sorted({*chosen, *self._needs_reset})
-            start_state = None if state is None else self._read_state(state, envs)
+            values, replay = self._read_state(state, envs)
             # If anything below raises, these environments need another reset.
             self._needs_reset.update(envs)
             # A step that raised `WorkerError` did not rebuild the diverged clients.
             for env in set(envs).intersection(self.simulation.diverged()):
                 self.simulation.rebuild(env)
-            for env in envs:
-                self._starts.draw(env)
-            if start_state is not None:
-                tensors = self._starts.state()
-                for key, value in (start_state.origin or start_state.values).items():
-                    tensors[key][envs] = value
-            self._start_episodes(envs)
-            if start_state is not None and start_state.origin:
-                self._repeat_actions(envs, start_state)
+            self._start_episodes(envs, values if replay is None else replay.start)
+            if replay is not None:
+                replay.run(self._repeat_step, self._state())
             self._needs_reset.difference_update(envs)
             observed = self._observe()
-            if start_state is not None:
+            if state is not None:
                 # An episode that has just started is not done, even if the given state
                 # was the last of an episode.
                 for key in ("terminated", "truncated", "done"):
@@ -239,9 +326,10 @@ class Episodes:
         """
         with self._guard:
             self._check_all_reset()
-            action = self._begin_step(action, step_mask)
+            action = self._read_action(action)
             envs = None if step_mask is None else indices(step_mask)
-            self._history.record(action, step_mask)
+            self.step_count += 1 if step_mask is None else step_mask
+            self._exact_states.record(action, step_mask)
             if diverged := self._advance(action, envs):
                 ended = [goal[diverged] for goal in self._goals]
                 self._recover(diverged)
@@ -249,7 +337,8 @@ class Episodes:
                 # The observations show the next episodes, but with the goals of the
                 # ended ones, which the policy pursued.
                 self._set_goals(diverged, ended)
-            self._observer.after_step(range(self.num_envs) if envs is None else envs)
+            for sensor in self._sensors:
+                sensor.after_step(range(self.num_envs) if envs is None else envs)
             observed = self._observe(action)
             if step_mask is not None:
                 observed["reward"] = observed["reward"] * step_mask
@@ -264,14 +353,14 @@ class Episodes:
         """The physical state, (n, ...) by key; see `RobotTaskEnv.get_state`."""
         with self._guard:
             self._check_all_reset()
-            state = {key: value.clone() for key, value in self._starts.state().items()}
-            return {**state, **self._history.export()} if exact else state
+            state = {key: value.clone() for key, value in self._state().items()}
+            return {**state, **self._exact_states.export()} if exact else state
 
     def state_entries(self) -> dict[str, Entry]:
         """Shapes and dtypes of the entries of a state, by key."""
         return {
             key: Entry(tuple(value.shape[1:]), value.dtype)
-            for key, value in self._starts.state().items()
+            for key, value in self._state().items()
         }
 
     def progress(self) -> Observed:
@@ -282,9 +371,9 @@ class Episodes:
         """
         self._check_all_reset()
         achieved_goal = self.task.achieved_goal(self.simulation).float()
-        desired_goal = self._starts.goal.float()
+        desired_goal = self.goal.float()
         return {
-            "step_count": self._starts.step_count,
+            "step_count": self.step_count,
             "achieved_goal": achieved_goal,
             "desired_goal": desired_goal,
             "success": self.task.is_success(achieved_goal, desired_goal),
@@ -323,77 +412,234 @@ class Episodes:
             self.renderer.close()
             self.simulation.close()
 
-    # ---- parts of a step and of a reset --------------------------------------------
+    # ---- parts of a reset ----------------------------------------------------------
 
-    def _start_episodes(self, envs: list[int]) -> None:
-        """Start the episodes whose starts are in the state tensors."""
-        self._starts.place_markers(envs)
-        self._history.begin(envs)
+    def _state(self) -> dict[str, Tensor]:
+        """The tensors of the state, (n, ...) by key, not copied."""
+        simulation = self.simulation
+        state = {
+            "joint_position": simulation.joint_position,
+            "joint_velocity": simulation.joint_velocity,
+            "object_pose": simulation.object_pose,
+            "object_velocity": simulation.object_velocity,
+            "desired_goal": self.goal,
+            "step_count": self.step_count,
+            **self._randomizer.state,
+        }
+        if any(simulation.scene.object_joints):
+            state["object_joint_position"] = simulation.object_joint_position
+            state["object_joint_velocity"] = simulation.object_joint_velocity
+        return state
+
+    def _read_state(
+        self, state: Mapping[str, Any] | None, envs: list[int]
+    ) -> tuple[dict[str, Tensor], Replay | None]:
+        """Check a state to start from, without changing the environments.
+
+        Returns:
+            The entries of the environments, (len(envs), ...) by key; and the actions to
+            repeat, if the state is exact.
+        """
+        if state is None:
+            return {}, None
+        values = read_state(
+            state, batch_shape=self.batch_shape, present=self._state(), envs=envs
+        )
+        replay = self._exact_states.read(state, values, envs, self.batch_shape)
+        self._randomizer.check_state(values, envs)
+        if replay is not None:
+            self._randomizer.check_state(replay.start, envs)
+        if self.simulation.scene.markers and "desired_goal" in values:
+            # Raises if the task computes an invalid pose, before anything changes.
+            self._marker_pose(values["desired_goal"], envs)
+        return values, replay
+
+    def _start_episodes(self, envs: list[int], values: Mapping[str, Tensor]) -> None:
+        """Start the next episodes of some environments.
+
+        Args:
+            envs: The environments.
+            values: Entries of the state that replace the drawn ones, (len(envs), ...).
+        """
+        state = self._state()
+        arrays = {key: value.numpy() for key, value in state.items()}
+        for env in envs:
+            self._draw_start(env, {key: array[env] for key, array in arrays.items()})
+        for key, value in values.items():
+            state[key][envs] = value
+        if self.simulation.scene.markers:
+            pose = self._marker_pose(self.goal[envs], envs)
+            self.simulation.marker_pose[envs] = pose
+        self._exact_states.begin(envs)
         if self._goal_observer is not None:
-            self._goal_observer.update(envs, self._starts.goal)
+            self._goal_observer.update(envs, self.goal)
         randomizer = self._randomizer
         randomize = randomizer.apply if randomizer.changes_physics else None
         self.simulation.reset(envs, randomize)
-        self._observer.after_reset(envs)
+        for sensor in self._sensors:
+            sensor.after_reset(envs)
 
-    @property
-    def _goals(self) -> list[Tensor]:
-        """Desired goals, (n, ...): the task's, and the observations of them."""
-        observer = self._goal_observer
-        return [self._starts.goal] + ([] if observer is None else [observer.desired])
+    def _draw_start(self, env: int, row: dict[str, Doubles]) -> None:
+        """Draw the start of an environment's next episode into its row of the state.
 
-    def _set_goals(self, envs: list[int], values: list[Tensor]) -> None:
-        """Set the rows of `_goals` that belong to some environments."""
-        for goal, rows in zip(self._goals, values, strict=True):
-            goal[envs] = rows
+        The robot starts in its neutral pose. The task draws the goal, the objects and
+        their joints. The randomizer draws the physics, and offsets of the robot's
+        joints.
 
-    def _observe(self, action: Tensor | None = None) -> Observed:
-        starts = self._starts
-        observed = self._observer.observe(starts.goal, starts.step_count, action)
-        if self._goal_observer is not None:
-            observed["achieved_goal"] = observed["observation"].clone()
-            observed["desired_goal"] = self._goal_observer.desired.clone()
-        return observed
+        Raises:
+            ValueError: The task draws numbers of a wrong shape, numbers that are not
+                finite, or quaternions that are not unit quaternions.
+        """
+        episode = (*self._streams[env], self._episode_numbers[env])
+        self._episode_numbers[env] += 1
+        start = self.task.sample_start(np.random.default_rng(episode))
+        row["step_count"][:] = 0
+        self._fill(row["desired_goal"], start.goal, "sample_goal")
+        row["joint_position"][:] = self.robot.neutral_joint_position
+        row["joint_velocity"][:] = 0.0
+        if len(row["object_pose"]):
+            self._fill(row["object_pose"], start.object_pose, "sample_objects")
+            for *_, x, y, z, w in row["object_pose"].tolist():
+                if abs(math.hypot(x, y, z, w) - 1) > QUATERNION_TOLERANCE:
+                    raise ValueError(
+                        f"{self._sampler('sample_objects')} must return unit "
+                        f"quaternions, got {[x, y, z, w]}"
+                    )
+            row["object_velocity"][:] = 0.0
+        if "object_joint_position" in row:
+            joints = row["object_joint_position"]
+            drawn = np.asarray(start.object_joint_position)
+            # A single number is the position of every joint.
+            drawn = np.broadcast_to(drawn, joints.shape) if drawn.size == 1 else drawn
+            self._fill(joints, drawn, "sample_object_joints")
+            row["object_joint_velocity"][:] = 0.0
+        if self._randomizer.is_active:
+            # Another stream of the same episode, so that randomized physics do not
+            # change the drawn goals and objects.
+            seed = np.random.SeedSequence(episode, spawn_key=(1,))
+            self._randomizer.draw(env, seed)
 
-    def _begin_step(self, action: Tensor | None, step_mask: Tensor | None) -> Tensor:
-        """Check an action and count a step; return the clipped action, a new tensor."""
-        action = check_action(action, self._action_shape)
-        self._starts.step_count += 1 if step_mask is None else step_mask
-        return action
+    def _fill(self, row: Doubles, values: object, sampler: str) -> None:
+        """Check the numbers that the task drew and write them into the state."""
+        drawn = np.asarray(values, dtype=np.float64)
+        if drawn.shape != row.shape or not np.isfinite(drawn).all():
+            raise ValueError(
+                f"{self._sampler(sampler)} must return finite numbers of shape "
+                f"{row.shape}, got {values}"
+            )
+        row[:] = drawn
+
+    def _sampler(self, name: str) -> str:
+        """``sample_start`` if the task overrides it, otherwise ``name``; for errors."""
+        overrides = type(self.task).sample_start is not Task.sample_start
+        return "sample_start" if overrides else name
+
+    def _marker_pose(self, goal: Tensor, envs: list[int]) -> Tensor:
+        """Poses of the markers for goals of some environments, (len(envs), n, 7)."""
+        pose = self.task.marker_pose(goal)
+        if type(self.task).marker_pose is not Task.marker_pose:
+            check_rotations("the marker pose for the desired_goal", pose, envs)
+        return pose
+
+    def _repeat_step(self, action: Tensor, step_mask: Tensor, last: list[int]) -> None:
+        """Repeat a step of an exact state; see `exact_states.TakeStep`."""
+        self._exact_states.record(action, step_mask)
+        self._advance(action, indices(step_mask))
+        # Sensors report the present only, so the last step of each environment is
+        # enough for them.
+        for sensor in self._sensors:
+            sensor.after_step(last)
+
+    # ---- parts of a step -----------------------------------------------------------
+
+    def _read_action(self, action: Tensor | None) -> Tensor:
+        """Check an action; return a clipped copy, (n, action_dim) float32."""
+        shape = (*self.batch_shape, self.robot.action_dim)
+        if not isinstance(action, Tensor):
+            raise ValueError(
+                f"the action must be a tensor of shape {shape}, got {action!r}"
+            )
+        if action.shape != shape:
+            raise ValueError(
+                f"the action must have shape {shape}, got {tuple(action.shape)}"
+            )
+        if not action.dtype.is_floating_point:
+            raise TypeError(
+                f"the action must have a floating-point dtype, got {action.dtype}: "
+                f"pass action.float()"
+            )
+        action = action.detach().to("cpu", copy=True).reshape(-1, shape[-1])
+        if not all_finite(action):
+            env = int((~action.isfinite()).any(dim=1).nonzero()[0])
+            raise ValueError(
+                f"the action of environment {env} is not finite: {action[env].tolist()}"
+            )
+        return action.clamp_(-1.0, 1.0).float()
 
     def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
         """Advance the physics by one step; return the environments that diverged."""
         setpoint = self.robot.setpoint(action, self.simulation).numpy()
         return self.simulation.step(self._control, setpoint, envs)
 
-    def _read_state(self, state: Mapping[str, Any], envs: list[int]) -> StartState:
-        """Check a state to start from, without changing the environments."""
-        start_state = read_state(
-            state,
-            batch_shape=self.batch_shape,
-            present=self._starts.state(),
-            envs=envs,
-            action_dim=self.robot.action_dim,
-        )
-        self._randomizer.check_state(start_state.values, envs)
-        self._randomizer.check_state(start_state.origin, envs)
-        if self.simulation.scene.markers and "desired_goal" in start_state.values:
-            # Raises if the task computes an invalid pose, before anything changes.
-            self._starts.marker_pose(start_state.values["desired_goal"], envs)
-        return start_state
+    def _observe(self, action: Tensor | None = None) -> Observed:
+        """Observe all environments.
 
-    def _repeat_actions(self, envs: list[int], start_state: StartState) -> None:
-        """Repeat the actions of an exact state and check that they lead to it."""
-        for action, acting, last in start_state.steps(envs, self.num_envs):
-            step_mask = torch.zeros(self.num_envs, 1, dtype=torch.bool, device="cpu")
-            step_mask[acting] = True
-            self._history.record(action, step_mask)
-            self._advance(action, acting)
-            # Sensors report the present only, so the last step of each environment is
-            # enough for them.
-            self._observer.after_step(last)
-        self._starts.step_count[envs] = start_state.values["step_count"]
-        start_state.check_arrival(envs, self._starts.state())
+        Args:
+            action: The action that led to the present state, (n, action_dim); None
+                after a reset.
+
+        Returns:
+            ``observation``, the goals, ``success``, ``terminated``, ``truncated``,
+            ``done``, and the keys of `entries`; after a step also ``reward``.
+        """
+        robot, task, simulation = self.robot, self.task, self.simulation
+        parts = robot.observation(simulation), task.observation(simulation)
+        observation = torch.cat(parts, dim=1).float()
+        # A copy, because a task may return a tensor that the next step overwrites.
+        achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
+        desired_goal = self.goal.float()
+        success = task.is_success(achieved_goal, desired_goal)
+        terminated = success if self.terminate_on_success else torch.zeros_like(success)
+        if self._has_failure:
+            terminated = terminated | task.failure(simulation)
+        if self._has_failure or self.terminate_on_success:
+            # No episode ends before its first step.
+            terminated = terminated & (self.step_count > 0)
+        truncated = self.step_count >= self.max_episode_steps
+        observed = {
+            "observation": observation,
+            "achieved_goal": achieved_goal,
+            "desired_goal": desired_goal,
+            "success": success,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        if action is not None and self._has_reward:
+            reward = task.reward(
+                simulation, action.clone(), achieved_goal, desired_goal
+            )
+            observed["reward"] = reward.to(torch.float32, copy=True)
+        elif action is not None:
+            reward = task.compute_reward(achieved_goal, desired_goal)
+            observed["reward"] = reward.float()
+        if self._goal_observer is not None:
+            observed["achieved_goal"] = observation.clone()
+            observed["desired_goal"] = self._goal_observer.desired.clone()
+        for observer in self._observers:
+            observed |= observer.observe()
+        return observed
+
+    @property
+    def _goals(self) -> list[Tensor]:
+        """Desired goals, (n, ...): the task's, and the observations of them."""
+        observer = self._goal_observer
+        return [self.goal] + ([] if observer is None else [observer.desired])
+
+    def _set_goals(self, envs: list[int], values: list[Tensor]) -> None:
+        """Set the rows of `_goals` that belong to some environments."""
+        for goal, rows in zip(self._goals, values, strict=True):
+            goal[envs] = rows
 
     def _recover(self, envs: list[int]) -> None:
         """Start the next episode of environments whose physics diverged."""
@@ -401,8 +647,7 @@ class Episodes:
         self._needs_reset.update(envs)
         for env in envs:
             self.simulation.rebuild(env)
-            self._starts.draw(env)
-        self._start_episodes(envs)
+        self._start_episodes(envs, {})
         self._needs_reset.difference_update(envs)
         if self.on_divergence == "raise":
             raise BulletError(
@@ -410,7 +655,7 @@ class Episodes:
                 f"finite; they are at the start of their next episode"
             )
         # Makes ``truncated`` true, so that torchrl resets these environments.
-        self._starts.step_count[envs] = self.max_episode_steps
+        self.step_count[envs] = self.max_episode_steps
 
     # ---- checks ------------------------------------------------------------------
 
@@ -428,6 +673,76 @@ class Episodes:
                 f"environments {sorted(self._needs_reset)} were never reset, or their "
                 f"last reset failed: call reset first"
             )
+
+
+class HookObserver:
+    """Observes the entries of `Task.extra_observation` or `Task.info`.
+
+    Args:
+        task: The task.
+        simulation: The environments.
+        name: Name of the hook.
+
+    Attributes:
+        entries: The entries, by key; empty if the task does not override the hook.
+    """
+
+    def __init__(self, task: Task, simulation: VectorSimulation, name: str) -> None:
+        self._hook = getattr(task, name)
+        self._simulation = simulation
+        self.entries: dict[str, Entry] = {}
+        if getattr(type(task), name) is not getattr(Task, name):
+            for key, value in self.observe().items():
+                self.entries[key] = Entry(tuple(value.shape[1:]), value.dtype)
+
+    def observe(self) -> Observed:
+        """The entries of all environments, (n, ...), in new tensors."""
+        return {
+            key: value.float() if value.dtype == torch.float64 else value.clone()
+            for key, value in self._hook(self._simulation).items()
+        }
+
+
+def _build_scene(
+    robot: Robot, task: Task, sensors: Sequence[Sensor], client: PhysicsClient
+) -> Scene:
+    """Build the scene in a client. It is the same scene in every client.
+
+    Raises:
+        TypeError: `Robot.build` does not return a body id, or `Task.build` does not
+            return `Bodies`.
+    """
+    body = robot.build(client)
+    if not isinstance(body, int):
+        raise TypeError(
+            f"{type(robot).__name__}.build must return the robot's body id, "
+            f"got {body!r}"
+        )
+    bodies = task.build(client)
+    if not isinstance(bodies, Bodies):
+        raise TypeError(
+            f"{type(task).__name__}.build must return Bodies, got {bodies!r}"
+        )
+    for sensor in sensors:
+        sensor.build(client, body, robot)
+    objects = tuple(bodies.objects)
+    return Scene(
+        robot=body,
+        joints=_movable_joints(client, body),
+        ee_link=robot.ee_link,
+        objects=objects,
+        object_joints=tuple(_movable_joints(client, k) for k in objects),
+        markers=tuple(bodies.markers),
+    )
+
+
+def _movable_joints(client: PhysicsClient, body: int) -> tuple[int, ...]:
+    return tuple(joint.number for joint in client.joints(body) if joint.is_movable)
+
+
+def _raise_problems(problems: Sequence[str]) -> None:
+    if problems:
+        raise ValueError("\n".join(problems))
 
 
 def indices(mask: Tensor) -> list[int]:

@@ -6,7 +6,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, PhysicsParams, Scene, VectorSimulation
+from torch_panda.bullet import (
+    PhysicsClient,
+    PhysicsParams,
+    Scene,
+    SimulationState,
+    VectorSimulation,
+)
 from torch_panda.bullet.euler import euler_angles
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
@@ -84,9 +90,8 @@ class GoalObserver:
     In such a state the objects are at their goals and at rest. The hand is in its
     neutral pose, or at the goal if the goal is a position of the hand.
 
-    `update` writes the objects and the neutral pose into the tensors of the simulation,
-    observes them, restores the tensors, and inserts the goals. It does not change
-    Bullet's clients.
+    The functions of robot and task observe these states as a second simulation, which
+    shares the clients of the first one, but not its tensors.
 
     Attributes:
         desired: Observations of the present episodes' goals, (n, observation_dim)
@@ -103,6 +108,9 @@ class GoalObserver:
         goal_indices: tuple[int, ...],
     ) -> None:
         self._robot, self._task, self._simulation = robot, task, simulation
+        self._at_goal = simulation.with_state(
+            SimulationState(simulation.scene, simulation.num_envs)
+        )
         self._goal_indices = list(goal_indices)
         self._hand_pose = _neutral_hand_pose(robot, build_scene, physics)
         size = robot.observation_dim + task.observation_dim
@@ -118,19 +126,12 @@ class GoalObserver:
                 hold the poses of their objects.
             goal: Desired goals of all environments, (n, goal_dim) float64.
         """
-        simulation = self._simulation
-        saved = simulation.state.rows.clone()
-        try:
-            self._write_goal_states(list(envs), goal)
-            observation = torch.cat(
-                (
-                    self._robot.observation(simulation),
-                    self._task.observation(simulation),
-                ),
-                dim=1,
-            )
-        finally:
-            simulation.state.rows.copy_(saved)
+        self._write_goal_states(list(envs), goal)
+        parts = (
+            self._robot.observation(self._at_goal),
+            self._task.observation(self._at_goal),
+        )
+        observation = torch.cat(parts, dim=1)
         desired = observation[envs].float()
         # Insert the goal itself. The observation may have rounded it. For goals of the
         # hand (Reach), the observation still holds the neutral pose.
@@ -138,29 +139,24 @@ class GoalObserver:
         self.desired[envs] = desired
 
     def _write_goal_states(self, envs: list[int], goal: Tensor) -> None:
-        """Write the states in which the goals are reached into the tensors."""
-        simulation = self._simulation
+        """Write the states in which the goals are reached into `_at_goal`."""
+        start, at_goal = self._simulation, self._at_goal
         objects = self._task.objects_at_goal(
             goal[envs],
-            ObjectState(
-                simulation.object_pose[envs], simulation.object_joint_position[envs]
-            ),
+            ObjectState(start.object_pose[envs], start.object_joint_position[envs]),
         )
+        # Everything else, such as velocities, stays 0.
         neutral = goal.new_tensor(self._robot.neutral_joint_position)
-        simulation.joint_position[envs] = neutral
-        simulation.joint_velocity[envs] = 0.0
-        simulation.ee_position[envs] = self._hand_pose[:3]
-        simulation.ee_velocity[envs] = 0.0
-        simulation.ee_orientation[envs] = self._hand_pose[3:]
-        simulation.object_pose[envs] = objects.pose
-        simulation.object_joint_position[envs] = objects.joint_position
-        simulation.object_joint_velocity[envs] = 0.0
-        simulation.object_state[envs] = 0.0  # includes the velocities
-        simulation.object_state[envs, :, :3] = objects.pose[..., :3]
+        at_goal.joint_position[envs] = neutral
+        at_goal.ee_position[envs] = self._hand_pose[:3]
+        at_goal.ee_orientation[envs] = self._hand_pose[3:]
+        at_goal.object_pose[envs] = objects.pose
+        at_goal.object_joint_position[envs] = objects.joint_position
+        at_goal.object_state[envs, :, :3] = objects.pose[..., :3]
         for env, poses in zip(envs, objects.pose.tolist(), strict=True):
             for index, pose in enumerate(poses):
                 angles = goal.new_tensor(euler_angles(*pose[3:]))
-                simulation.object_euler[env, index] = angles
+                at_goal.object_euler[env, index] = angles
 
 
 def _neutral_hand_pose(

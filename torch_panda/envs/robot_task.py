@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import _update_during_reset
 from typing_extensions import Self
@@ -18,17 +19,15 @@ from typing_extensions import Self
 from torch_panda.arguments import argument_names, check_names
 from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.checks import check_device
-from torch_panda.envs.episodes import Episodes, OnDivergence, indices
+from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
 from torch_panda.envs.goal_observation import GoalName, apply_to_observations
-from torch_panda.envs.observer import Observed
 from torch_panda.envs.randomization import Randomization
-from torch_panda.envs.specs import Specs
 from torch_panda.envs.state import EXACT_KEYS, is_state, unpack_state
 from torch_panda.extras import install_command
 from torch_panda.rendering import Camera, RendererName
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
-from torch_panda.sensors import Sensor
+from torch_panda.sensors import Entry, Sensor
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import RewardFunction
 
@@ -165,12 +164,8 @@ class RobotTaskEnv(EnvBase):
         self._episodes, self._num_envs = episodes, num_envs
         self._env_id: str | None = None
         self._has_state_transform = False  # `StateTransform` sets it
-        self._terminate_on_success = terminate_on_success
         self._goal, self._observe_state = goal, observe_state
-        specs = Specs(episodes, device, observe_state=observe_state)
-        self.observation_spec, self.action_spec = specs.observation, specs.action
-        self.reward_spec = specs.reward
-        self.done_spec = specs.done  # type: ignore[misc]  # it has a setter
+        self._declare_specs()
         # torchrl's default is True, which would keep `EnvBase.__del__` from closing a
         # forgotten environment.
         self.is_closed = False
@@ -239,7 +234,7 @@ class RobotTaskEnv(EnvBase):
     @property
     def terminate_on_success(self) -> bool:
         """Whether success ends an episode."""
-        return self._terminate_on_success
+        return self.episodes.terminate_on_success
 
     @property
     def on_divergence(self) -> OnDivergence:
@@ -385,7 +380,7 @@ class RobotTaskEnv(EnvBase):
             ValueError: The index is out of range, or the seed is negative.
             TypeError: The seed is not an integer.
         """
-        self.episodes.seeds.restart_one(env, seed)
+        self.episodes.set_env_seed(env, seed)
 
     # ---- states, saving and pickling -----------------------------------------------
 
@@ -423,12 +418,12 @@ class RobotTaskEnv(EnvBase):
         every lambda in an `EnvCreator`, so with another type all its workers would play
         the same episodes.
         """
-        text = json.dumps(self.episodes.seeds.state())
+        text = json.dumps(self.episodes.seed_state())
         return torch.tensor([*text.encode()], dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Restore seeds and episode numbers. The next reset starts the next episode."""
-        self.episodes.seeds.load(json.loads(bytes(state.tolist())))
+        self.episodes.load_seed_state(json.loads(bytes(state.tolist())))
 
     def load_state_dict(
         self,
@@ -449,7 +444,7 @@ class RobotTaskEnv(EnvBase):
         return super().load_state_dict(state_dict, *args, **kwargs)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        seed = self.episodes.seeds.seed
+        seed = self.episodes.seed
         settings = (seed, self.device, self.env_id)
         return _rebuild, (type(self), *self._arguments, *settings)
 
@@ -621,7 +616,7 @@ class RobotTaskEnv(EnvBase):
         return False
 
     def _set_seed(self, seed: int | None) -> None:
-        self.episodes.seeds.restart(seed)
+        self.episodes.set_seed(seed)
 
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
@@ -647,6 +642,46 @@ class RobotTaskEnv(EnvBase):
         """
 
     # ---- tensors in and out ----------------------------------------------------------
+
+    def _declare_specs(self) -> None:
+        """Set the specs, which follow from the sizes that the parts declare."""
+        batch, device, episodes = self.batch_size, self.device, self.episodes
+        robot, task = self.robot, self.task
+
+        def spec(entry: Entry) -> TensorSpec:
+            shape, dtype = torch.Size((*batch, *entry.shape)), entry.dtype
+            if dtype == torch.bool:
+                return Binary(shape=shape, device=device, dtype=dtype)
+            if entry.high is None:
+                return Unbounded(shape, dtype=dtype, device=device)
+            return Bounded(0, entry.high, shape, dtype=dtype, device=device)
+
+        def numbers(size: int) -> TensorSpec:
+            return spec(Entry((size,), torch.float32))
+
+        flag = Entry((1,), torch.bool)
+        observed = {
+            "achieved_goal": numbers(episodes.goal_dim),
+            "desired_goal": numbers(episodes.goal_dim),
+            "success": spec(flag),
+        }
+        if self._observe_state:
+            size = robot.observation_dim + task.observation_dim
+            observed["observation"] = numbers(size)
+        observed |= {key: spec(entry) for key, entry in episodes.entries.items()}
+        ends = {key: spec(flag) for key in ("done", "terminated", "truncated")}
+        self.observation_spec = Composite(observed, shape=batch, device=device)
+        self.action_spec = Bounded(
+            low=-1.0,
+            high=1.0,
+            shape=torch.Size((*batch, robot.action_dim)),
+            device=device,
+            dtype=torch.float32,
+        )
+        self.reward_spec = numbers(1)
+        self.done_spec = Composite(  # type: ignore[misc]  # it has a setter
+            ends, shape=batch, device=device
+        )
 
     def _read_mask(self, tensordict: TensorDictBase, key: str) -> Tensor | None:
         """The mask under a key, (n, 1) bool, or None if the key is missing."""
@@ -685,5 +720,5 @@ def _rebuild(
     """Rebuild a pickled environment."""
     env = env_class(*args, **kwargs)
     env._env_id = env_id
-    env.episodes.seeds.restart(seed)
+    env.episodes.set_seed(seed)
     return env.to(device)

@@ -1,14 +1,11 @@
 """Reads and checks the state from which a reset starts."""
 
-import math
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Collection, Mapping
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from torch_panda.checks import check_rotations, check_rows
-from torch_panda.envs.history import ACTIONS, NUM_ACTIONS, START
 from torch_panda.envs.randomization import PHYSICS_KEYS
 
 # Largest position, angle or velocity that a state may hold [m], [rad], [m/s], [rad/s].
@@ -29,72 +26,11 @@ BODY_KEYS = (
 PLAIN_KEYS = (*BODY_KEYS, "desired_goal", "step_count", *PHYSICS_KEYS)
 # Key under which `StateTransform` puts a whole state.
 NESTED_STATE = "state"
-# Entries that only an exact state has.
-EXACT_KEYS = (*(START + key for key in PLAIN_KEYS), ACTIONS, NUM_ACTIONS)
-
-
-class StartState(NamedTuple):
-    """A state to start from, in k environments.
-
-    Attributes:
-        values: Entries of the state, (k, ...) by key.
-        origin: State at the start of the episode, from which ``actions`` lead to
-            ``values``, (k, ...) by key; empty unless the state is exact.
-        actions: Actions since the start of the episode, (k, length, action_dim) float32
-            in [-1, 1]; None unless the state is exact.
-        num_actions: Number of actions of each row, (k, 1) int64; None unless the state
-            is exact.
-    """
-
-    values: dict[str, Tensor]
-    origin: dict[str, Tensor]
-    actions: Tensor | None = None
-    num_actions: Tensor | None = None
-
-    def steps(
-        self, envs: list[int], num_envs: int
-    ) -> Iterator[tuple[Tensor, list[int], list[int]]]:
-        """Iterate over the actions of an exact state, step by step.
-
-        Args:
-            envs: The environments of the k rows.
-            num_envs: Number of all environments, n.
-
-        Yields:
-            The actions, (n, action_dim); the environments that take them; and the
-            environments for which this step is the last.
-        """
-        if self.actions is None or self.num_actions is None:
-            return
-        counts = self.num_actions.flatten()
-        rows = torch.tensor(envs, device="cpu")
-        for index in range(int(counts.max())):
-            is_acting = counts > index
-            action = self.actions.new_zeros(num_envs, self.actions.shape[-1])
-            action[rows[is_acting]] = self.actions[is_acting, index]
-            last = rows[counts == index + 1]
-            yield action, rows[is_acting].tolist(), last.tolist()
-
-    def check_arrival(self, envs: list[int], state: dict[str, Tensor]) -> None:
-        """Check that repeating the actions led to the state in `values`.
-
-        Args:
-            envs: The environments of the k rows.
-            state: The present state of all environments, (n, ...) by key.
-
-        Raises:
-            ValueError: An entry differs.
-        """
-        for key, value in state.items():
-            differs = (value[envs] != self.values[key]).flatten(1).any(dim=1).nonzero()
-            if len(differs):
-                raise ValueError(
-                    f"the actions in the exact state of environment "
-                    f"{envs[int(differs[0])]} do not lead to its {key}: the state was "
-                    f"changed or comes from an environment with other physics; to "
-                    f"start from its poses and velocities, leave out num_actions, "
-                    f"actions and the entries that begin with start_"
-                )
+# Entries that only an exact state has; see `exact_states`.
+START = "start_"  # prefix of the keys of the state at the start of the episode
+ACTIONS = "actions"
+NUM_ACTIONS = "num_actions"
+EXACT_KEYS = {*(START + key for key in PLAIN_KEYS), ACTIONS, NUM_ACTIONS}
 
 
 def is_state(entries: Mapping[str, Any] | None, observed_keys: Collection[str]) -> bool:
@@ -155,26 +91,24 @@ def read_state(
     batch_shape: tuple[int, ...],
     present: dict[str, Tensor],
     envs: list[int],
-    action_dim: int,
-) -> StartState:
+) -> dict[str, Tensor]:
     """Check a state, and read the entries of the environments that start from it.
 
     Args:
         state: Tensors of shape (*batch_shape, ...). Entries under keys that are not
-            part of a state are ignored.
+            part of a plain state are ignored.
         batch_shape: Batch shape of the environment.
         present: The present state of all environments, (n, ...) by key.
         envs: The environments that start from the state.
-        action_dim: Size of an action.
 
     Returns:
         Entries of shape (len(envs), ...), in the dtypes of ``present``.
 
     Raises:
         ValueError: An entry has a wrong shape, or a number that is infinite, NaN or
-            above 1e6 in magnitude; an object's quaternion is not a unit quaternion; an
-            exact state lacks entries; or there is no state. A ``step_count`` alone is
-            not a state, because torchrl's `StepCounter` writes it too.
+            above 1e6 in magnitude; an object's quaternion is not a unit quaternion; or
+            there is no state. A ``step_count`` alone is not a state, because torchrl's
+            `StepCounter` writes it too.
     """
     if not {*BODY_KEYS, "desired_goal", *PHYSICS_KEYS}.intersection(state.keys()):
         accepted = [key for key in present if key != "step_count"]
@@ -184,36 +118,14 @@ def read_state(
             "the innermost TransformedEnv, and give the state under the key "
             f"{NESTED_STATE!r}"
         )
-
-    def read(prefix: str = "") -> dict[str, Tensor]:
-        return {
-            key: _read_entry(prefix + key, state[prefix + key], batch_shape, now, envs)
-            for key, now in present.items()
-            if state.get(prefix + key, None) is not None
-        }
-
-    exact_keys = set(EXACT_KEYS).intersection(state.keys())
-    if not exact_keys:
-        return StartState(read(), origin={})
-    required = {START + key for key in present} | {ACTIONS, NUM_ACTIONS}
-    if missing := (required | present.keys()).difference(state.keys()):
-        raise ValueError(
-            f"an exact state needs all its entries, but {sorted(missing)} are missing; "
-            f"leave out {sorted(exact_keys)} to start from the other entries"
-        )
-    n = len(next(iter(present.values())))
-    length = math.prod(state[ACTIONS].shape[-2:-1])  # 1 if a dimension is missing
-    values, origin = read(), read(START)
-    like = torch.zeros(n, length, action_dim, dtype=torch.float32, device="cpu")
-    actions = _read_entry(ACTIONS, state[ACTIONS], batch_shape, like, envs)
-    check_rows(ACTIONS, actions.abs() <= 1, envs, "in [-1, 1]")
-    like = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
-    count = _read_entry(NUM_ACTIONS, state[NUM_ACTIONS], batch_shape, like, envs)
-    check_rows(NUM_ACTIONS, count <= length, envs, f"at most {length}")
-    return StartState(values, origin, actions, count)
+    return {
+        key: read_entry(key, state[key], batch_shape, now, envs)
+        for key, now in present.items()
+        if state.get(key, None) is not None
+    }
 
 
-def _read_entry(
+def read_entry(
     key: str,
     value: Tensor,
     batch_shape: tuple[int, ...],

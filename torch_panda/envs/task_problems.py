@@ -1,15 +1,21 @@
 """Problems of the functions of a robot and a task: wrong tensors, changes in place."""
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.robots import Robot
 from torch_panda.tasks import Task
+from torch_panda.tasks.base import SAMPLERS
+
+# Number of starts that `find_uncalled_samplers` draws.
+_NUM_PROBES = 100
 
 
 class Function(NamedTuple):
@@ -180,6 +186,52 @@ def find_goal_entries_problems(
         f"{robot.observation_dim} numbers, and the task's part has "
         f"{task.observation_dim}"
     ]
+
+
+def find_uncalled_samplers(task: Task) -> list[str]:
+    """Find methods that a task overrides, but that its `sample_start` never calls.
+
+    `sample_start` is called on a copy of the task. If it fails, nothing is found.
+    """
+    if type(task).sample_start is Task.sample_start:
+        return []
+    unused = {
+        name
+        for name in SAMPLERS
+        if _override_level(task, name) < _override_level(task, "sample_start")
+    }
+    if not unused:
+        return []
+    probe = copy.copy(task)
+
+    def record(name: str, rng: np.random.Generator) -> object:
+        unused.discard(name)
+        return getattr(task, name)(rng)
+
+    for name in unused:
+        setattr(probe, name, partial(record, name))
+    try:
+        # `sample_start` may call a method in some of the episodes only.
+        for seed in range(_NUM_PROBES):
+            probe.sample_start(np.random.default_rng(seed))
+    except Exception:
+        return []
+    if not unused:
+        return []
+    owner = type(task).__mro__[_override_level(task, "sample_start")].__name__
+    return [
+        f"{' and '.join(sorted(unused))} of {type(task).__name__} would never be "
+        f"called, because {owner}.sample_start draws without "
+        f"{'it' if len(unused) == 1 else 'them'}: override sample_start instead"
+    ]
+
+
+def _override_level(task: Task, name: str) -> int:
+    """Index in the MRO of the class that defines a method; -1 for the object itself."""
+    if name in vars(task):
+        return -1
+    classes = type(task).__mro__
+    return next(level for level, base in enumerate(classes) if name in vars(base))
 
 
 def find_tensor_problems(

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.envs.observer import Observed
+from torch_panda.envs.episodes import Observed
 from torch_panda.envs.state import EXACT_KEYS, PLAIN_KEYS
 from torch_panda.gymnasium_envs.panda_gym import PandaGymErrors
 

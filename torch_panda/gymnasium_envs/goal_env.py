@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.envs.observer import Observed
+from torch_panda.envs.episodes import Observed
 from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
 from torch_panda.gymnasium_envs.rendering import (

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.envs.observer import Observed
+from torch_panda.envs.episodes import Observed
 from torch_panda.gymnasium_envs import arrays
 from torch_panda.gymnasium_envs.arrays import GoalFunctions, Observation
 from torch_panda.gymnasium_envs.goal_env import check_no_arguments, metadata_of

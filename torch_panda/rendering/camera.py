@@ -145,7 +145,10 @@ def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
     """
     if size is None:
         return camera
-    height, width = np.broadcast_to(size, 2).tolist()
+    sizes = np.atleast_1d(size).tolist()
+    if len(sizes) > 2:
+        raise ValueError(f"size must be one or two numbers, got {size}")
+    height, width = sizes[0], sizes[-1]
     return dataclasses.replace(camera, height=height, width=width)
 
 
