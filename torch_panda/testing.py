@@ -141,8 +141,8 @@ class _TaskCheck:
     def find_problems(self, sensors: Sequence[Sensor | str]) -> list[str]:
         """Play episodes, and return the problems, one line each."""
         task, name = self._task, f"{self._name}.goal_entries"
-        self._add(
-            name, find_goal_entries_problems(self._robot, task, self._goal_indices)
+        self._set(
+            name, *find_goal_entries_problems(self._robot, task, self._goal_indices)
         )
         # The class has the name of the task, because it appears in errors.
         scene_class = type(self._name, (_Scene,), {"goal_dim": task.goal_dim})
@@ -162,25 +162,23 @@ class _TaskCheck:
 
     def _check_episodes(self, env: RobotTaskEnv) -> None:
         """Check what functions and sensors return, and that episodes repeat."""
-        first_episode = env.state_dict()
-        outputs, copies, states = [], [], []
+        begin = env.state_dict()
+        states, outputs = [], []
         for action, output in _play(env):
             self._check_functions(env, action, has_started=True)
             self._check_sensors(env, output)
-            outputs.append(output)
-            copies.append(output.clone())
             states.append(env.get_state())
+            outputs.append((output, output.clone()))
         for key in env.episodes.entries:
-            pairs = zip(outputs, copies, strict=True)
-            if any(not _is_equal(x.get(key), y.get(key)) for x, y in pairs if key in x):
-                self._add(
-                    f"sensor {key}",
-                    [
+            for output, copied in outputs:
+                value, expected = output.get(key, None), copied.get(key, None)
+                if value is not None and not _is_equal(value, expected):
+                    self._set(
+                        f"sensor {key}",
                         f"a sensor must return new tensors, but a later step overwrote "
-                        f"{key!r}: return a copy, such as tensor.clone()"
-                    ],
-                )
-        env.load_state_dict(first_episode)
+                        f"{key!r}: return a copy, such as tensor.clone()",
+                    )
+        env.load_state_dict(begin)
         for state, _ in zip(states, _play(env), strict=True):
             self._compare_states(state, env.get_state())
 
@@ -194,27 +192,45 @@ class _TaskCheck:
         for function in list_functions(
             robot, self._task, simulation, action=action, goals=goals
         ):
-            if function.name in self._problems:
+            name = function.name
+            if name in self._problems:
                 continue
-            result = self._attempt(function.name, function.check)
-            if result is None:
-                continue
-            value, problems = result
-            if not problems and function.is_hook:
-                problems = self._find_changed_entries(function.name, value)
-            if not problems and has_started:  # before, the state is all zero
+            value, problems = self._attempt(name, function.check) or (None, [])
+            if not problems and function.is_hook and value is not None:
+                problems = self._find_changed_entries(name, value)
+            # Before the first reset, the state is all zero.
+            if not problems and has_started and value is not None:
                 problems = _find_wrong_numbers(function, value)
-            self._add(function.name, problems)
-            if not problems:
-                values[function.name] = value
-        parts = [
-            values.get(f"{type(robot).__name__}.observation"),
-            values.get(f"{self._name}.observation"),
-            values.get(f"{self._name}.achieved_goal"),
-        ]
+            self._set(name, *problems)
+            if name not in self._problems:
+                values[name] = value
+        if has_started and self._goal_indices is not None:
+            self._check_goal_entries(values, list(self._goal_indices))
+
+    def _check_goal_entries(self, values: dict[str, Any], indices: list[int]) -> None:
+        """Compare the achieved goal with the columns of the observation that hold it.
+
+        Args:
+            values: What the functions returned, without those that have problems.
+            indices: The columns.
+        """
         name = f"{self._name}.goal_entries"
-        if has_started and self._goal_indices and name not in self._problems:
-            self._add(name, _find_other_goal(name, self._goal_indices, *parts))
+        observation = [
+            f"{type(self._robot).__name__}.observation",
+            f"{self._name}.observation",
+        ]
+        goal = f"{self._name}.achieved_goal"
+        if name in self._problems or not values.keys() >= {*observation, goal}:
+            return
+        numbers = torch.cat([values[part] for part in observation], dim=1)[:, indices]
+        achieved_goal = values[goal]
+        if not torch.allclose(numbers.float(), achieved_goal.float()):
+            self._set(
+                name,
+                f"the columns {indices} of the observation must be the achieved goal, "
+                f"as {name} says, but they differ: {numbers[0].tolist()} and "
+                f"{achieved_goal[0].tolist()}",
+            )
 
     def _read_goals(self, env: RobotTaskEnv) -> tuple[Tensor, Tensor]:
         """Achieved and desired goals, (n, goal_dim) float32, for functions of goals."""
@@ -244,7 +260,7 @@ class _TaskCheck:
             if name not in self._problems:
                 value, shape = output.get(key, None), (_NUM_ENVS, *entry.shape)
                 text = f"the sensor that declares {key!r}"
-                self._add(name, find_tensor_problems(text, value, shape, entry.dtype))
+                self._set(name, *find_tensor_problems(text, value, shape, entry.dtype))
 
     def _compare_states(self, state: TensorDictBase, repeated: TensorDictBase) -> None:
         """Compare the states of two episodes of one seed after the same actions."""
@@ -261,7 +277,7 @@ class _TaskCheck:
                 f"{self._name}.sample_start, sample_goal, sample_objects and "
                 f"sample_object_joints must draw from rng alone"
             )
-        self._add(name, [line])
+        self._set(name, line)
 
     def _check_goal_functions(self) -> None:
         """Check that the functions of goals are pure."""
@@ -281,12 +297,12 @@ class _TaskCheck:
         ):
             if name not in self._problems:
                 find = partial(_find_impurity, name, function, achieved, desired)
-                self._add(name, self._attempt(name, find) or [])
+                self._set(name, *self._attempt(name, find) or [])
 
-    def _add(self, name: str, problems: list[str]) -> None:
-        """Note the problems of a function."""
+    def _set(self, name: str, *problems: str) -> None:
+        """Note the problems of a function, if there are any."""
         if problems:
-            self._problems.setdefault(name, []).extend(problems)
+            self._problems[name] = list(problems)
 
     def _attempt(self, name: str, call: Callable[[], Any]) -> Any:  # noqa: ANN401
         """Return what a function returns, or note its error and return None."""
@@ -295,7 +311,7 @@ class _TaskCheck:
         except Exception as error:
             self.error = self.error or error
             message = " ".join(str(error).split())
-            self._add(name, [f"{name} raised {type(error).__name__}: {message}"])
+            self._set(name, f"{name} raised {type(error).__name__}: {message}")
             return None
 
 
@@ -335,31 +351,6 @@ def _find_wrong_numbers(function: Function, value: Any) -> list[str]:  # noqa: A
                 f"0 or a root of a negative number"
             )
     return problems
-
-
-def _find_other_goal(
-    name: str, goal_indices: tuple[int, ...], *parts: Tensor | None
-) -> list[str]:
-    """Compare the achieved goal with the columns of the observation that declare it.
-
-    Args:
-        name: Name of the declaration.
-        goal_indices: The columns.
-        *parts: The robot's and the task's part of the observation, and the achieved
-            goal; None if the function that returns it has a problem.
-    """
-    robot_part, task_part, achieved_goal = parts
-    if robot_part is None or task_part is None or achieved_goal is None:
-        return []
-    observation = torch.cat((robot_part, task_part), dim=1)
-    numbers = observation[:, list(goal_indices)].float()
-    if torch.allclose(numbers, achieved_goal.float()):
-        return []
-    return [
-        f"the columns {list(goal_indices)} of the observation must be the achieved "
-        f"goal, as {name} says, but they differ: {numbers[0].tolist()} and "
-        f"{achieved_goal[0].tolist()}"
-    ]
 
 
 def _find_impurity(

@@ -211,13 +211,7 @@ def load_policy(id_or_path: str | Path) -> Policy:
 
     Raises:
         ValueError: There is no such policy, or the file does not hold a policy.
-        TypeError: The argument is not a path or an id.
     """
-    if not isinstance(id_or_path, str | Path):
-        raise TypeError(
-            "load_policy takes the folder of a run, a .pt file, or an id, got "
-            f"{id_or_path!r}"
-        )
     shipped = shipped_policies()
     if isinstance(id_or_path, str) and id_or_path in shipped:
         path = shipped[id_or_path]
