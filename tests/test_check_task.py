@@ -225,6 +225,18 @@ def test_faults_of_all_functions_are_reported_at_once():
     ]
 
 
+class Blind(Panda):
+    observation_dim = 9
+
+
+def test_a_robot_is_checked_with_its_task():
+    task = make_task(failure=lambda s, sim: torch.zeros(2, 1))
+    assert find_problems(task, robot=Blind()) == [
+        "Blind.observation must return shape (2, 9), got (2, 7)",
+        "Own.failure must return bool, got torch.float32",
+    ]
+
+
 class Height(Sensor):
     """Observes what a function of the height of the hand returns."""
 

@@ -111,6 +111,8 @@ class Task(Configured, ABC):
     shipped tasks are fields of dataclasses, whose defaults are those of the ids that
     end in ``-v1``.
 
+    `torch_panda.testing.check_task` checks all of these methods.
+
     `randomize`, `reward`, `failure`, `extra_observation` and `info` are optional hooks.
     A hook that a task leaves out is never called, so it costs nothing.
 
