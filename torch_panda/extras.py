@@ -26,7 +26,9 @@ EXTRAS = {
         "train, evaluate, record, watch, plot",
         ("tyro", "tqdm", "matplotlib", "imageio", "imageio_ffmpeg", "PIL", "filelock"),
     ),
-    "viewer": Extra("env.open_viewer() and watch --web", ("viser", "trimesh")),
+    "viewer": Extra(
+        "env.open_viewer() and watch --web", ("yourdfpy", "viser", "trimesh")
+    ),
     "minari": Extra("data sets in Minari's format", ("minari", "h5py"), (3, 11)),
     "lerobot": Extra("data sets in LeRobot's format", ("lerobot",), (3, 12)),
     "tensorboard": Extra("train --logger tensorboard", ("tensorboard",)),

@@ -14,7 +14,7 @@ from torch_panda.learning.policy_files import save_policy
 
 @pytest.mark.slow
 def test_every_step_is_shown_on_the_page(monkeypatch):
-    pytest.importorskip("viser", reason="needs the extra viewer")
+    pytest.importorskip("yourdfpy", reason="needs the extra viewer")
     from torch_panda.rendering.web_viewer import WebViewer
 
     monkeypatch.setattr(watch, "FPS", 1e6)

@@ -368,9 +368,9 @@ def test_reward_functions_pickle_without_the_simulator(env):
     assert success(*goals).all()
 
 
-def test_a_viewer_without_viser_is_refused(env, monkeypatch):
+def test_a_viewer_without_its_extra_is_refused(env, monkeypatch):
     monkeypatch.setattr(robot_task, "find_spec", lambda name: None)
-    message = r"^viewers need viser: pip install -e '.*\[viewer\]'$"
+    message = r"^viewers need viser and yourdfpy: pip install -e '.*\[viewer\]'$"
     with pytest.raises(ImportError, match=message):
         env.open_viewer()
 

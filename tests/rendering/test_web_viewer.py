@@ -12,14 +12,16 @@ import torch
 
 import torch_panda
 
-pytest.importorskip("viser", reason="needs the extra viewer")
+pytest.importorskip("yourdfpy", reason="needs the extra viewer")
 
+from viser.transforms import SO3
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from torch_panda.bullet import Box, PhysicsClient
 from torch_panda.rendering import Camera, web_bodies, web_viewer
 from torch_panda.rendering.visual_client import VisualClient
+from torch_panda.tasks import Bodies
 from torch_panda.tasks.flip import VISUAL
 
 
@@ -35,7 +37,7 @@ def world_pose(nodes, name):
     while name:
         node = nodes[name]
         local = np.eye(4)
-        local[:3, :3] = web_bodies.SO3(np.asarray(node.wxyz)).as_matrix()
+        local[:3, :3] = SO3(np.asarray(node.wxyz)).as_matrix()
         local[:3, 3] = node.position
         pose, name = local @ pose, name.rpartition("/")[0]
     return pose
@@ -65,6 +67,13 @@ def test_the_page_shows_the_state(env):
         np.testing.assert_allclose(
             world_pose(nodes, ee)[:3, 3], simulation.ee_position[0], atol=1e-6
         )
+        # The URDF couples the fingers, but Bullet and the page do not.
+        for finger, shift in (("left", 1), ("right", -1)):
+            node = next(
+                x for name, x in nodes.items() if name.endswith(f"_{finger}finger")
+            )
+            joint = simulation.joint_position[0, 7 if finger == "left" else 8]
+            assert node.position[1] == pytest.approx(shift * joint.item())
         for bodies, poses in (
             (scene.objects, simulation.object_pose),
             (scene.markers, simulation.marker_pose),
@@ -180,6 +189,56 @@ def test_the_page_has_the_objects_and_markers_of_a_task(task):
             for body in (*scene.objects, *scene.markers):
                 assert f"/body{body}" in nodes
         viewer.close()
+
+
+class Neighbours(torch_panda.Task):
+    """Two arms beside the robot; building bent the second one."""
+
+    goal_dim, observation_dim = 3, 0
+
+    def build(self, client):
+        self.arms = [
+            client.load_urdf("kuka_iiwa/model.urdf", position=(0, y, 0.1))
+            for y in (-0.5, 0.5)
+        ]
+        client.set_joints(self.arms[1], (1, 3), (0.4, -0.7), (0.0, 0.0))
+        return Bodies()
+
+    def sample_goal(self, rng):
+        return (0.0, 0.0, 0.0)
+
+    def achieved_goal(self, simulation):
+        return simulation.ee_position
+
+
+def test_bodies_that_nothing_moves_are_shown_as_they_were_built():
+    task = Neighbours()
+    with torch_panda.RobotTaskEnv(robot=torch_panda.Panda(), task=task) as env:
+        client = env.episodes.simulation.clients[0]
+        centres = [client.state(arm).link_pose(6)[:3].copy() for arm in task.arms]
+        with env.open_viewer(port=8765) as viewer:
+            nodes = nodes_of(viewer)
+            for arm, centre in zip(task.arms, centres, strict=True):
+                tip = next(
+                    name
+                    for name in nodes
+                    if name.startswith(f"/body{arm}/") and name.endswith("_link_7")
+                )
+                shown = world_pose(nodes, tip) @ (*client.centre_of_mass(arm, 6), 1)
+                np.testing.assert_allclose(shown[:3], centre, atol=1e-6)
+
+
+def test_an_open_drawer_is_open_on_the_page():
+    with torch_panda.make("PandaDrawer-v1", seed=0) as env:
+        env.reset()
+        state = env.get_state()
+        state["object_joint_position"].fill_(0.08)
+        env.reset(state, set_state=True)
+        with env.open_viewer(port=8765) as viewer:
+            viewer.update()
+            nodes = nodes_of(viewer)
+            drawer = next(x for name, x in nodes.items() if name.endswith("/drawer"))
+            assert np.abs(drawer.position).max() == pytest.approx(0.08)
 
 
 def test_wrong_calls_of_a_viewer_raise_clear_errors(env):

@@ -540,11 +540,13 @@ class RobotTaskEnv(EnvBase):
                 name are refused, and so are requests that a page of another site sends.
 
         Raises:
-            ImportError: viser is not installed.
+            ImportError: viser or yourdfpy is not installed.
             BulletError: The environment is closed.
         """
-        if find_spec("viser") is None:
-            raise ImportError(f"viewers need viser: {install_command('viewer')}")
+        if find_spec("yourdfpy") is None:
+            raise ImportError(
+                f"viewers need viser and yourdfpy: {install_command('viewer')}"
+            )
         from torch_panda.rendering.web_viewer import WebViewer
 
         episodes = self.episodes

@@ -1,6 +1,8 @@
 """The bodies of a scene in viser's scene tree; needs the extra ``viewer``."""
 
+import io
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,21 +10,18 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 import viser
+import yourdfpy
 from PIL import Image
-from viser.transforms import SO3
+from viser.extras import ViserUrdf
 
 from torch_panda.bullet import Box, Cylinder, PhysicsClient, Scene, Sphere
-from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase
+from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase, SetJoints
 from torch_panda.bullet.shapes import LIGHT_GREY
-from torch_panda.rendering.mesh_decimation import decimated_urdf
+from torch_panda.bullet.urdf import find_mesh, parse_urdf
 
-MESH_CELL = 0.003  # edge length of the cells in which vertices are merged [m]
 YELLOW = (255, 190, 0)
 
 Floats = npt.NDArray[np.float64]
-# A movable joint: node of the link that it moves, origin and rotation in the parent's
-# frame, axis, and whether it is prismatic (otherwise revolute).
-Joint = tuple[Any, Floats, SO3, Floats, bool]
 
 
 class WebBodies:
@@ -39,19 +38,20 @@ class WebBodies:
     ) -> None:
         self._tree = server.scene
         self._tree.set_up_direction("+z")
-        self._joints: list[Joint] = []
         self._nodes: dict[int, Any] = {}
+        # The URDF of a body, and the names of its joints in Bullet's order.
+        self._urdfs: dict[int, tuple[ViserUrdf, list[str]]] = {}
         for command in client.blueprint:
             match command:
-                case LoadURDF(body):
+                case LoadURDF(body, file):
                     name = f"/body{body}"
-                    node = self._tree.add_frame(name, show_axes=False)
-                    _place(node, np.array((*command.position, *command.orientation)))
-                    self._nodes[body] = node
-                    movable = [x.name for x in client.joints(body) if x.is_movable]
-                    handles = self._add_urdf(name, command.file, movable)
-                    if body == scene.robot:
-                        self._joints = [handles[joint] for joint in movable]
+                    self._nodes[body] = self._tree.add_frame(name, show_axes=False)
+                    pose = np.array((*command.position, *command.orientation))
+                    _place(self._nodes[body], pose)
+                    urdf = ViserUrdf(server, _read_urdf(file), root_node_name=name)
+                    names = [joint.name for joint in client.joints(body)]
+                    self._urdfs[body] = urdf, names
+                    self._set_joints(body, (), ())  # places the links
                 case CreateBody(body):
                     node = self._add_shape(f"/body{body}", command)
                     if node is not None:
@@ -59,6 +59,12 @@ class WebBodies:
                         self._nodes[body] = node
                 case SetBase(body, position, orientation) if body in self._nodes:
                     _place(self._nodes[body], np.array((*position, *orientation)))
+                case SetJoints(body, joints, positions):
+                    self._set_joints(body, joints, positions)
+        self._joints = [
+            (scene.robot, scene.joints),
+            *zip(scene.objects, scene.object_joints, strict=True),
+        ]
         self._objects = [self._nodes.get(body) for body in scene.objects]
         self._markers = [self._nodes.get(body) for body in scene.markers]
 
@@ -72,19 +78,19 @@ class WebBodies:
         """Show the bodies of one environment, and arrows for contact forces.
 
         Args:
-            joint_position: Positions of the robot's joints (n_joints,) [rad] or [m].
+            joint_position: Positions of the robot's joints, then of the objects' joints
+                (n_joints,) [rad] or [m].
             object_pose: Poses of the objects (n_objects, 7): position [m], quaternion
                 xyzw.
             marker_pose: Poses of the markers (n_markers, 7).
             arrows: Starts and ends of arrows (n, 2, 3), world frame [m].
         """
-        for (node, origin, rotation, axis, is_prismatic), q in zip(
-            self._joints, joint_position, strict=True
-        ):
-            if is_prismatic:
-                node.position = origin + rotation @ (axis * q)
-            else:
-                node.wxyz = (rotation @ SO3.exp(axis * q)).wxyz
+        first = 0
+        for body, joints in self._joints:
+            last = first + len(joints)
+            if joints:
+                self._set_joints(body, joints, joint_position[first:last].tolist())
+            first = last
         for nodes, poses in (
             (self._objects, object_pose),
             (self._markers, marker_pose),
@@ -102,70 +108,12 @@ class WebBodies:
             visible=len(arrows) > 0,
         )
 
-    # ---- building ----------------------------------------------------------------
-
-    def _add_urdf(self, root: str, file: str, movable: list[str]) -> dict[str, Joint]:
-        """Add a node for each link of a body, as a child of its parent link's node.
-
-        The browser then computes the poses of the links from those of the joints.
-        ``root`` is the name of the body's node. The result holds the movable joints, by
-        name.
-        """
-        source = decimated_urdf(file, MESH_CELL)
-        tree = ElementTree.parse(source)
-        colors = {
-            material.get("name"): _numbers(color.get("rgba"), (1, 1, 1, 1))
-            for material in tree.iter("material")
-            if (color := material.find("color")) is not None
-        }
-        joints = {x.find("child").get("link"): x for x in tree.findall("joint")}  # type: ignore[union-attr]
-        names: dict[str, str] = {}
-        handles: dict[str, Joint] = {}
-
-        def node_path(link: str) -> str:
-            """Name of a link's node. Adds the node if it does not exist."""
-            if link in names:
-                return names[link]
-            joint = joints.get(link)
-            if joint is None:
-                names[link] = root
-                return root
-            parent = joint.find("parent").get("link")  # type: ignore[union-attr]
-            names[link] = f"{node_path(parent)}/{link}"  # type: ignore[arg-type]
-            origin, rotation = _origin(joint)
-            node = self._tree.add_frame(
-                names[link], show_axes=False, position=origin, wxyz=rotation.wxyz
-            )
-            axis = joint.find("axis")
-            direction = _numbers(None if axis is None else axis.get("xyz"), (1, 0, 0))
-            if joint.get("name") in movable:
-                is_prismatic = joint.get("type") == "prismatic"
-                handles[str(joint.get("name"))] = (
-                    node, origin, rotation, direction, is_prismatic,
-                )  # fmt: skip
-            return names[link]
-
-        for link in tree.findall("link"):
-            parent = node_path(str(link.get("name")))
-            for k, visual in enumerate(link.findall("visual")):
-                material = visual.find("material")
-                name = None if material is None else material.get("name")
-                mesh = _read_mesh(visual, source)
-                if mesh is not None:
-                    node_name = f"{parent}/visual{k}"
-                    origin, rotation = _origin(visual)
-                    pose = {"position": origin, "wxyz": rotation.wxyz}
-                    if _has_texture(mesh):
-                        self._tree.add_mesh_trimesh(node_name, mesh, **pose)
-                    else:
-                        self._tree.add_mesh_simple(
-                            node_name,
-                            mesh.vertices,
-                            mesh.faces,
-                            color=colors.get(name, np.ones(4))[:3],
-                            **pose,
-                        )
-        return handles
+    def _set_joints(
+        self, body: int, joints: Sequence[int], positions: Sequence[float]
+    ) -> None:
+        urdf, names = self._urdfs[body]
+        moved = [names[joint] for joint in joints]
+        urdf.update_cfg(dict(zip(moved, positions, strict=True)))
 
     def _add_shape(self, name: str, body: CreateBody) -> Any:  # noqa: ANN401 (viser's)
         """Add a body. Return its node, or None for an invisible marker."""
@@ -209,45 +157,16 @@ def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _read_mesh(visual: ElementTree.Element, urdf: Path) -> trimesh.Trimesh | None:
-    """The mesh of a visual of a URDF; None for an unknown geometry."""
-    if (geometry := visual.find("geometry/*")) is None:
-        return None
-    match geometry.tag:
-        case "mesh":
-            mesh = trimesh.load(
-                urdf.parent / str(geometry.get("filename")), force="mesh"
-            )
-            return mesh.apply_scale(_numbers(geometry.get("scale"), (1, 1, 1)))
-        case "box":
-            return trimesh.creation.box(_numbers(geometry.get("size"), (1, 1, 1)))
-        case "sphere":
-            return trimesh.creation.icosphere(radius=float(geometry.get("radius", 1)))
-        case "cylinder":
-            radius, length = (float(geometry.get(x, 1)) for x in ("radius", "length"))
-            return trimesh.creation.cylinder(radius, length)
-    return None
-
-
-def _has_texture(mesh: trimesh.Trimesh) -> bool:
-    """Whether a mesh has a texture of its own."""
-    if mesh.visual.kind != "texture":
-        return False
-    # A mesh without a texture has a placeholder of 2 x 2 pixels.
-    image = mesh.visual.material.image
-    return image is not None and image.width > 2
-
-
-def _origin(element: ElementTree.Element) -> tuple[Floats, SO3]:
-    """Position [m] and rotation of a joint or a visual in its link's frame."""
-    origin = element.find("origin")
-    attributes = {} if origin is None else origin.attrib
-    position = _numbers(attributes.get("xyz"), (0, 0, 0))
-    return position, SO3.from_rpy_radians(*_numbers(attributes.get("rpy"), (0, 0, 0)))
-
-
-def _numbers(text: str | None, default: tuple[float, ...]) -> Floats:
-    return np.array(default if text is None else text.split(), dtype=float)
+def _read_urdf(file: str) -> yourdfpy.URDF:
+    """Read a URDF and its meshes as Bullet does."""
+    xml = io.BytesIO(ElementTree.tostring(parse_urdf(file)))
+    urdf = yourdfpy.URDF.load(
+        xml, filename_handler=lambda fname: str(find_mesh(fname, Path(file)))
+    )
+    # In Bullet, a joint that mimics another one has a position of its own.
+    for joint in urdf.robot.joints:
+        joint.mimic = None
+    return urdf
 
 
 def _place(node: Any, pose: Floats) -> None:  # noqa: ANN401 (viser's handles)

@@ -32,7 +32,7 @@ class Frame(NamedTuple):
     """State of an environment at one step, which the page shows (`WebBodies.show`).
 
     Attributes:
-        joint_position: Positions of the robot's joints.
+        joint_position: Positions of the robot's joints, then of the objects' joints.
         object_pose: Poses of the objects.
         marker_pose: Poses of the markers.
         forces: Contact points [m] and forces [N] (n, 2, 3); see `read_forces`.
@@ -145,7 +145,12 @@ class WebViewer:
                     self._episodes[env].clear()
                 self._episodes[env].append(
                     Frame(
-                        simulation.joint_position[env].numpy().copy(),
+                        np.concatenate(
+                            (
+                                simulation.joint_position[env],
+                                simulation.object_joint_position[env],
+                            )
+                        ),
                         simulation.object_pose[env].numpy().copy(),
                         simulation.marker_pose[env].numpy().copy(),
                         forces[env],
