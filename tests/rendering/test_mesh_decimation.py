@@ -9,7 +9,7 @@ from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import find_urdf, parse_urdf
 from torch_panda.rendering import Camera
 from torch_panda.rendering.mesh_decimation import decimated_urdf
-from torch_panda.rendering.vector_renderer import mesh_cell
+from torch_panda.rendering.renderer import mesh_cell
 from torch_panda.rendering.visual_client import VisualClient
 
 
@@ -21,7 +21,7 @@ def test_the_arm_looks_the_same_from_afar():
             arm = physics.load_urdf("franka_panda/panda.urdf", fixed_base=True)
             physics.set_joints(arm, (1, 3, 5), (0.41, -1.85, 2.26), (0.0,) * 3)
         with VisualClient(physics.blueprint, mesh_cell=cell) as client:
-            image = client.draw(camera, segmentation=True)
+            image = client.render(camera, segmentation=True)
             images.append((image.rgb.astype(int), image.segmentation == arm))
     (fine, is_arm), (coarse, is_coarse_arm) = images
     assert is_arm.sum() > 200
@@ -53,12 +53,12 @@ def test_coarse_files_are_small_and_written_once():
     assert 1000 < len(faces) < 12_000
 
 
-def test_another_robot_is_drawn_with_coarse_meshes():
+def test_another_robot_is_rendered_with_coarse_meshes():
     camera = Camera(target=(0, 0, 0.5), width=32, height=32)
     with PhysicsClient() as physics:
         arm = physics.load_urdf("kuka_iiwa/model.urdf", fixed_base=True)
     with VisualClient(physics.blueprint, mesh_cell=0.02) as client:
-        assert (client.draw(camera, segmentation=True).segmentation == arm).sum() > 50
+        assert (client.render(camera, segmentation=True).segmentation == arm).sum() > 50
 
 
 TRIANGLE = """# Caf\u00e9

@@ -97,7 +97,7 @@ def test_a_marker_below_the_table_is_hidden():
     assert (pictures[0] == pictures[1]).all()
 
 
-def test_an_open_drawer_is_drawn_open():
+def test_an_open_drawer_is_rendered_open():
     pictures, camera = [], Camera(distance=0.5, pitch=-60, width=60, height=40)
     with torch_panda.make("PandaDrawer-v1", seed=0) as env:
         env.reset()
@@ -166,7 +166,7 @@ class Housing(torch_panda.Sensor):
     after_step = after_reset
 
 
-def test_bodies_of_a_sensor_are_drawn():
+def test_bodies_of_a_sensor_are_rendered():
     pictures = []
     for sensors in ((), (Housing(),)):
         with torch_panda.make("PandaReach-v1", seed=0, sensors=sensors) as env:
@@ -199,7 +199,7 @@ def test_a_red_cube_is_below_a_green_one_in_stack():
             assert color[channel] > 4 * color[channel - 1]
 
 
-def test_render_draws_the_chosen_environments():
+def test_render_shows_the_chosen_environments():
     with torch_panda.make("PandaPush-v1", num_envs=5, num_threads=2, seed=0) as env:
         with pytest.raises(ValueError, match="environment 0 was not reset: call reset"):
             env.render()
@@ -236,7 +236,7 @@ def test_pictures_do_not_depend_on_threads():
     assert (pictures[0] == pictures[1]).all()
 
 
-def test_drawing_does_not_change_the_simulation():
+def test_rendering_does_not_change_the_simulation():
     rollouts = []
     for look in (False, True):
         with torch_panda.make("PandaPickAndPlace-v1", num_envs=2, seed=0) as env:

@@ -62,7 +62,7 @@ def test_pictures_equal_those_of_pybullet(shadow):
     )
     pybullet.disconnect(reference)
     with visual_client(build) as client:
-        image = client.draw(CAMERA, segmentation=True, shadow=shadow)
+        image = client.render(CAMERA, segmentation=True, shadow=shadow)
         assert image.rgb.shape == (61, 93, 3)
         np.testing.assert_array_equal(image.rgb, np.reshape(rgba, (61, 93, 4))[..., :3])
         np.testing.assert_array_equal(image.depth, np.reshape(depth, (61, 93)))
@@ -71,15 +71,15 @@ def test_pictures_equal_those_of_pybullet(shadow):
         assert set(np.unique(ids)) == {-1, 0, 1, 2}
 
 
-def test_every_layer_draws_its_own_bodies_under_the_same_ids():
+def test_every_layer_shows_its_own_bodies_under_the_same_ids():
     seen = {"solids": {-1, 0, 1, 2}, "markers": {-1, 3}, "all": {-1, 0, 1, 2, 3}}
     for layer, expected in seen.items():
         with visual_client(build, layer) as client:
-            image = client.draw(CAMERA, segmentation=True)
+            image = client.render(CAMERA, segmentation=True)
             assert set(np.unique(image.segmentation)) == expected
 
 
-def test_bodies_that_were_moved_while_building_are_drawn_there():
+def test_bodies_that_were_moved_while_building_are_rendered_there():
     def build_and_move(client):
         arm = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
         box = client.create_box((0.1,) * 3, mass=1, position=(0, 0, 9))
@@ -97,7 +97,7 @@ def test_bodies_that_were_moved_while_building_are_drawn_there():
     pictures = []
     for function in (build_and_move, reference):
         with visual_client(function) as client:
-            image = client.draw(CAMERA, segmentation=True)
+            image = client.render(CAMERA, segmentation=True)
             pictures.append([array.copy() for array in image])
     for ours, theirs in zip(*pictures, strict=True):
         np.testing.assert_array_equal(ours, theirs)
@@ -113,7 +113,7 @@ def test_depth_is_converted_to_metres():
         client.create_box((0.3, 0.3, 0.25), mass=0, position=(0, 0, 0))
 
     with visual_client(build_box) as client:
-        depth = to_metres(client.draw(camera).depth, camera)
+        depth = to_metres(client.render(camera).depth, camera)
     assert depth[16, 16] == pytest.approx(1.75, abs=1e-4)
     assert depth[0, 0] == camera.far
 
@@ -131,7 +131,7 @@ def test_the_six_faces_of_a_texture_differ():
             camera = Camera(
                 distance=0.2, yaw=yaw, pitch=pitch, fov=11, width=48, height=48
             )
-            square = client.draw(camera, shadow=False).rgb
+            square = client.render(camera, shadow=False).rgb
             # Compare hues, because shading changes the brightness.
             color = square.reshape(-1, 3).mean(axis=0)
             colors.append(color / np.linalg.norm(color))

@@ -156,7 +156,7 @@ def test_a_textured_box_has_the_colours_of_a_picture():
             camera = Camera(
                 distance=0.2, yaw=yaw, pitch=pitch, fov=11, width=9, height=9
             )
-            drawn = client.draw(camera, shadow=False).rgb[4, 4].astype(float)
+            drawn = client.render(camera, shadow=False).rgb[4, 4].astype(float)
             shown = colors[mesh.faces[face, 0]]
             # Compare hues, because shading changes the brightness.
             hues = [color / np.linalg.norm(color) for color in (drawn, shown)]

@@ -27,7 +27,7 @@ def test_the_window_shows_the_chosen_environment(env, monkeypatch):
     with env.open_window() as opened:
         for index in (0, 1, 1):
             opened.show(index)
-            pictures.append(opened._client.draw(camera).rgb.copy())
+            pictures.append(opened._client.render(camera).rgb.copy())
     assert (pictures[0] != pictures[1]).any()
     np.testing.assert_array_equal(pictures[1], pictures[2])
     with pytest.raises(BulletError, match="closed"):

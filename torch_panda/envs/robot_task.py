@@ -458,7 +458,7 @@ class RobotTaskEnv(EnvBase):
         the objects, such as ``object`` in Push, and ``object1`` and ``object2`` in
         Stack. A task can give a body another name with `Visual.name`.
         """
-        from torch_panda.rendering.env_renderer import segmentation_ids
+        from torch_panda.rendering.renderer import segmentation_ids
 
         return segmentation_ids(self.episodes.simulation)
 
@@ -469,7 +469,7 @@ class RobotTaskEnv(EnvBase):
         camera: Camera | None = None,
         size: int | tuple[int, int] | None = None,
     ) -> Tensor:
-        """Draw the environments as they are now.
+        """Render the environments as they are now.
 
         Args:
             envs: Index or indices of the environments; None means all.
@@ -494,7 +494,7 @@ class RobotTaskEnv(EnvBase):
         with episodes.exclusive():
             for env in chosen:
                 episodes.check_index(env)
-            pixels = episodes.renderer.picture(chosen, camera).to(self.device)
+            pixels = episodes.renderer.render(chosen, camera).to(self.device)
         return pixels[0] if is_single else pixels
 
     def open_window(self, camera: Camera | None = None) -> "Window":

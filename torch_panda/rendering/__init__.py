@@ -2,7 +2,7 @@
 
 from torch_panda.rendering.camera import Camera, HandCamera
 from torch_panda.rendering.egl import RendererName, check_renderer
-from torch_panda.rendering.vector_renderer import VectorRenderer
+from torch_panda.rendering.renderer import VectorRenderer
 
 __all__ = [
     "Camera",

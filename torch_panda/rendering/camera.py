@@ -34,8 +34,8 @@ class Camera:
         height: Height of the image [pixels].
         near: Distance below which nothing is visible [m], along the line of sight.
         far: Distance above which nothing is visible [m], along the line of sight.
-        shadows: Whether bodies cast shadows. Bullet's software renderer draws the scene
-            twice for them, so a picture without shadows takes half the time.
+        shadows: Whether bodies cast shadows. Bullet's software renderer renders the
+            scene twice for them, so a picture without shadows takes half the time.
 
     Raises:
         ValueError: A size, a distance or an angle is out of range.
@@ -113,15 +113,15 @@ class HandCamera(Camera):
         object.__setattr__(self, "distance", float(np.linalg.norm(sight)))
         super().__post_init__()
 
-    def placed(
-        self, hand: Sequence[float]
+    def in_world(
+        self, ee_pose: Sequence[float]
     ) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         """Eye, target and up in the world frame.
 
         Args:
-            hand: Pose of the end-effector (7,): position [m] and quaternion xyzw.
+            ee_pose: Pose of the end-effector (7,): position [m] and quaternion xyzw.
         """
-        position, rotation = hand[:3], hand[3:]
+        position, rotation = ee_pose[:3], ee_pose[3:]
         eye, target = (
             [
                 x + dx

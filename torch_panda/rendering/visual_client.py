@@ -1,4 +1,4 @@
-"""A client of Bullet that holds the visual shapes of a scene and draws them."""
+"""A client of Bullet that holds the visual shapes of a scene and renders them."""
 
 from collections.abc import Sequence
 from ctypes import byref, c_float, c_int
@@ -44,23 +44,23 @@ class Image(NamedTuple):
 
 
 class VisualClient:
-    """A client that holds the visual shapes of a scene and draws them.
+    """A client that holds the visual shapes of a scene and renders them.
 
     It has no physics and takes no steps: `pose` moves the bodies.
 
-    Bullet's software renderer has no translucency. Two clients therefore draw the
+    Bullet's software renderer has no translucency. Two clients therefore render the
     scene in two layers, one with the opaque bodies and one with the translucent
     markers, and the caller blends the two pictures. In every layer, bodies have the
     same ids as in the physics clients.
 
     Args:
         blueprint: Commands that built the scene in a physics client.
-        layer: Bodies to draw: "solids", "markers", or "all". "all" needs "egl" or a
+        layer: Bodies to render: "solids", "markers", or "all". "all" needs "egl" or a
             window, because markers are translucent.
         renderer: "tiny", Bullet's software renderer, or "egl", its OpenGL renderer. One
             thread must make, use and close a client of "egl".
         mesh_cell: Edge length of the cubes in which the vertices of a mesh are merged
-            [m]; see `decimated_urdf`. 0 draws all details.
+            [m]; see `decimated_urdf`. 0 renders all details.
         connection: Connection to a client with a window; None makes one without.
     """
 
@@ -122,27 +122,27 @@ class VisualClient:
         at_rest = (0.0,) * len(joints)
         building.set_joints(self._connection, body, joints, positions, at_rest)
 
-    def draw(
+    def render(
         self,
         camera: Camera,
-        hand: Sequence[float] = (),
+        ee_pose: Sequence[float] = (),
         *,
         segmentation: bool = False,
         shadow: bool = True,
     ) -> Image:
-        """Draw what a camera sees.
+        """Render what a camera sees.
 
         Args:
             camera: The camera.
-            hand: Pose of the end-effector (7,), which only a `HandCamera` needs; see
-                `HandCamera.placed`.
+            ee_pose: Pose of the end-effector (7,), which only a `HandCamera` needs; see
+                `HandCamera.in_world`.
             segmentation: Whether the image has a segmentation.
             shadow: Whether bodies cast shadows.
         """
         view, projection = (c_float * 16)(), (c_float * 16)()
         if isinstance(camera, HandCamera):
             capi.view_matrix_from_positions(
-                *((c_float * 3)(*point) for point in camera.placed(hand)), view
+                *((c_float * 3)(*point) for point in camera.in_world(ee_pose)), view
             )
         else:
             capi.view_matrix(
@@ -163,7 +163,7 @@ class VisualClient:
             capi.camera_set_shadow(command, int(shadow))
             flags = 0 if segmentation else capi.ER_NO_SEGMENTATION_MASK
             capi.camera_set_flags(command, flags)
-            self._connection.submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "draw")
+            self._connection.submit(command, capi.CMD_CAMERA_IMAGE_COMPLETED, "render")
         self._num_to_discard = 0
         data = capi.CameraImage()
         capi.camera_result(self._connection.handle, byref(data))
@@ -205,7 +205,7 @@ class VisualClient:
                     self._set_joints(body, joints, positions)
 
     def _build_body(self, command: LoadURDF | CreateBody) -> None:
-        """Build a body: with visual shapes if this layer draws it, else without."""
+        """Build a body: with visual shapes if this layer shows it, else without."""
         is_marker = isinstance(command, CreateBody) and command.is_marker
         if self._layer != "all" and is_marker != (self._layer == "markers"):
             building.create_body(self._connection, command.position)

@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class WebBodies:
-    """The bodies of a scene, drawn by a viser server.
+    """The bodies of a scene, in the scene tree of a viser server.
 
     Args:
         server: The server.

@@ -99,7 +99,7 @@ class WebViewer:
         self._chosen.on_update(self._choose)
         self._step.on_update(self._go_to)
         self._pause.on_update(self._set_paused)
-        self._contacts.on_update(lambda _: self._draw())
+        self._contacts.on_update(lambda _: self._show())
 
     @property
     def url(self) -> str:
@@ -154,7 +154,7 @@ class WebViewer:
             self._step.max = max(self._step.max, longest)
             if not self.paused:
                 self._step.value = len(self._episodes[self._env]) - 1
-                self._draw()
+                self._show()
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait while the page is paused, at most ``timeout`` [s]."""
@@ -182,12 +182,12 @@ class WebViewer:
             self._env = _clamped(self._chosen.value, len(self._episodes))
             if not self.paused:
                 self._step.value = max(len(self._episodes[self._env]) - 1, 0)
-            self._draw()
+            self._show()
 
     def _go_to(self, event: Any) -> None:  # noqa: ANN401 (viser's)
         if event.client is not None:  # a person moved the slider, not `update`
             self._pause.value = True
-            self._draw()
+            self._show()
 
     def _set_paused(self, event: Any) -> None:  # noqa: ANN401 (viser's)
         if self._pause.value:
@@ -195,7 +195,7 @@ class WebViewer:
         else:
             self._resumed.set()
 
-    def _draw(self) -> None:
+    def _show(self) -> None:
         """Show the chosen step of the chosen environment."""
         with self._lock:
             episode = self._episodes[self._env]

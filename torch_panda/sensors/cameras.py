@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation
 from torch_panda.rendering import Camera, VectorRenderer
-from torch_panda.rendering.frames import Frames
+from torch_panda.rendering.renderer import Frames
 from torch_panda.robots import Robot
 from torch_panda.sensors.base import Entry, Reading, Sensor
 
@@ -72,7 +72,7 @@ class _CameraReading:
         self.entries = {prefix + image: entry for image, entry in images.items()}
 
     def after_reset(self, envs: Sequence[int]) -> None:
-        self._renderer.draw(envs, self._camera, self._frames, envs)
+        self._renderer.render_into(self._frames, envs, envs, self._camera)
 
     after_step = after_reset
 
