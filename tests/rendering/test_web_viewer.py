@@ -227,6 +227,25 @@ def test_bodies_that_nothing_moves_are_shown_as_they_were_built():
                 np.testing.assert_allclose(shown[:3], centre, atol=1e-6)
 
 
+def test_parts_of_a_urdf_that_the_page_cannot_show_are_left_out(tmp_path):
+    capsule = '<geometry><capsule radius="0.1" length="0.2"/></geometry>'
+    ball = '<geometry><sphere radius="0.1"/></geometry>'
+    path = tmp_path / "limb.urdf"
+    path.write_text(
+        f"""<robot name="limb">
+        <link name="upper"><visual>{capsule}</visual><visual>{ball}</visual>
+        <collision>{capsule}</collision></link>
+        <link name="lower"><visual>{ball}</visual></link><link name="hand"/>
+        <joint name="elbow" type="spherical">
+        <parent link="upper"/><child link="lower"/></joint>
+        <joint name="wrist" type="continuous">
+        <parent link="lower"/><child link="hand"/></joint></robot>"""
+    )
+    urdf = web_bodies._read_urdf(str(path))
+    assert len(urdf.scene.geometry) == 2
+    assert urdf.actuated_joint_names == ["wrist"]
+
+
 def test_an_open_drawer_is_open_on_the_page():
     with torch_panda.make("PandaDrawer-v1", seed=0) as env:
         env.reset()

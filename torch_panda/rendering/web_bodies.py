@@ -20,6 +20,7 @@ from torch_panda.bullet.shapes import LIGHT_GREY
 from torch_panda.bullet.urdf import find_mesh, parse_urdf
 
 YELLOW = (255, 190, 0)
+SHAPES = ("box", "cylinder", "sphere", "mesh")  # that yourdfpy reads from URDFs
 
 Floats = npt.NDArray[np.float64]
 
@@ -158,15 +159,28 @@ def textured_box(box: Box, texture: Path) -> trimesh.Trimesh:
 
 
 def _read_urdf(file: str) -> yourdfpy.URDF:
-    """Read a URDF and its meshes as Bullet does."""
-    xml = io.BytesIO(ElementTree.tostring(parse_urdf(file)))
-    urdf = yourdfpy.URDF.load(
-        xml, filename_handler=lambda fname: str(find_mesh(fname, Path(file)))
+    """Read the visual shapes and the joints of a URDF.
+
+    Elements that are not shown go first, because yourdfpy refuses some that Bullet
+    accepts, such as capsules and spherical joints. ``mimic`` goes, too: in Bullet, each
+    joint has a position of its own.
+    """
+    robot = parse_urdf(file)
+    for link in robot.findall("link"):
+        for part in list(link):
+            geometry = part.find("geometry/*")
+            if part.tag != "visual" or geometry is None or geometry.tag not in SHAPES:
+                link.remove(part)
+    for joint in robot.findall("joint"):
+        if joint.get("type") not in ("revolute", "continuous", "prismatic"):
+            joint.set("type", "fixed")
+        for part in list(joint):
+            if part.tag not in ("parent", "child", "origin", "axis"):
+                joint.remove(part)
+    return yourdfpy.URDF.load(
+        io.BytesIO(ElementTree.tostring(robot)),
+        filename_handler=lambda fname: str(find_mesh(fname, Path(file))),
     )
-    # In Bullet, a joint that mimics another one has a position of its own.
-    for joint in urdf.robot.joints:
-        joint.mimic = None
-    return urdf
 
 
 def _place(node: Any, pose: Floats) -> None:  # noqa: ANN401 (viser's handles)
