@@ -70,7 +70,7 @@ def make_arm() -> torch_panda.Robot:
     return torch_panda.Robot(
         urdf="kuka_iiwa/model.urdf",
         neutral_joint_position=(0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),  # [rad]
-        joint_forces=(200.0,) * 7,  # [N m]
+        effort_limits=(200.0,) * 7,  # [N m]
         ee_link=6,
         ee_orientation=(0.0, 1.0, 0.0, 0.0),  # quaternion xyzw
     )

@@ -155,7 +155,7 @@ def test_the_position_of_a_tool_is_refused_by_name():
     robot = Robot(
         urdf="kuka_iiwa/model.urdf",
         neutral_joint_position=(0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
-        joint_forces=(200.0,) * 7,
+        effort_limits=(200.0,) * 7,
         ee_link=6,
         tool=tool,
     )

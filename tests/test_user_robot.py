@@ -42,7 +42,7 @@ def make_gantry(file, **options):
     return Robot(
         urdf=file,
         neutral_joint_position=(0.0,) * 6,
-        joint_forces=(500.0, 500.0, 500.0, 50.0, 100.0, 100.0),
+        effort_limits=(500.0, 500.0, 500.0, 50.0, 100.0, 100.0),
         ee_link=6,
         ee_orientation=(0.0, 0.0, 0.0, 1.0),
         base_position=(0.0, 0.0, 0.3),
@@ -135,7 +135,7 @@ def test_a_gripper_or_tool_that_does_not_fit_is_refused(file):
         Robot(
             urdf=file,
             neutral_joint_position=(0.0,) * 6,
-            joint_forces=(1.0,) * 6,
+            effort_limits=(1.0,) * 6,
             ee_link=3,
             num_arm_joints=4,
             gripper=Gripper(closed=(0.0,), opened=(0.04,), width=0.04),

@@ -33,7 +33,8 @@ class Configured:
     changeable: ClassVar[tuple[str, ...]] = ()
     """Arguments that may change in an environment, in addition to the base classes'."""
     _replaceable_methods: ClassVar[frozenset[str]] = frozenset()
-    # The fix for the error, by unknown name.
+    # The fixes for errors, by unknown name: of an argument, and of an assignment.
+    _argument_advice: ClassVar[Mapping[str, str]] = {}
     _assignment_advice: ClassVar[Mapping[str, str]] = {}
     _is_frozen = False
 
@@ -41,7 +42,8 @@ class Configured:
         """Refuse unknown arguments, and defaults that have no effect."""
         # A constructor with ``**options`` passes them on, so Python checks these.
         if not _has_options(inspect.signature(cls.__init__).parameters):
-            check_names(cls.__name__, arguments, argument_names(cls))
+            accepted = argument_names(cls)
+            check_names(cls.__name__, arguments, accepted, cls._argument_advice)
         _check_defaults(cls)
         return super().__new__(cls)
 

@@ -121,7 +121,7 @@ def test_an_assignment_to_a_task_without_effect_is_refused(env, name, message):
         ("fingers_width", "fingers_width cannot be replaced .* method"),
         ("control", "control cannot be replaced .* method"),
         ("urdf", "urdf cannot be changed in the Panda"),
-        ("joint_forces", "arguments that can change are action_scale"),
+        ("effort_limits", "arguments that can change are action_scale"),
         ("finger_friction", "finger_friction cannot be changed"),
         ("has_free_gripper", "has_free_gripper cannot be changed"),
         ("acton_scale", "no option 'acton_scale'; did you mean 'action_scale'"),

@@ -21,7 +21,7 @@ def make_kuka(**arguments):
         **{
             "urdf": "kuka_iiwa/model.urdf",
             "neutral_joint_position": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
-            "joint_forces": (200.0,) * 7,
+            "effort_limits": (200.0,) * 7,
             "ee_link": 6,
             "ee_orientation": (0.0, 1.0, 0.0, 0.0),
             **arguments,
@@ -35,7 +35,7 @@ def make_kuka_env(**arguments):
 
 def too_few_forces():
     robot = make_kuka()
-    robot.joint_forces = robot.joint_forces[:-1]
+    robot.effort_limits = robot.effort_limits[:-1]
     return make(Reach(), robot)
 
 
@@ -81,9 +81,9 @@ DEGREES = (0.0, 30.0, 0.0, -90.0, 0.0, 60.0, 0.0)
         ),
         (
             make_kuka,
-            {"joint_forces": (-200.0,) * 7},
+            {"effort_limits": (-200.0,) * 7},
             ValueError,
-            "joint_forces must be",
+            "effort_limits must be",
         ),
         (too_few_forces, {}, ValueError, "7 movable joints"),
         (

@@ -100,7 +100,7 @@ def test_torques_move_the_arm_as_in_pybullet():
         action = torch.tensor([0.3, -0.2, 0.1, 0.4, 0.0, -0.5, 0.2])
         simulation, _ = hold(env, action, steps=3)
         found = simulation.joint_position[0, :7].tolist()
-        torques = action * 0.1 * torch.tensor(env.robot.joint_forces[:7])
+        torques = action * 0.1 * torch.tensor(env.robot.effort_limits[:7])
         start = env.robot.neutral_joint_position
     reference = BulletClient(pybullet.DIRECT)
     reference.setAdditionalSearchPath(pybullet_data.getDataPath())
@@ -238,7 +238,9 @@ def test_a_gripper_changes_the_distance_between_its_fingers():
 
 
 def test_fingers_that_follow_match_the_joint_that_leads():
-    gripper = Gripper(closed=(0.8, 0.8), opened=(0.0, 0.0), width=0.1, followers=(1,))
+    gripper = Gripper(
+        closed=(0.8, 0.8), opened=(0.0, 0.0), width=0.1, mimic_joints=(1,)
+    )
     joints = torch.tensor([[0.4, 0.7]], dtype=torch.float64)  # the second one lags
     assert gripper.fingers_width(joints).item() == pytest.approx(0.05)
     setpoint = gripper.setpoint(torch.tensor([[0.1]]), joints)
@@ -261,6 +263,18 @@ def test_the_repr_of_a_robot_shows_its_arguments():
         "finger_friction=1.0, finger_spinning_friction=None)"
     )
     assert repr(Kuka()).startswith("Kuka(control_type='ee', ")
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: torch_panda.Robot(joint_forces=()), "effort_limits"),
+        (lambda: Gripper(followers=()), "mimic_joints"),
+    ],
+)
+def test_a_former_name_of_an_argument_is_refused_with_the_new_one(make, name):
+    with pytest.raises(TypeError, match=f"use {name}"):
+        make()
 
 
 @pytest.mark.parametrize("robot_class", [Panda, Kuka, XArm6, XArm6Gripper])

@@ -5,7 +5,7 @@ import contextlib
 import pytest
 
 from torch_panda.bullet.solver import activate
-from torch_panda.bullet.solver.gate import load_library
+from torch_panda.bullet.solver.compat import load_library
 from torch_panda.bullet.solver.native import FOLLOW, LEAVE, SOLVE
 
 needs_packed = pytest.mark.skipif(

@@ -13,7 +13,7 @@ from torch_panda.bullet.physics import (
     FAST,
     PhysicsName,
     PhysicsParams,
-    read_physics,
+    resolve_physics,
 )
 from torch_panda.bullet.pool import WorkerError, WorkerPool
 from torch_panda.bullet.scene import Scene
@@ -41,7 +41,7 @@ __all__ = [
     "Visual",
     "WorkerError",
     "WorkerPool",
-    "read_physics",
+    "resolve_physics",
 ]
 
 

@@ -97,7 +97,7 @@ FAST = PhysicsParams(
 _NAMED: dict[str, PhysicsParams] = {"exact": EXACT, "fast": FAST}
 
 
-def read_physics(physics: "PhysicsParams | PhysicsName") -> PhysicsParams:
+def resolve_physics(physics: "PhysicsParams | PhysicsName") -> PhysicsParams:
     """Look up a preset by its name; `PhysicsParams` are returned unchanged.
 
     Raises:

@@ -19,7 +19,7 @@ from torch_panda.bullet import (
     Scene,
     ThreadGuard,
     VectorSimulation,
-    read_physics,
+    resolve_physics,
 )
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.checks import (
@@ -49,7 +49,7 @@ from torch_panda.sensors import (
     Observer,
     Sensor,
     join_entries,
-    read_sensors,
+    resolve_sensors,
 )
 from torch_panda.tasks import Bodies, Task
 
@@ -137,7 +137,7 @@ class Episodes:
         self.max_episode_steps = max_episode_steps or task.max_episode_steps
         self.terminate_on_success = terminate_on_success
         self.on_divergence = on_divergence
-        self.physics = read_physics(physics)
+        self.physics = resolve_physics(physics)
         self._control = robot.controller
         # Optional hooks of the task are called only if it overrides them.
         self._has_reward = type(task).reward is not Task.reward
@@ -152,7 +152,7 @@ class Episodes:
         self._streams: list[tuple[int, int]] = []  # (seed, index) by environment
         self._episode_numbers = [0] * n  # of the next episodes
         self.set_seed(seed)
-        sensors = read_sensors(sensors, robot)
+        sensors = resolve_sensors(sensors, robot)
         # With a bound method, the simulation would refer back to this object, and the
         # cycle of references would keep a forgotten environment alive.
         build = partial(_build_scene, robot, task, sensors)
@@ -464,7 +464,7 @@ class Episodes:
         state = self._state()
         arrays = {key: value.numpy() for key, value in state.items()}
         for env in envs:
-            self._draw_start(env, {key: array[env] for key, array in arrays.items()})
+            self._sample_start(env, {key: array[env] for key, array in arrays.items()})
         for key, value in values.items():
             state[key][envs] = value
         if self.simulation.scene.markers:
@@ -479,7 +479,7 @@ class Episodes:
         for sensor in self._sensors:
             sensor.after_reset(envs)
 
-    def _draw_start(self, env: int, row: dict[str, Doubles]) -> None:
+    def _sample_start(self, env: int, row: dict[str, Doubles]) -> None:
         """Draw the start of an environment's next episode into its row of the state.
 
         The robot starts in its neutral pose. The task draws the goal, the objects and
@@ -517,7 +517,7 @@ class Episodes:
             # Another stream of the same episode, so that randomized physics do not
             # change the drawn goals and objects.
             seed = np.random.SeedSequence(episode, spawn_key=(1,))
-            self._randomizer.draw(env, seed)
+            self._randomizer.sample(env, seed)
 
     def _fill(self, row: Doubles, values: object, sampler: str) -> None:
         """Check the numbers that the task drew and write them into the state."""

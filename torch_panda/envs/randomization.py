@@ -204,7 +204,7 @@ class DomainRandomizer:
             (n, ...) by key.
         entries: Observed entries, by key.
         changes_physics: Whether `apply` changes anything.
-        is_active: Whether `draw` draws anything.
+        is_active: Whether `sample` draws anything.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class DomainRandomizer:
         self.changes_physics = bool(self.state)
         self.is_active = self.changes_physics or self._randomization.joint_position > 0
 
-    def draw(self, env: int, seed: np.random.SeedSequence) -> None:
+    def sample(self, env: int, seed: np.random.SeedSequence) -> None:
         """Draw the physics and the joint offsets of an environment's next episode.
 
         Args:

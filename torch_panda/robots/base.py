@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
@@ -66,7 +66,7 @@ class Robot(Configured):
         urdf: Path of the URDF, or its name among the files that pybullet ships.
         neutral_joint_position: Start position of each movable joint [rad] or [m], in
             Bullet's order (see `PhysicsClient.joints`).
-        joint_forces: Largest torque [N m] or force [N] of each movable joint's motor.
+        effort_limits: Largest torque [N m] or force [N] of each movable joint's motor.
         ee_link: Index of the link whose centre of mass is the end-effector.
         ee_orientation: Orientation that the end-effector keeps under the control type
             "ee", quaternion xyzw, world frame.
@@ -79,7 +79,7 @@ class Robot(Configured):
             each joint. "joint_velocity": velocity of each joint. "joint_torque": torque
             of each joint, without compensation of gravity.
         action_scale: Displacement [m] or [rad], velocity [rad/s], or share of
-            ``joint_forces`` that an action of 1 stands for. None means 0.05 m, 0.05
+            ``effort_limits`` that an action of 1 stands for. None means 0.05 m, 0.05
             rad, 1.25 rad/s, or the whole force.
         gripper: The gripper, which has the last joints; None means no gripper.
         block_gripper: Keep the fingers at their start positions.
@@ -101,13 +101,16 @@ class Robot(Configured):
     """
 
     changeable: ClassVar[tuple[str, ...]] = ("action_scale",)
+    _argument_advice: ClassVar[Mapping[str, str]] = {
+        "joint_forces": "use effort_limits"
+    }
 
     def __init__(
         self,
         *,
         urdf: str | Path,
         neutral_joint_position: Sequence[float],
-        joint_forces: Sequence[float],
+        effort_limits: Sequence[float],
         ee_link: int,
         ee_orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
         num_arm_joints: int | None = None,
@@ -123,39 +126,39 @@ class Robot(Configured):
         finger_links: Sequence[int] = (),
     ) -> None:
         check_choice("control_type", control_type, get_args(ControlType))
-        if len(neutral_joint_position) != len(joint_forces):
+        if len(neutral_joint_position) != len(effort_limits):
             raise ValueError(
-                f"neutral_joint_position and joint_forces must have the same length, "
-                f"got {len(neutral_joint_position)} and {len(joint_forces)} values"
+                f"neutral_joint_position and effort_limits must have the same length, "
+                f"got {len(neutral_joint_position)} and {len(effort_limits)} values"
             )
         for position in neutral_joint_position:
             check_finite(neutral_joint_position=position)
-        for force in joint_forces:
-            check_not_negative(joint_forces=force)
+        for force in effort_limits:
+            check_not_negative(effort_limits=force)
         check_quaternion("ee_orientation", ee_orientation)
         check_quaternion("base_orientation", base_orientation)
         if action_scale is None:
             action_scale = _ACTION_SCALES[control_type]
         self.urdf = urdf
         self.neutral_joint_position = tuple(map(float, neutral_joint_position))
-        self.joint_forces = tuple(map(float, joint_forces))
+        self.effort_limits = tuple(map(float, effort_limits))
         self.ee_link = operator.index(ee_link)
         x, y, z, w = ee_orientation
         self.ee_orientation = (float(x), float(y), float(z), float(w))
         num_fingers = 0 if gripper is None else gripper.num_joints
         if num_arm_joints is None:
-            num_arm_joints = len(joint_forces) - num_fingers
-        if not 1 <= num_arm_joints <= len(joint_forces):
+            num_arm_joints = len(effort_limits) - num_fingers
+        if not 1 <= num_arm_joints <= len(effort_limits):
             raise ValueError(
                 f"num_arm_joints must be from 1 to the number of joints, "
-                f"{len(joint_forces)}, got {num_arm_joints}"
+                f"{len(effort_limits)}, got {num_arm_joints}"
             )
         self.num_arm_joints = num_arm_joints
-        if gripper is not None and num_arm_joints + num_fingers != len(joint_forces):
+        if gripper is not None and num_arm_joints + num_fingers != len(effort_limits):
             raise ValueError(
                 f"a robot with this gripper must have {num_arm_joints} joints of the "
-                f"arm and {num_fingers} of the gripper, got {len(joint_forces)} "
-                f"joint_forces"
+                f"arm and {num_fingers} of the gripper, got {len(effort_limits)} "
+                f"effort_limits"
             )
         others = self.neutral_joint_position[num_arm_joints:]
         self._other_joints = torch.tensor(others, dtype=torch.float64, device="cpu")
@@ -208,8 +211,8 @@ class Robot(Configured):
         Raises:
             FileNotFoundError: The URDF does not exist.
             ValueError: The number of movable joints in the URDF is not that of
-                ``joint_forces``, a neutral position is outside the limits of its joint,
-                or the URDF has no link or joint with a given index.
+                ``effort_limits``, a neutral position is outside the limits of its
+                joint, or the URDF has no link or joint with a given index.
         """
         body = client.load_urdf(
             self.urdf,
@@ -220,11 +223,11 @@ class Robot(Configured):
         )
         joints = client.joints(body)
         movable = [joint for joint in joints if joint.is_movable]
-        if len(movable) != len(self.joint_forces):
+        if len(movable) != len(self.effort_limits):
             raise ValueError(
                 f"{self.urdf} has {len(movable)} movable joints "
-                f"{[joint.name for joint in movable]}, but joint_forces has "
-                f"{len(self.joint_forces)} values"
+                f"{[joint.name for joint in movable]}, but effort_limits has "
+                f"{len(self.effort_limits)} values"
             )
         for joint, position in zip(movable, self.neutral_joint_position, strict=True):
             low, high = joint.lower_limit, joint.upper_limit
@@ -288,7 +291,7 @@ class Robot(Configured):
             case "joint_velocity":
                 return scaled.double()
             case "joint_torque":
-                forces = simulation.joint_position.new_tensor(self.joint_forces)
+                forces = simulation.joint_position.new_tensor(self.effort_limits)
                 return scaled * forces[: self.num_arm_joints]
             case "joints":
                 return simulation.joint_position[:, : self.num_arm_joints] + scaled
@@ -323,7 +326,7 @@ class Robot(Configured):
 
         An environment reads it once, when it is made.
         """
-        arm, forces = self.num_arm_joints, self.joint_forces
+        arm, forces = self.num_arm_joints, self.effort_limits
         if self.control_type == "ee":
             return MotorControl(forces, self.ee_link, self.ee_orientation, arm)
         if self.control_type == "ee_pose":

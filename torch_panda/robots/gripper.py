@@ -1,10 +1,12 @@
 """Grippers whose fingers open and close together."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
+from torch_panda.arguments import check_names
 from torch_panda.checks import check_above_zero, check_finite
 
 
@@ -18,7 +20,7 @@ class Gripper:
             does not move has the same position in both.
         width: Distance between the fully open fingers [m].
         scale: Change of the distance for an action of 1 [m].
-        followers: Indices of joints that a real gripper couples mechanically to the
+        mimic_joints: Indices of joints that a real gripper couples mechanically to the
             others. Bullet does not couple them, so their setpoints are the positions
             that match the present distance between the fingers.
 
@@ -31,13 +33,20 @@ class Gripper:
     opened: tuple[float, ...]
     width: float
     scale: float = 0.2
-    followers: tuple[int, ...] = ()
+    mimic_joints: tuple[int, ...] = ()
     # The width is the joint positions times _weights, plus _offset. The joint positions
     # are _closed plus the width times _per_width.
     _weights: Tensor = field(init=False, repr=False, compare=False)
     _offset: float = field(init=False, repr=False, compare=False)
     _per_width: Tensor = field(init=False, repr=False, compare=False)
     _closed: Tensor = field(init=False, repr=False, compare=False)
+
+    def __new__(cls, *args: object, **arguments: object) -> Self:
+        """Refuse unknown arguments."""
+        accepted = [field.name for field in fields(cls) if field.init]
+        advice = {"followers": "use mimic_joints"}
+        check_names(cls.__name__, arguments, accepted, advice)
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for name in ("closed", "opened"):
@@ -54,10 +63,11 @@ class Gripper:
             )
         per_width = (opened - closed) / self.width
         leads = closed != opened
-        leads[list(self.followers)] = False
+        leads[list(self.mimic_joints)] = False
         if not leads.any():
             raise ValueError(
-                f"followers must leave out one joint that moves, got {self.followers}"
+                f"mimic_joints must leave out one joint that moves, got "
+                f"{self.mimic_joints}"
             )
         weights = torch.where(leads, 1 / per_width, 0.0) / leads.sum()
         object.__setattr__(self, "_closed", closed)
@@ -88,9 +98,9 @@ class Gripper:
         # The sum is float32, as in panda-gym under NumPy 2.
         target = width.float() + action * self.scale
         setpoint = self._closed + target.double() * self._per_width
-        if self.followers:
-            followers = list(self.followers)
-            setpoint[:, followers] = (self._closed + width * self._per_width)[
-                :, followers
+        if self.mimic_joints:
+            mimic_joints = list(self.mimic_joints)
+            setpoint[:, mimic_joints] = (self._closed + width * self._per_width)[
+                :, mimic_joints
             ]
         return setpoint

@@ -30,7 +30,7 @@ class Kuka(Robot):
         super().__init__(
             urdf="kuka_iiwa/model.urdf",
             neutral_joint_position=NEUTRAL_JOINT_POSITION,
-            joint_forces=JOINT_FORCES,
+            effort_limits=JOINT_FORCES,
             ee_link=EE_LINK,
             ee_orientation=(0.0, 1.0, 0.0, 0.0),
             control_type=control_type,

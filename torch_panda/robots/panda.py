@@ -57,7 +57,7 @@ class Panda(Robot):
         super().__init__(
             urdf="franka_panda/panda.urdf",
             neutral_joint_position=(*NEUTRAL_JOINT_POSITION[:7], *fingers),
-            joint_forces=JOINT_FORCES,
+            effort_limits=JOINT_FORCES,
             ee_link=EE_LINK,
             num_arm_joints=7,
             control_type=control_type,

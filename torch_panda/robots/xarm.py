@@ -18,7 +18,7 @@ BASE_POSITION = (-0.45, 0.0, 0.0)  # [m]
 
 # In the real gripper the first joint drives the others.
 GRIPPER = Gripper(
-    closed=(0.85,) * 6, opened=(0.0,) * 6, width=0.089, followers=(1, 2, 3, 4, 5)
+    closed=(0.85,) * 6, opened=(0.0,) * 6, width=0.089, mimic_joints=(1, 2, 3, 4, 5)
 )
 GRIPPER_FORCES = (8.0, 50.0, 50.0, 50.0, 50.0, 50.0)  # [N m]
 # Between the fingertips, where they hold a cube.
@@ -45,7 +45,7 @@ class XArm6(Robot):
         super().__init__(
             urdf="xarm/xarm6_robot.urdf",
             neutral_joint_position=NEUTRAL_ARM,
-            joint_forces=ARM_FORCES,
+            effort_limits=ARM_FORCES,
             ee_link=6,
             control_type=control_type,
             action_scale=action_scale,
@@ -77,7 +77,7 @@ class XArm6Gripper(Robot):
         super().__init__(
             urdf="xarm/xarm6_with_gripper.urdf",
             neutral_joint_position=(*NEUTRAL_ARM_WITH_GRIPPER, *GRIPPER.closed),
-            joint_forces=(*ARM_FORCES, *GRIPPER_FORCES),
+            effort_limits=(*ARM_FORCES, *GRIPPER_FORCES),
             ee_link=TOOL_LINK,
             control_type=control_type,
             action_scale=action_scale,

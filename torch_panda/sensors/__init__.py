@@ -9,7 +9,7 @@ from torch_panda.sensors.forces import (
     WristForceTorque,
 )
 from torch_panda.sensors.joints import JointState
-from torch_panda.sensors.keywords import SENSORS, read_keywords, read_sensors
+from torch_panda.sensors.keywords import SENSORS, read_keywords, resolve_sensors
 
 __all__ = [
     "SENSORS",
@@ -25,5 +25,5 @@ __all__ = [
     "WristForceTorque",
     "join_entries",
     "read_keywords",
-    "read_sensors",
+    "resolve_sensors",
 ]

@@ -123,7 +123,7 @@ class JointTorque(ForceSensor):
     def shape(self, robot: Robot) -> tuple[int, ...] | None:
         """(n_joints,), or None under the control type "joint_torque"."""
         is_torque = robot.control_type == "joint_torque"
-        return None if is_torque else (len(robot.joint_forces),)
+        return None if is_torque else (len(robot.effort_limits),)
 
     def read(
         self, client: PhysicsClient, scene: Scene, robot: Robot

@@ -62,7 +62,9 @@ def read_keywords(
     return (pictures, *sensors)
 
 
-def read_sensors(sensors: Sequence[Sensor | str], robot: Robot) -> tuple[Sensor, ...]:
+def resolve_sensors(
+    sensors: Sequence[Sensor | str], robot: Robot
+) -> tuple[Sensor, ...]:
     """Look up sensors that are given by name, and check that the robot can have them.
 
     Raises:

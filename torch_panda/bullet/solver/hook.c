@@ -24,7 +24,7 @@
 
 enum { VERSION = 8 }; /* native.py refuses a library of another version */
 
-/* The functions that are replaced, in the order of gate.py. */
+/* The functions that are replaced, in the order of compat.py. */
 enum { ITERATIONS, CONVERT, MOTOR_ROWS, LIMIT_ROWS, EXTERNAL_FORCES,
        COMMAND, UPDATE_AABBS, SET_AABB, SERIALIZE_BODIES, NUM_FUNCTIONS };
 

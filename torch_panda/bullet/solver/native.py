@@ -18,8 +18,8 @@ FOLLOW, PROBE, SOLVE, LEAVE = range(4)
 REVOLUTE, PRISMATIC, FIXED = 0, 1, 4
 
 
-class GateError(Exception):
-    """A condition of the gate does not hold."""
+class IncompatibleError(Exception):
+    """The solver does not fit this process; see ``compat.py``."""
 
 
 class Replacement(NamedTuple):
@@ -99,7 +99,7 @@ class SolverLibrary:
         path: Path of the compiled file.
 
     Raises:
-        GateError: The library was compiled from sources of another version.
+        IncompatibleError: The library was compiled from sources of another version.
     """
 
     def __init__(self, path: str) -> None:
@@ -109,7 +109,7 @@ class SolverLibrary:
         except AttributeError:
             version = 0  # the library is older than the version numbers
         if version != VERSION:
-            raise GateError(
+            raise IncompatibleError(
                 f"the compiled solver {path} has version {version}, but the sources of "
                 f"torch_panda have version {VERSION}: install torch_panda again"
             )
@@ -131,13 +131,15 @@ class SolverLibrary:
         """Replace Bullet's functions in their slots.
 
         Raises:
-            GateError: The system does not let a vtable be written.
+            IncompatibleError: The system does not let a vtable be written.
         """
         addresses = c_void_p * len(replacements)
         slots = addresses(*(replacement.slot for replacement in replacements))
         functions = addresses(*(replacement.function for replacement in replacements))
         if self._install(slots, functions):
-            raise GateError("a table of virtual functions cannot be made writable")
+            raise IncompatibleError(
+                "a table of virtual functions cannot be made writable"
+            )
 
     def uninstall(self) -> None:
         """Put Bullet's functions back into their slots."""

@@ -23,7 +23,7 @@ from torch_panda.bullet.solver.native import (
     REVOLUTE,
     SOLVE,
     Expectation,
-    GateError,
+    IncompatibleError,
     SolverLibrary,
 )
 from torch_panda.rotations import NO_ROTATION
@@ -63,7 +63,7 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         limit_table: Address of the joint limits' table of virtual functions.
 
     Raises:
-        GateError: The layout of Bullet's objects, or any bit of a state, differs.
+        IncompatibleError: The layout of Bullet's objects or any bit of a state differs.
     """
     expectation = Expectation(
         motor_table,
@@ -96,10 +96,12 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
         expected = _simulate()
         counts = solver.counts()
         if counts.mismatch is not None:
-            raise GateError(f"Bullet's layout differs: {counts.mismatch.decode()}")
+            raise IncompatibleError(
+                f"Bullet's layout differs: {counts.mismatch.decode()}"
+            )
         motors = _NUM_JOINTS * _NUM_STEPS
         if counts.joint_rows <= motors or not counts.contact_rows:
-            raise GateError(
+            raise IncompatibleError(
                 "the scene of the self-test has no joint limit or no contact"
             )
         solver.set_mode(SOLVE)
@@ -108,27 +110,33 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
     finally:
         solver.set_mode(FOLLOW)
     if counts.bullet_groups or not counts.groups:
-        raise GateError("the packed solver did not solve all groups of the self-test")
+        raise IncompatibleError(
+            "the packed solver did not solve all groups of the self-test"
+        )
     # Bullet still creates some rows: the first rows of a joint, and rows for which it
     # must enlarge an array.
     if counts.joints <= counts.bullet_joints or not counts.manifolds:
-        raise GateError("the packed solver did not create the rows of the self-test")
+        raise IncompatibleError(
+            "the packed solver did not create the rows of the self-test"
+        )
     if counts.bodies != _NUM_STEPS:
-        raise GateError(
+        raise IncompatibleError(
             "the packed solver did not compute the accelerations of the self-test"
         )
     # The first of Bullet's answers creates numbers that the replacement reads.
     if (counts.answers, counts.bullet_answers) != (_NUM_STEPS - 1, 1):
-        raise GateError(
+        raise IncompatibleError(
             "the packed solver did not compute the inverse kinematics of the self-test"
         )
     if (counts.snapshots, counts.bullet_snapshots) != (1, 0):
-        raise GateError("the snapshot of the self-test has collision shapes")
+        raise IncompatibleError("the snapshot of the self-test has collision shapes")
     if not counts.aabbs:
-        raise GateError("the packed solver did not move the AABBs of the self-test")
+        raise IncompatibleError(
+            "the packed solver did not move the AABBs of the self-test"
+        )
     for step, (state, expected_state) in enumerate(zip(states, expected, strict=True)):
         if state != expected_state:
-            raise GateError(f"the self-test differs from Bullet in step {step}")
+            raise IncompatibleError(f"the self-test differs from Bullet in step {step}")
 
 
 def _simulate() -> list[bytes]:
@@ -156,7 +164,7 @@ def _simulate() -> list[bytes]:
         finally:
             connection.close()
     except BulletError as error:
-        raise GateError(f"the self-test failed: {error}") from None
+        raise IncompatibleError(f"the self-test failed: {error}") from None
 
 
 def _build(connection: Connection) -> list[int]:

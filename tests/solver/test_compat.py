@@ -1,4 +1,4 @@
-"""If a condition of the gate does not hold, Bullet's own functions run."""
+"""If the solver does not fit the process, Bullet's own functions run."""
 
 import ctypes
 import os
@@ -10,7 +10,7 @@ import pytest
 
 from tests.solver.solvers import needs_packed
 from torch_panda.bullet import library
-from torch_panda.bullet.solver import SOLVER_VARIABLE, gate, native, self_test
+from torch_panda.bullet.solver import SOLVER_VARIABLE, compat, native, self_test
 from torch_panda.bullet.solver.elf import Symbol, read_symbols
 
 pytestmark = needs_packed
@@ -19,23 +19,25 @@ pytestmark = needs_packed
 @pytest.fixture
 def closed(monkeypatch):
     """Pretend that nothing was replaced yet, and forbid to enable the replacement."""
-    solver = gate.load_library()
+    solver = compat.load_library()
     solver.uninstall()
-    replacements = gate.find_replacements(library.library_path())
+    replacements = compat.find_replacements(library.library_path())
     monkeypatch.delenv(SOLVER_VARIABLE, raising=False)
-    monkeypatch.setattr(gate, "_status", None)
+    monkeypatch.setattr(compat, "_status", None)
     monkeypatch.setattr(
-        native.SolverLibrary, "enable", lambda self, on: pytest.fail("the gate opened")
+        native.SolverLibrary,
+        "enable",
+        lambda self, on: pytest.fail("the solver was enabled"),
     )
     yield
     monkeypatch.undo()
     # Bullet's functions are back in their slots.
-    assert gate.find_replacements(library.library_path()) == replacements
+    assert compat.find_replacements(library.library_path()) == replacements
     solver.install(replacements)
 
 
 def reason():
-    status = gate.activate()
+    status = compat.activate()
     assert status.name == "bullet"
     assert str(status) == f"bullet: {status.reason}"
     return status.reason
@@ -49,7 +51,7 @@ def test_the_variable_switches_the_packed_solver_off(closed, monkeypatch):
 def test_an_unknown_solver_is_refused(closed, monkeypatch):
     monkeypatch.setenv(SOLVER_VARIABLE, "fast")
     with pytest.raises(ValueError, match='must be "packed" or "bullet", got "fast"'):
-        gate.activate()
+        compat.activate()
 
 
 def test_a_demanded_packed_solver_that_cannot_run_is_an_error(closed, monkeypatch):
@@ -58,16 +60,14 @@ def test_a_demanded_packed_solver_that_cannot_run_is_an_error(closed, monkeypatc
     with pytest.raises(
         RuntimeError, match="=packed, but the packed solver needs x86-64 Linux"
     ):
-        gate.activate()
+        compat.activate()
 
 
 @pytest.mark.parametrize(
     ("system", "machine"),
     [("linux", "aarch64"), ("darwin", "x86_64"), ("win32", "AMD64")],
 )
-def test_the_gate_stays_closed_on_another_platform(
-    closed, monkeypatch, system, machine
-):
+def test_the_solver_stays_off_on_another_platform(closed, monkeypatch, system, machine):
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(platform, "machine", lambda: machine)
     assert f"this is {system} on {machine}" in reason()
@@ -79,26 +79,26 @@ def test_an_empty_variable_counts_as_unset(closed, monkeypatch):
     assert "needs x86-64 Linux" in reason()
 
 
-def test_the_gate_stays_closed_for_another_version_of_pybullet(closed, monkeypatch):
+def test_the_solver_stays_off_for_another_version_of_pybullet(closed, monkeypatch):
     monkeypatch.setattr(library, "SUPPORTED_VERSION", "3.2.6")
     assert reason() == "the packed solver needs pybullet 3.2.6, and 3.2.7 is installed"
 
 
-def test_the_gate_stays_closed_without_a_compiled_library(closed, monkeypatch):
-    monkeypatch.setattr(gate, "_LIBRARY", gate._LIBRARY.with_name("missing.so"))
+def test_the_solver_stays_off_without_a_compiled_library(closed, monkeypatch):
+    monkeypatch.setattr(compat, "_LIBRARY", compat._LIBRARY.with_name("missing.so"))
     assert "the packed solver is not compiled" in reason()
 
 
 @pytest.mark.parametrize("part", [0, 1])
-@pytest.mark.parametrize("index", range(len(gate._REPLACED)))
-def test_the_gate_stays_closed_if_a_symbol_is_missing(closed, monkeypatch, index, part):
-    replaced = [list(names) for names in gate._REPLACED]
+@pytest.mark.parametrize("index", range(len(compat._REPLACED)))
+def test_the_solver_stays_off_if_a_symbol_is_missing(closed, monkeypatch, index, part):
+    replaced = [list(names) for names in compat._REPLACED]
     replaced[index][part] = "_ZTV7missing"
-    monkeypatch.setattr(gate, "_REPLACED", replaced)
+    monkeypatch.setattr(compat, "_REPLACED", replaced)
     assert reason() == "pybullet has no symbol _ZTV7missing"
 
 
-def test_the_gate_stays_closed_for_a_stripped_module(closed, monkeypatch, tmp_path):
+def test_the_solver_stays_off_for_a_stripped_module(closed, monkeypatch, tmp_path):
     stripped = tmp_path / "pybullet.so"
     header = bytearray(64)
     header[:6] = b"\x7fELF\x02\x01"
@@ -107,15 +107,15 @@ def test_the_gate_stays_closed_for_a_stripped_module(closed, monkeypatch, tmp_pa
     assert "has no .symtab" in reason()
 
 
-def test_the_gate_stays_closed_for_a_module_that_is_no_elf_file(closed, monkeypatch):
+def test_the_solver_stays_off_for_a_module_that_is_no_elf_file(closed, monkeypatch):
     monkeypatch.setattr(library, "library_path", lambda: __file__)
     assert "is not a 64-bit ELF file" in reason()
 
 
-def test_the_gate_stays_closed_if_a_table_lacks_its_function(closed, monkeypatch):
-    (table, _), *others = gate._REPLACED
+def test_the_solver_stays_off_if_a_table_lacks_its_function(closed, monkeypatch):
+    (table, _), *others = compat._REPLACED
     replaced = [(table, others[1][1]), *others]
-    monkeypatch.setattr(gate, "_REPLACED", replaced)
+    monkeypatch.setattr(compat, "_REPLACED", replaced)
     assert "holds the function to replace 0 times" in reason()
 
 
@@ -147,7 +147,7 @@ def test_the_gate_stays_closed_if_a_table_lacks_its_function(closed, monkeypatch
         ("ik_iterations", 7, "m_maxNumIterations"),
     ],
 )
-def test_the_gate_stays_closed_if_bullets_layout_differs(
+def test_the_solver_stays_off_if_bullets_layout_differs(
     closed, monkeypatch, field, value, wrong
 ):
     # Expect wrong numbers of the scene: the probe then reports a field, as it would if
@@ -168,18 +168,18 @@ def test_an_interrupted_self_test_puts_bullets_functions_back(closed, monkeypatc
     def interrupt(*args, **tables):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(gate, "run_self_test", interrupt)
+    monkeypatch.setattr(compat, "run_self_test", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        gate.activate()
-    assert gate.find_replacements(library.library_path())
+        compat.activate()
+    assert compat.find_replacements(library.library_path())
 
 
-def test_the_gate_stays_closed_for_a_library_of_other_sources(closed, monkeypatch):
+def test_the_solver_stays_off_for_a_library_of_other_sources(closed, monkeypatch):
     monkeypatch.setattr(native, "VERSION", 0)
     assert "but the sources of torch_panda have version 0" in reason()
 
 
-def test_the_gate_stays_closed_if_results_differ(closed, monkeypatch):
+def test_the_solver_stays_off_if_results_differ(closed, monkeypatch):
     simulate = self_test._simulate
     runs = []
 
@@ -194,7 +194,7 @@ def test_the_gate_stays_closed_if_results_differ(closed, monkeypatch):
     assert reason() == "the self-test differs from Bullet in step 7"
 
 
-def test_the_gate_stays_closed_if_groups_are_left_to_bullet(closed, monkeypatch):
+def test_the_solver_stays_off_if_groups_are_left_to_bullet(closed, monkeypatch):
     monkeypatch.setattr(self_test, "SOLVE", native.LEAVE)
     assert reason() == "the packed solver did not solve all groups of the self-test"
 
@@ -208,7 +208,7 @@ def test_the_gate_stays_closed_if_groups_are_left_to_bullet(closed, monkeypatch)
         ("answers", "did not compute the inverse kinematics of the self-test"),
     ],
 )
-def test_the_gate_stays_closed_if_a_part_is_left_to_bullet(
+def test_the_solver_stays_off_if_a_part_is_left_to_bullet(
     closed, monkeypatch, field, wrong
 ):
     counts = native.SolverLibrary.counts
@@ -222,10 +222,12 @@ def test_the_gate_stays_closed_if_a_part_is_left_to_bullet(
     assert reason() == f"the packed solver {wrong}"
 
 
-def test_the_gate_decides_once(monkeypatch):
-    monkeypatch.setattr(gate, "open_gate", lambda: pytest.fail("decided again"))
+def test_compatibility_is_decided_once(monkeypatch):
+    monkeypatch.setattr(
+        compat, "enable_if_compatible", lambda: pytest.fail("decided again")
+    )
     monkeypatch.setenv(SOLVER_VARIABLE, "bullet")
-    assert gate.activate().name == "packed"
+    assert compat.activate().name == "packed"
 
 
 def test_symbols_have_the_addresses_of_the_process():

@@ -34,7 +34,7 @@ from typing import Literal, NamedTuple
 from torch_panda.bullet import library
 from torch_panda.bullet.solver.elf import read_symbols
 from torch_panda.bullet.solver.native import (
-    GateError,
+    IncompatibleError,
     Replacement,
     SolverLibrary,
 )
@@ -146,8 +146,8 @@ def _decide() -> SolverStatus:
     if choice == "bullet":
         return SolverStatus("bullet", f"{SOLVER_VARIABLE}=bullet")
     try:
-        open_gate()
-    except GateError as error:
+        enable_if_compatible()
+    except IncompatibleError as error:
         if choice == "packed":
             raise RuntimeError(
                 f"{SOLVER_VARIABLE}=packed, but {error}; unset it to run Bullet's own "
@@ -157,11 +157,11 @@ def _decide() -> SolverStatus:
     return SolverStatus("packed")
 
 
-def open_gate() -> None:
+def enable_if_compatible() -> None:
     """Check conditions 2 to 7, and enable the replacement.
 
     Raises:
-        GateError: A condition does not hold. Bullet's own functions run.
+        IncompatibleError: A condition does not hold. Bullet's own functions run.
     """
     check_platform()
     check_version()
@@ -183,7 +183,7 @@ def open_gate() -> None:
 def check_platform() -> None:
     """Check for x86-64 Linux."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        raise GateError(
+        raise IncompatibleError(
             f"the packed solver needs x86-64 Linux, and this is {sys.platform} on "
             f"{platform.machine()}"
         )
@@ -196,7 +196,7 @@ def check_version() -> None:
     except importlib.metadata.PackageNotFoundError:
         version = "an unknown version"
     if version != library.SUPPORTED_VERSION:
-        raise GateError(
+        raise IncompatibleError(
             f"the packed solver needs pybullet {library.SUPPORTED_VERSION}, and "
             f"{version} is installed"
         )
@@ -205,7 +205,9 @@ def check_version() -> None:
 def load_library() -> SolverLibrary:
     """Load the compiled library."""
     if not _LIBRARY.is_file():
-        raise GateError("the packed solver is not compiled: install torch_panda again")
+        raise IncompatibleError(
+            "the packed solver is not compiled: install torch_panda again"
+        )
     return SolverLibrary(str(_LIBRARY))
 
 
@@ -219,10 +221,10 @@ def find_replacements(path: str) -> list[Replacement]:
     try:
         symbols = read_symbols(path, names)
     except ValueError as error:
-        raise GateError(str(error)) from None
+        raise IncompatibleError(str(error)) from None
     for name in sorted(names):
         if name not in symbols:
-            raise GateError(f"pybullet has no symbol {name}")
+            raise IncompatibleError(f"pybullet has no symbol {name}")
     exported = ctypes.cast(getattr(library.WORK, _EXPORTED), c_void_p).value
     assert exported is not None
     base = exported - symbols[_EXPORTED].address
@@ -233,7 +235,7 @@ def find_replacements(path: str) -> list[Replacement]:
         entries = (c_void_p * (symbols[table_name].size // 8)).from_address(table)
         slots = [i for i, entry in enumerate(entries) if entry == function]
         if len(slots) != 1:
-            raise GateError(
+            raise IncompatibleError(
                 f"{table_name} holds the function to replace {len(slots)} times, "
                 f"expected once"
             )
