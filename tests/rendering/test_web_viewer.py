@@ -1,5 +1,6 @@
-"""The viewer in the browser shows environments."""
+"""The viewer in the browser shows environments, and serves its own page only."""
 
+import socket
 from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 from itertools import product
@@ -13,8 +14,8 @@ import torch_panda
 
 pytest.importorskip("yourdfpy", reason="needs the extra viewer")
 
-import viser
 from viser.transforms import SO3
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from torch_panda.bullet import Box, PhysicsClient
@@ -276,19 +277,104 @@ def test_wrong_calls_of_a_viewer_raise_clear_errors(env):
         env.open_viewer()
 
 
-def test_a_browser_gets_the_page_and_the_scene(env):
-    env.reset()
-    with env.open_viewer(port=8765) as viewer:
-        viewer.update()
-        address = viewer.url.removeprefix("http://")
-        connection = HTTPConnection(address, timeout=10)
-        connection.request("GET", "/")
-        response = connection.getresponse()
-        assert response.status == 200
-        assert "<html" in response.read().decode()
-        protocol = f"viser-v{viser.__version__}"
-        with connect(f"ws://{address}", subprotocols=[protocol], max_size=None) as page:
-            assert len(page.recv(timeout=10)) > 100_000  # the meshes
+@pytest.fixture(scope="module")
+def viewer():
+    with torch_panda.make("PandaReach-v1", seed=0) as env:
+        env.reset()
+        with env.open_viewer(port=8765, allowed_hosts=("lab.example",)) as viewer:
+            viewer.update()
+            yield viewer
+
+
+def get(viewer, host):
+    """Status and text of the answer to a request with this header Host."""
+    connection = HTTPConnection("127.0.0.1", viewer._server.get_port(), timeout=10)
+    connection.putrequest("GET", "/", skip_host=True)
+    for name in host if isinstance(host, tuple) else (host,):
+        connection.putheader("Host", name)
+    connection.endheaders()
+    response = connection.getresponse()
+    return response.status, response.read().decode()
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["localhost", "127.0.0.1:8765", "[::1]:9", "LocalHost:80", "lab.example:8443"],
+)
+def test_the_page_is_served_under_loopback_and_listed_names(viewer, host):
+    status, text = get(viewer, host)
+    assert status == 200
+    assert "<html" in text
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example",
+        "evil.example:8765",
+        "localhost.evil.example",
+        "evil.example@localhost",
+        "localhost:x",
+        "",
+        ("localhost", "evil.example"),
+    ],
+)
+def test_the_page_is_not_served_under_other_names(viewer, host):
+    status, _ = get(viewer, host)
+    assert status in (400, 403)
+
+
+def test_a_refusal_says_how_to_allow_a_name(viewer):
+    status, text = get(viewer, "robot.example:80")
+    assert status == 403
+    assert "'robot.example'" in text and "allowed_hosts" in text
+
+
+def open_socket(viewer, origin, host="localhost:8765"):
+    """Open a web socket as viser's page does, with these headers."""
+    return connect(
+        f"ws://{host}",
+        sock=socket.create_connection(("127.0.0.1", viewer._server.get_port())),
+        origin=origin,
+        subprotocols=[f"viser-v{web_bodies.viser.__version__}"],
+        open_timeout=10,
+        max_size=None,
+    )
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "http://evil.example:8765",
+        "http://localhost:8766",  # another server on the same machine
+        "http://localhost",
+        "null",
+    ],
+)
+def test_other_web_pages_cannot_connect(viewer, origin):
+    with pytest.raises(InvalidStatus, match="403"):
+        open_socket(viewer, origin)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("localhost:8765", "http://localhost:8765"),
+        ("localhost:9000", "http://localhost:9000"),  # a tunnel's port
+        ("lab.example", "https://lab.example"),  # a tunnel with TLS
+        ("127.0.0.1:8765", None),  # no browser
+    ],
+)
+def test_the_own_page_can_connect(viewer, host, origin):
+    with open_socket(viewer, origin, host) as connection:
+        assert connection.recv(timeout=10)
+
+
+def test_a_version_of_viser_that_cannot_be_checked_is_refused(env, monkeypatch):
+    monkeypatch.setattr(web_viewer.viser, "ViserServer", lambda **options: None)
+    with pytest.raises(RuntimeError, match="cannot check web requests"):
+        env.open_viewer(port=8765)
 
 
 def test_indices_from_a_browser_never_raise(env):

@@ -52,6 +52,7 @@ def serve(
     *,
     host: str,
     port: int,
+    allowed_hosts: Sequence[str],
 ) -> None:
     """Play episodes in a browser, in real time.
 
@@ -60,8 +61,12 @@ def serve(
         policies: One policy per episode.
         host: Network address that serves the page.
         port: Port of the page. If it is taken, the next free port is used.
+        allowed_hosts: Further names of this machine under which browsers may open the
+            page.
     """
-    with env.open_viewer(CAMERA, host=host, port=port) as viewer:
+    with env.open_viewer(
+        CAMERA, host=host, port=port, allowed_hosts=allowed_hosts
+    ) as viewer:
         print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
         for number, policy in enumerate(policies, 1):
             viewer.write(f"episode {number}")
@@ -112,6 +117,9 @@ class Args:
     machines"""
     port: Port = 8080
     """with --web, port of the page; if it is taken, the next free port"""
+    allowed_hosts: tuple[str, ...] = ()
+    """with --web, further names of this machine under which browsers may open the page;
+    needed with --host 0.0.0.0, if other machines open the page by its name"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
 
@@ -144,7 +152,13 @@ def main(args: Args) -> None:
                 policies: Iterator[TensorDictModuleBase] = itertools.repeat(policy)
                 if trained and Path(args.policy).exists():
                     policies = follow(Path(args.policy))
-                serve(env, policies, host=args.host, port=args.port)
+                serve(
+                    env,
+                    policies,
+                    host=args.host,
+                    port=args.port,
+                    allowed_hosts=args.allowed_hosts,
+                )
             elif args.human:
                 show(env, policy, args.num_envs)
             else:

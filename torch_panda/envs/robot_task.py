@@ -521,6 +521,7 @@ class RobotTaskEnv(EnvBase):
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
+        allowed_hosts: Sequence[str] = (),
     ) -> "WebViewer":
         """Serve the scene to browsers, in three dimensions; needs the extra ``viewer``.
 
@@ -532,8 +533,11 @@ class RobotTaskEnv(EnvBase):
             camera: The camera with which the view starts; None means `Camera`'s
                 defaults.
             host: Address at which the server listens; "0.0.0.0" lets other machines
-                connect. viser does not check who connects.
+                connect.
             port: First port to try; the viewer takes the next free one, see ``url``.
+            allowed_hosts: Names of this machine under which browsers may open the page,
+                in addition to ``host`` and the loopback names. Requests under any other
+                name are refused, and so are requests that a page of another site sends.
 
         Raises:
             ImportError: viser or yourdfpy is not installed.
@@ -555,6 +559,7 @@ class RobotTaskEnv(EnvBase):
                 camera=camera or Camera(),
                 host=host,
                 port=port,
+                allowed_hosts=allowed_hosts,
             )
 
     # ---- closing -------------------------------------------------------------------

@@ -4,7 +4,7 @@ This module needs the extra ``viewer``.
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
@@ -16,12 +16,16 @@ from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
 from torch_panda.rendering.camera import Camera
+from torch_panda.rendering.web_access import (
+    WILDCARDS,
+    allowed_names,
+    restricted_servers,
+)
 from torch_panda.rendering.web_bodies import WebBodies
 
 POSITION_SIZE = 3  # numbers in a position
 ARROW_LENGTH = 0.005  # length of an arrow per newton of contact force [m/N]
 LONGEST_ARROW = 0.12  # [m]
-ALL_ADDRESSES = ("0.0.0.0", "::", "")  # stand for every address of the machine
 
 
 class Frame(NamedTuple):
@@ -59,6 +63,7 @@ class WebViewer:
         camera: See `RobotTaskEnv.open_viewer`, as for the following arguments.
         host: Address of the server.
         port: Port of the server.
+        allowed_hosts: Names under which browsers may reach the server.
     """
 
     def __init__(
@@ -71,6 +76,7 @@ class WebViewer:
         camera: Camera,
         host: str,
         port: int,
+        allowed_hosts: Sequence[str],
     ) -> None:
         self._simulation, self._observe, self._title = simulation, observe, title
         self._exclusive = exclusive
@@ -80,9 +86,10 @@ class WebViewer:
         self._lock = threading.RLock()
         self._resumed = threading.Event()
         self._resumed.set()
-        self._server = server = viser.ViserServer(
-            host=host, port=port, label=title, verbose=False
-        )
+        with restricted_servers(allowed_names(host, allowed_hosts)):
+            self._server = server = viser.ViserServer(
+                host=host, port=port, label=title, verbose=False
+            )
         server.initial_camera.look_at = camera.target
         server.initial_camera.position = eye(camera)
         self._bodies = WebBodies(server, simulation.clients[0], simulation.scene)
@@ -105,7 +112,7 @@ class WebViewer:
     def url(self) -> str:
         """Address of the page."""
         host = self._server.get_host()
-        name = "localhost" if host in ALL_ADDRESSES else host
+        name = "localhost" if host in WILDCARDS else host
         return f"http://{name}:{self._server.get_port()}"
 
     @property
