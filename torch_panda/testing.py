@@ -16,6 +16,7 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.goal_observation import find_goal_indices
 from torch_panda.envs.task_problems import (
     Function,
+    describe_error,
     find_goal_entries_problems,
     find_tensor_problems,
     list_functions,
@@ -318,8 +319,7 @@ class _TaskCheck:
             return call()
         except Exception as error:
             self.error = self.error or error
-            message = " ".join(str(error).split())
-            self._set(name, f"{name} raised {type(error).__name__}: {message}")
+            self._set(name, describe_error(name, error))
             return None
 
 

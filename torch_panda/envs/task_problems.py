@@ -85,67 +85,53 @@ def list_functions(
         goals: Achieved and desired goals for the functions of goals, (n, goal_dim)
             each; None means zeros.
     """
-    n, state = simulation.num_envs, simulation.state.rows
+    n = simulation.num_envs
     if action is None:
         action = torch.zeros(n, robot.action_dim, dtype=torch.float32, device="cpu")
     if goals is None:
         zeros = torch.zeros(n, task.goal_dim, dtype=torch.float32, device="cpu")
         goals = zeros, zeros.clone()
-    reads_state = partial(Function, inputs=(state,))
-    reads_goals = partial(Function, inputs=goals)
-    owner = type(task).__name__
+
+    def function(
+        owner: Robot | Task,
+        name: str,
+        arguments: tuple[Any, ...],
+        shape: tuple[int, ...],
+        dtype: torch.dtype | None = None,
+        is_hook: bool = False,
+    ) -> Function:
+        # An environment copies the action for `Task.reward`, which may change it.
+        inputs = [x for x in arguments if isinstance(x, Tensor) and x is not action]
+        if any(x is simulation for x in arguments):
+            inputs.append(simulation.state.rows)
+        call = partial(getattr(owner, name), *arguments)
+        name = f"{type(owner).__name__}.{name}"
+        return Function(name, call, shape, dtype, is_hook, tuple(inputs))
+
     functions = [
-        reads_state(
-            f"{type(robot).__name__}.observation",
-            partial(robot.observation, simulation),
-            (n, robot.observation_dim),
-        ),
-        reads_state(
-            f"{owner}.observation",
-            partial(task.observation, simulation),
-            (n, task.observation_dim),
-        ),
-        reads_state(
-            f"{owner}.achieved_goal",
-            partial(task.achieved_goal, simulation),
-            (n, task.goal_dim),
-        ),
-        reads_goals(
-            f"{owner}.is_success",
-            partial(task.is_success, *goals),
-            (n, 1),
-            torch.bool,
-        ),
-        reads_goals(
-            f"{owner}.compute_reward", partial(task.compute_reward, *goals), (n, 1)
-        ),
+        function(robot, "observation", (simulation,), (n, robot.observation_dim)),
+        function(task, "observation", (simulation,), (n, task.observation_dim)),
+        function(task, "achieved_goal", (simulation,), (n, task.goal_dim)),
+        function(task, "is_success", goals, (n, 1), torch.bool),
+        function(task, "compute_reward", goals, (n, 1)),
     ]
     if markers := simulation.scene.markers:
-        goal = goals[1].double()
-        functions.append(
-            Function(
-                f"{owner}.marker_pose",
-                partial(task.marker_pose, goal),
-                (n, len(markers), 7),
-                inputs=(goal,),
-            )
-        )
-    reward = partial(task.reward, simulation, action, *goals)
-    optional = {
-        "reward": Function("", reward, (n, 1), inputs=(state, *goals)),
-        "failure": reads_state(
-            "", partial(task.failure, simulation), (n, 1), torch.bool
+        goal, shape = goals[1].double(), (n, len(markers), 7)
+        functions.append(function(task, "marker_pose", (goal,), shape))
+    state = (simulation,)
+    hooks = {
+        "reward": function(task, "reward", (simulation, action, *goals), (n, 1)),
+        "failure": function(task, "failure", state, (n, 1), torch.bool),
+        "extra_observation": function(
+            task, "extra_observation", state, (n,), is_hook=True
         ),
+        "info": function(task, "info", state, (n,), is_hook=True),
     }
-    for hook in ("extra_observation", "info"):
-        call = partial(getattr(task, hook), simulation)
-        optional[hook] = reads_state("", call, (n,), is_hook=True)
-    functions += [
-        function._replace(name=f"{owner}.{name}")
-        for name, function in optional.items()
+    return functions + [
+        hook
+        for name, hook in hooks.items()
         if getattr(type(task), name) is not getattr(Task, name)
     ]
-    return functions
 
 
 def find_problems(
@@ -165,8 +151,15 @@ def find_problems(
     Returns:
         The problems, one line each.
     """
-    functions = list_functions(robot, task, simulation)
-    problems = [line for function in functions for line in function.check()[1]]
+    problems: list[str] = []
+    for function in list_functions(robot, task, simulation):
+        try:
+            problems += function.check()[1]
+        except Exception as error:
+            if not problems:
+                raise
+            # The problems that are known may be the cause, for example a wrong size.
+            problems.append(describe_error(function.name, error))
     return problems + find_goal_entries_problems(robot, task, goal_indices)
 
 
@@ -257,6 +250,11 @@ def find_tensor_problems(
         expected = str(dtype).removeprefix("torch.")
         problems.append(f"{name} must return {expected}, got {value.dtype}")
     return problems
+
+
+def describe_error(name: str, error: Exception) -> str:
+    """Describe the error that a function raised, on one line."""
+    return f"{name} raised {type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _class(value: object) -> str:
