@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import gymnasium
-import torch
 
 from torch_panda.arguments import argument_names, check_names, load_class, suggest
 from torch_panda.bullet.shapes import BLUE
@@ -204,10 +203,6 @@ _ADVICE = {
 def make(
     env_id: str,
     *,
-    num_envs: int | None = None,
-    num_threads: int | None = None,
-    seed: int | None = None,
-    device: torch.device | str | int | None = None,
     from_pixels: bool = False,
     pixels_only: bool = False,
     depth: bool = False,
@@ -226,12 +221,6 @@ def make(
 
     Args:
         env_id: One of `ENV_IDS`, or an id that was registered with `register`.
-        num_envs: Number of environments stepped in parallel; the batch size is
-            [num_envs]. None makes one environment of batch size [].
-        num_threads: Number of threads that step them; None means one per core that
-            the process may use, at most ``num_envs``.
-        seed: Seed of all random draws; None draws one from the operating system.
-        device: Device of all outputs; None means the CPU.
         from_pixels: Observe ``pixels``, uint8 (*batch, height, width, 3).
         pixels_only: Leave ``observation`` out; the goals stay.
         depth: Observe ``depth``, float32 (*batch, height, width, 1) [m].
@@ -244,7 +233,8 @@ def make(
             "finger_contact", "joint_torque"), or `Sensor` objects.
         task_options: Arguments of the task, such as ``distance_threshold``.
         robot_options: Arguments of the robot, such as ``control_type``.
-        **options: Further arguments of `RobotTaskEnv`.
+        **options: Arguments of `RobotTaskEnv`, such as ``num_envs``, ``num_threads``,
+            ``seed`` and ``device``.
 
     Raises:
         ValueError: The id is unknown, or an argument is out of range.
@@ -260,10 +250,6 @@ def make(
     env = RobotTaskEnv(
         robot=registration.make_robot(robot_options),
         task=registration.make_task(task_options),
-        num_envs=num_envs,
-        num_threads=num_threads,
-        seed=seed,
-        device=device,
         sensors=read_keywords(
             from_pixels=from_pixels,
             depth=depth,
