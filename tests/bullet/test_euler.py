@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torch_panda.bullet.euler import euler_angles
 from torch_panda.bullet.loop import load_library
+from torch_panda.rotations import euler_angles
 
 angle = st.floats(-math.pi, math.pi)
 

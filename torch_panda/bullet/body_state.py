@@ -40,7 +40,7 @@ class BodyState:
         num_links, q_size = c_int(), c_int()
         self._q, self._u = c_void_p(), c_void_p()
         self._wrenches, self._motor_forces = c_void_p(), c_void_p()
-        self._poses, self._velocities = c_void_p(), c_void_p()
+        self._poses = c_void_p()
         capi.state_result(
             status,
             None,
@@ -54,7 +54,7 @@ class BodyState:
             None,
             byref(self._motor_forces),
             byref(self._poses),
-            byref(self._velocities),
+            None,
         )
         self._num_links = num_links.value
         self._num_joints = q_size.value - Q_OFFSET
@@ -82,10 +82,6 @@ class BodyState:
     def link_pose(self, link: int) -> Doubles:
         """Pose of a link's centre of mass (7,): position [m], quaternion xyzw."""
         return _view(self._poses, 7 * link, 7)
-
-    def link_velocity(self, link: int) -> Doubles:
-        """Velocity of a link's centre of mass (6,), if velocities were requested."""
-        return _view(self._velocities, 6 * link, 6)
 
     @property
     def link_poses(self) -> Doubles:

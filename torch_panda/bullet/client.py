@@ -629,11 +629,9 @@ class PhysicsClient:
         """Number of collision detections so far; every substep has one."""
         return self.struct.num_detections
 
-    def state(self, body: int, *, link_velocities: bool = False) -> BodyState:
+    def state(self, body: int) -> BodyState:
         """The state of a body: base, joints, links, and forces in the joints."""
         command = capi.state_init(self.connection.handle, body)
-        if link_velocities:
-            capi.state_want_link_velocity(command, 1)
         return BodyState(
             self.connection.submit(
                 command, capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED, "report a state"

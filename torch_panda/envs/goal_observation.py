@@ -13,8 +13,8 @@ from torch_panda.bullet import (
     SimulationState,
     VectorSimulation,
 )
-from torch_panda.bullet.euler import euler_angles
 from torch_panda.robots import Robot
+from torch_panda.rotations import euler_angles
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import ObjectState, RewardFunction
 
@@ -171,6 +171,6 @@ def _neutral_hand_pose(
             scene.joints, robot.neutral_joint_position, strict=True
         ):
             client.set_joint(scene.robot, joint, position, 0.0)
-        state = client.state(scene.robot, link_velocities=True)
+        state = client.state(scene.robot)
         pose = list(state.link_pose(scene.ee_link))
     return torch.tensor(pose, dtype=torch.float64, device="cpu")

@@ -110,7 +110,7 @@ int client_reset(struct batch *batch, int env);
 /* Hash of the sources from which the library was compiled. */
 uint32_t loop_version(void);
 
-/* Roll, pitch and yaw of a quaternion xyzw; see euler.py. */
+/* Roll, pitch and yaw of a quaternion xyzw; see rotations.py. */
 void euler_angles(doubles quaternion, double *angles);
 
 #endif
