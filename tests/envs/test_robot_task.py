@@ -128,10 +128,10 @@ def test_the_first_call_must_be_a_reset(env):
 
 def test_unknown_options_of_a_reset_are_refused(env):
     for refusing in (env, TransformedEnv(env)):
-        with pytest.raises(TypeError, match=r"'seed'; call set_seed\(seed\) before"):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'seed'"):
             refusing.reset(seed=0)
     env.reset()
-    with pytest.raises(TypeError, match="'set_sate'; did you mean 'set_state'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'set_sate'"):
         env.reset(env.get_state(), set_sate=True)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.client import PhysicsClient
-from torch_panda.bullet.connection import BulletError, ThreadGuard
+from torch_panda.bullet.connection import BulletError
 from torch_panda.bullet.control import Control, MotorControl
 from torch_panda.bullet.physics import (
     EXACT,
@@ -36,7 +36,6 @@ __all__ = [
     "Scene",
     "SimulationState",
     "Sphere",
-    "ThreadGuard",
     "VectorSimulation",
     "Visual",
     "WorkerError",

@@ -1,6 +1,5 @@
-"""Checked commands to one client of Bullet, and the guard against a second thread."""
+"""Checked commands to one client of Bullet."""
 
-import threading
 from collections.abc import Sequence
 from ctypes import Array, c_double
 
@@ -74,30 +73,6 @@ class Connection:
         handle, self._handle = self._handle, None
         if handle is not None:
             capi.disconnect(handle)
-
-
-class ThreadGuard:
-    """A context manager that one thread at a time may enter.
-
-    Two threads in one Bullet client crash the interpreter. The thread that is inside
-    may enter again.
-
-    Raises:
-        BulletError: Another thread is inside.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.RLock()
-
-    def __enter__(self) -> None:
-        if not self._lock.acquire(blocking=False):
-            raise BulletError(
-                "another thread is using this environment: it serves one thread at a "
-                "time, so make an environment for each thread"
-            )
-
-    def __exit__(self, *error: object) -> None:
-        self._lock.release()
 
 
 def connect() -> Connection:

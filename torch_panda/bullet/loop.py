@@ -123,6 +123,7 @@ class Loop:
             failures=self._failures,
         )
         self._control: MotorControl | None = None  # control of the last step
+        self._setpoint_shape = (0, 0)
         self._threads: int | None = None  # address of the ``struct loop``
         self._process = os.getpid()
         for env, client in enumerate(clients):
@@ -144,11 +145,12 @@ class Loop:
             control.check(self._num_joints)
             self._batch.control = pointer(self._convert(control))
             self._control = control
+            self._setpoint_shape = len(self._clients), control.setpoint_dim
         # C code would read beyond the end of the array.
-        shape = (len(self._clients), control.setpoint_dim)
-        if setpoint.shape != shape:
+        if setpoint.shape != self._setpoint_shape:
             raise ValueError(
-                f"the setpoint must have shape {shape}, got {setpoint.shape}"
+                f"the setpoint must have shape {self._setpoint_shape}, got "
+                f"{setpoint.shape}"
             )
         self._batch.setpoint = setpoint.ctypes.data
         self._start()

@@ -18,6 +18,7 @@ from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool, num_cores
 from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.state import SimulationState
+from torch_panda.checks import all_finite
 
 
 class VectorSimulation:
@@ -223,7 +224,10 @@ class VectorSimulation:
 
     def diverged(self) -> list[int]:
         """Indices of the clients whose state was not finite when it was last read."""
-        return self.state.diverged()
+        rows = self.state.rows
+        if all_finite(rows):
+            return []
+        return (~rows.isfinite()).any(dim=1).nonzero().flatten().tolist()
 
     def rebuild(self, env: int) -> None:
         """Replace a diverged client by a new one: no reset removes NaN from Bullet."""

@@ -3,7 +3,6 @@
 import torch
 
 from torch_panda.bullet.scene import Scene
-from torch_panda.checks import all_finite
 
 
 class SimulationState:
@@ -65,9 +64,3 @@ class SimulationState:
         self.marker_pose = torch.zeros(
             num_envs, len(scene.markers), 7, dtype=torch.float64, device="cpu"
         )
-
-    def diverged(self) -> list[int]:
-        """Indices of the clients whose state is not finite."""
-        if all_finite(self.rows):
-            return []
-        return (~self.rows.isfinite()).any(dim=1).nonzero().flatten().tolist()

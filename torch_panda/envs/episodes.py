@@ -2,6 +2,7 @@
 
 import math
 import secrets
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -17,7 +18,6 @@ from torch_panda.bullet import (
     PhysicsName,
     PhysicsParams,
     Scene,
-    ThreadGuard,
     VectorSimulation,
     resolve_physics,
 )
@@ -673,6 +673,30 @@ class Episodes:
                 f"environments {sorted(self._needs_reset)} were never reset, or their "
                 f"last reset failed: call reset first"
             )
+
+
+class ThreadGuard:
+    """A context manager that one thread at a time may enter.
+
+    Two threads in one Bullet client crash the interpreter. The thread that is inside
+    may enter again.
+
+    Raises:
+        BulletError: Another thread is inside.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            raise BulletError(
+                "another thread is using this environment: it serves one thread at a "
+                "time, so make an environment for each thread"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
 
 
 class HookObserver:

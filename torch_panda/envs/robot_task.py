@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import _update_during_reset
 from typing_extensions import Self
 
-from torch_panda.arguments import argument_names, check_names
+from torch_panda.arguments import argument_names
 from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
@@ -36,12 +36,6 @@ if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.window import Window
 
 _CPU = torch.device("cpu")
-
-# Arguments of Gymnasium's ``reset``, and what to call instead.
-_RESET_ADVICE = {
-    "seed": "call set_seed(seed) before reset()",
-    "options": "to start from a state, call reset(state, set_state=True)",
-}
 
 
 class RobotTaskEnv(EnvBase):
@@ -587,14 +581,12 @@ class RobotTaskEnv(EnvBase):
         step_mask = self._read_mask(tensordict, "_step")
         return self._emit(self.episodes.step(action, step_mask))
 
-    def _reset(
+    def _reset(  # type: ignore[override]  # other options are refused
         self,
         tensordict: TensorDictBase | None = None,
         *,
         set_state: bool | None = None,
-        **kwargs: Any,  # noqa: ANN401 (torchrl's signature)
     ) -> TensorDict:
-        check_names("reset", kwargs, ("tensordict", "set_state"), _RESET_ADVICE)
         mask = None if tensordict is None else self._read_mask(tensordict, "_reset")
         envs = None if mask is None else indices(mask)
         state = unpack_state({} if tensordict is None else tensordict)
