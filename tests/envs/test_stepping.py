@@ -304,3 +304,12 @@ def test_a_robots_own_control_is_called():
             states.append(env.get_state())
     assert (states[0] == states[1]).all()
     assert robots[0].num_controlled == 4 * N
+
+
+def test_a_robots_own_control_cannot_use_torques():
+    """They would act in the first substep only."""
+    robot = OwnControl(block_gripper=True, control_type="joint_torque")
+    with RobotTaskEnv(robot=robot, task=Push(), num_envs=2, num_threads=1) as env:
+        env.reset()
+        with pytest.raises(WorkerError, match=r"environment 0: ValueError: .* torq"):
+            env.step(env.rand_action())
