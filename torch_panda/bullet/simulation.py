@@ -160,14 +160,15 @@ class VectorSimulation:
             ValueError: ``control`` does not fit the setpoints or the robot, or
                 ``envs`` has an index twice or one that is out of range.
         """
+        if envs is not None:
+            self._check_indices(envs)
         stepped = range(self.num_envs) if envs is None else envs
-        self._check_indices(stepped)
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
             self._loop.step(control, setpoint, stepped)
         else:
             self._step_in_python(control, setpoint, stepped)
-        return sorted(set(self.diverged()).intersection(stepped))
+        return [env for env in self.diverged() if env in stepped]
 
     def _step_in_python(
         self, control: Control, setpoint: Doubles, envs: Sequence[int]
