@@ -135,11 +135,14 @@ class Loop:
 
     def step(
         self, control: MotorControl, setpoint: Doubles, envs: Sequence[int]
-    ) -> None:
+    ) -> bool:
         """Set the motors, advance time and read the state; see `VectorSimulation.step`.
 
         Ctrl-C raises when the step is done. ``setpoint`` must be contiguous float64,
         and ``envs`` must have no duplicates.
+
+        Returns:
+            Whether a state is not finite.
         """
         if control is not self._control:
             control.check(self._num_joints)
@@ -154,8 +157,10 @@ class Loop:
             )
         self._batch.setpoint = setpoint.ctypes.data
         self._start()
-        if self._library.loop_step(self._threads, _ints(envs), len(envs)):
-            self._raise_first_error(envs)
+        if not self._library.loop_step(self._threads, _ints(envs), len(envs)):
+            return False
+        self._raise_first_error(envs)
+        return True
 
     def reset(self, envs: Sequence[int]) -> None:
         """Move bodies to the start of an episode; see `VectorSimulation.reset`."""

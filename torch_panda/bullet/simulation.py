@@ -18,7 +18,6 @@ from torch_panda.bullet.physics import EXACT, PhysicsParams
 from torch_panda.bullet.pool import Work, WorkerPool, num_cores
 from torch_panda.bullet.scene import Scene
 from torch_panda.bullet.state import SimulationState
-from torch_panda.checks import all_finite
 
 
 class VectorSimulation:
@@ -165,7 +164,8 @@ class VectorSimulation:
         stepped = range(self.num_envs) if envs is None else envs
         setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
-            self._loop.step(control, setpoint, stepped)
+            if not self._loop.step(control, setpoint, stepped):
+                return []
         else:
             self._step_in_python(control, setpoint, stepped)
         return [env for env in self.diverged() if env in stepped]
@@ -225,10 +225,8 @@ class VectorSimulation:
 
     def diverged(self) -> list[int]:
         """Indices of the clients whose state was not finite when it was last read."""
-        rows = self.state.rows
-        if all_finite(rows):
-            return []
-        return (~rows.isfinite()).any(dim=1).nonzero().flatten().tolist()
+        clients = enumerate(self._clients)
+        return [env for env, client in clients if client.struct.has_diverged]
 
     def rebuild(self, env: int) -> None:
         """Replace a diverged client by a new one: no reset removes NaN from Bullet."""

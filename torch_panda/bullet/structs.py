@@ -56,6 +56,7 @@ class Client(Structure):
     _fields_ = (
         ("handle", c_void_p),
         ("num_detections", c_int64),
+        ("has_diverged", c_int),
         ("broad_phase", POINTER(BroadPhase)),
     )
 

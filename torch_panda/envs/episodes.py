@@ -568,13 +568,13 @@ class Episodes:
                 f"the action must have a floating-point dtype, got {action.dtype}: "
                 f"pass action.float()"
             )
-        action = action.detach().to("cpu", copy=True).reshape(-1, shape[-1])
+        action = action.detach().to("cpu").view(-1, shape[-1])
         if not all_finite(action):
             env = int((~action.isfinite()).any(dim=1).nonzero()[0])
             raise ValueError(
                 f"the action of environment {env} is not finite: {action[env].tolist()}"
             )
-        return action.clamp_(-1.0, 1.0).float()
+        return action.clamp(-1.0, 1.0).float()
 
     def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
         """Advance the physics by one step; return the environments that diverged."""

@@ -154,6 +154,7 @@ struct row client_row(const struct batch *batch, int env) {
     int num_object_joints = scene->num_object_joints;
     size_t size = 2 * n + 10 + (7 + STATE_SIZE) * num_objects + 2 * num_object_joints;
     struct row row;
+    row.size = size;
     row.joint_position = batch->state + env * size;
     row.joint_velocity = row.joint_position + n;
     row.ee_position = row.joint_velocity + n;
@@ -189,6 +190,9 @@ int client_read(struct batch *batch, int env) {
         copy(row.object_joint_velocity + first, body.u + U_OFFSET, count);
         first += count;
     }
+    batch->clients[env]->has_diverged = 0;
+    for (size_t k = 0; k < row.size; k++)
+        if (!isfinite(row.joint_position[k])) batch->clients[env]->has_diverged = 1;
     return 1;
 }
 

@@ -31,6 +31,7 @@ struct broad_phase {
 struct client {
     handle handle;          /* NULL if the client is closed */
     int64_t num_detections; /* collision detections so far */
+    int has_diverged;       /* whether the state was not finite when it was last read */
     const struct broad_phase *broad_phase;
 };
 
@@ -77,6 +78,7 @@ struct batch { /* many clients of one scene */
 /* An object's state is position (3), Euler angles (3) and velocity (6). */
 enum { STATE_SIZE = 12, VELOCITY = 6 };
 struct row { /* parts of a client's row of the state */
+    size_t size; /* of the whole row, which begins with joint_position */
     double *joint_position, *joint_velocity, *ee_position, *ee_velocity;
     double *ee_orientation, *object_pose, *object_joint_position;
     double *object_joint_velocity, *object_state; /* STATE_SIZE per object */

@@ -80,7 +80,7 @@ struct loop *loop_create(struct batch *batch, int num_threads) {
 }
 
 /* Do some work on the num_envs clients whose indices are in envs, without duplicates.
-   Return whether it failed for one of them. */
+   Return whether it failed for one of them, or the state of one is not finite. */
 static int run(struct loop *loop, work *work, const int *envs, int num_envs) {
     fenv_t before; /* the caller's settings, which may flush denormals to zero */
     fegetenv(&before);
@@ -93,8 +93,10 @@ static int run(struct loop *loop, work *work, const int *envs, int num_envs) {
     while (loop->num_done < num_envs) pthread_cond_wait(&loop->done, &loop->mutex);
     pthread_mutex_unlock(&loop->mutex);
     fesetenv(&before);
+    const struct batch *batch = loop->batch;
     for (int k = 0; k < num_envs; k++)
-        if (loop->batch->failures[envs[k]].expected) return 1;
+        if (batch->failures[envs[k]].expected || batch->clients[envs[k]]->has_diverged)
+            return 1;
     return 0;
 }
 
