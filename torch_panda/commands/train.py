@@ -42,6 +42,7 @@ from torch_panda.learning.offline.options import (
 from torch_panda.learning.offline.training import OfflineRun
 from torch_panda.learning.options import Args, check, default_args
 from torch_panda.learning.recipes import find_recipe
+from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.training import Run
 from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.learning.video import record
@@ -82,9 +83,13 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
         return offline_args
     if mode.algo in OFFLINE_AGENTS and mode.algo not in AGENTS:
         raise ValueError(f"{mode.algo} learns offline: add --offline")
-    first = tyro.cli(Args, prog=PROG, args=without_help)
+    recipe = Args(preset="recipe")
+    first = tyro.cli(Args, prog=PROG, args=without_help, default=recipe)
     import_modules(read_modules(first.imports))
     default = default_args(first.preset, first.env_id, first.algo)
+    names = [x.split("=")[0].replace("_", "-") for x in arguments]
+    if "--total-steps" in names:
+        default.stop_when_solved = False
     return tyro.cli(Args, prog=PROG, args=arguments, default=default)
 
 
@@ -169,6 +174,8 @@ def main(args: Args | OfflineArgs) -> None:
             registration.make_task(args.task_options), robot=registration.make_robot()
         )
         run = make_run(args, out)
+        if isinstance(args, Args) and args.preset == "recipe":
+            print(describe_recipe(args, run.agent.spaces))
         is_tuned = isinstance(args, Args) and args.preset == "tuned"
         if is_tuned and not find_recipe(args.env_id):
             print(
@@ -200,6 +207,25 @@ def main(args: Args | OfflineArgs) -> None:
     print(f"success {progress.success} after {progress.steps} steps; see {out}")
     if not finished:
         print(f"stopped and saved in {out}: the same command with --resume goes on")
+
+
+def describe_recipe(args: Args, spaces: Spaces) -> str:
+    """What the recipe derived from the task, on one line."""
+    geometry = spaces.geometry
+    num_objects = num_goals = 0
+    if geometry is not None:
+        num_objects = len(geometry.positions) - 1
+        num_goals = len(geometry.goal_positions)
+    declares = geometry is not None and geometry.box is None
+    parts = [
+        f"discount {args.gamma} for {spaces.max_episode_steps} steps",
+        f"{num_objects} objects and {num_goals} goal positions "
+        f"({'declared' if declares else 'found'})",
+        f"hindsight {args.her!r} with {args.desired_ratio:.0%} desired goals",
+        f"inputs {args.relative_inputs!r}",
+        f"augmentation {args.augmentation!r}",
+    ]
+    return f"{args.env_id}: {', '.join(parts)}"
 
 
 def run(arguments: Sequence[str]) -> None:

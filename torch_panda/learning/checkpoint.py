@@ -26,7 +26,7 @@ RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
 # offline learning.
 SAVE_INTERVAL = 20_000
 # Options that may change when a run is resumed.
-FREE_OPTIONS = {"resume", "out", "video", "imports", "logger"}
+FREE_OPTIONS = {"resume", "out", "video", "imports", "logger", "stop_when_solved"}
 
 
 @dataclass

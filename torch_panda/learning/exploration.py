@@ -18,15 +18,15 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 # Two corners of the box from which points are drawn, in the world frame [m]. The box is
 # around the origin, where the objects start.
-LOWEST_POINT, HIGHEST_POINT = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
+BOX = (-0.2, -0.2, 0.0), (0.2, 0.2, 0.08)
 # Half of the points are near an object: at most OBJECT_DISTANCE from its centre along x
 # and along y, and up to the heights in OBJECT_HEIGHTS below and above its centre [m].
 NEAR_OBJECTS = 0.5
 OBJECT_DISTANCE = 0.1
 OBJECT_HEIGHTS = (-0.02, 0.06)
-# In its first WARM_UP steps, each environment always moves to points, so that the
-# replay buffer soon has many contacts. During training, torchrl's collector uses up
-# one of these steps when it is made.
+# If there are objects, each environment always moves to points in its first WARM_UP
+# steps, so that the replay buffer soon has many contacts. During training, torchrl's
+# collector uses up one of these steps when it is made.
 WARM_UP = 250
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point
@@ -58,7 +58,8 @@ class RandomPointModule(TensorDictModuleBase):
             first.
         object_columns: For each object, the first of the three columns of
             ``observation`` with its position [m]. Without objects, all points are
-            anywhere over the table.
+            anywhere in the box.
+        box: Lowest and highest (x, y, z) of the points, in the world frame [m].
     """
 
     steps_left: Tensor
@@ -77,6 +78,7 @@ class RandomPointModule(TensorDictModuleBase):
         moves_joints: bool,
         num_arm_actions: int,
         object_columns: Sequence[int],
+        box: tuple[Sequence[float], Sequence[float]] = BOX,
     ) -> None:
         super().__init__()
         self.in_keys = ["observation", "action"]
@@ -91,13 +93,16 @@ class RandomPointModule(TensorDictModuleBase):
         )
         self.action_scale = action_scale
         self.moves_joints = moves_joints
+        self.box = box
         self.num_objects = len(object_columns)
         # Columns of the three coordinates of each object, (num_objects, 3).
         x_columns = torch.tensor(tuple(object_columns), dtype=torch.int64).unsqueeze(-1)
         self.register_buffer(
             "position_columns", x_columns + torch.arange(3), persistent=False
         )
-        self.register_buffer("warm_up_left", torch.tensor(WARM_UP))
+        # Without objects there are no contacts to collect.
+        warm_up = WARM_UP if self.num_objects else 0
+        self.register_buffer("warm_up_left", torch.tensor(warm_up))
         self.register_buffer("steps_left", torch.zeros(num_envs, dtype=torch.int64))
         self.register_buffer("point", torch.zeros(num_envs, num_arm_actions))
         gripper_size = action_size - num_arm_actions
@@ -137,7 +142,7 @@ class RandomPointModule(TensorDictModuleBase):
 
     def _draw_points(self, observation: Tensor) -> Tensor:
         """Draw a point for the hand in each environment, (num_envs, 3) [m]."""
-        low, high = map(self.point.new_tensor, (LOWEST_POINT, HIGHEST_POINT))
+        low, high = map(self.point.new_tensor, self.box)
         point = low + (high - low) * torch.rand_like(self.point)
         if not self.num_objects:
             return point
@@ -147,7 +152,7 @@ class RandomPointModule(TensorDictModuleBase):
         low = point.new_tensor((-OBJECT_DISTANCE, -OBJECT_DISTANCE, lowest))
         high = point.new_tensor((OBJECT_DISTANCE, OBJECT_DISTANCE, highest))
         near = centre + low + (high - low) * torch.rand_like(point)
-        near[:, 2].clamp_(min=0.0)  # not below the table
+        near[:, 2].clamp_(min=self.box[0][2])  # not below the table
         is_near = torch.rand_like(point[:, :1]) < NEAR_OBJECTS
         return torch.where(is_near, near, point)
 

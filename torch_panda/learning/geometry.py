@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from torch_panda.envs import RobotTaskEnv
@@ -33,6 +34,14 @@ _MIRROR: dict[Quantity, tuple[float, ...]] = {
 }
 
 WIDTH: Quantity = "number"  # the distance between the fingers is one number
+
+
+# Rollouts, and steps of each, with which `find_geometry` looks at a task.
+_PROBE_ROLLOUTS, _PROBE_STEPS = 4, 30
+_SAME = 1e-5  # largest difference of equal numbers
+# Distances from the lowest and the highest start of an object to the ends of the box of
+# points, along x, y and z [m].
+_MARGINS = ((0.05, 0.05, 0.02), (0.05, 0.05, 0.06))
 
 
 class Part(NamedTuple):
@@ -69,6 +78,8 @@ class Geometry:
             goals are lower. None leaves the goals unchanged.
         orientation: First column of the object's quaternion in an observation, if goals
             are orientations; else None.
+        box: Lowest and highest (x, y, z) of the box in which the exploration "points"
+            draws its points [m]; None means the box of the shipped tasks.
     """
 
     points: tuple[int, ...]
@@ -80,6 +91,7 @@ class Geometry:
     goal_positions: tuple[int, ...]
     goal_height: float | None
     orientation: int | None
+    box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Offsets from the hand to objects and from objects to goals, (..., n) [m]."""
@@ -154,6 +166,79 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
         goal_height=task.sampled_goal_height,
         orientation=rotations[0][0].start if rotations else None,
     )
+
+
+def find_geometry(env: RobotTaskEnv) -> Geometry:
+    """Find the geometry of a task that does not declare it, from random actions.
+
+    Three successive numbers of the achieved goal that are equal to three successive
+    observed numbers are a position. It is an object's position, unless it is the
+    hand's, which every shipped robot observes first.
+
+    What cannot be found is left out. The result then has fewer ``points``.
+
+    Args:
+        env: The environments, which play some episodes.
+    """
+    played = [
+        env.rollout(_PROBE_STEPS, break_when_any_done=False)
+        for _ in range(_PROBE_ROLLOUTS)
+    ]
+    rollouts = TensorDict.stack(played).reshape(-1, _PROBE_STEPS)
+    first, following = rollouts[:, 0], rollouts.reshape(-1).get("next")
+    observation, achieved = following["observation"], following["achieved_goal"]
+    size, goal_size = observation.shape[-1], achieved.shape[-1]
+    columns = _find_columns(observation, achieved)
+    pairs: list[tuple[int, int]] = []  # of origin and point
+    objects: list[int] = []
+    goals: list[int] = []
+    # Goals of another size are no positions alone, such as the quaternions of Flip.
+    for start in range(0, goal_size if goal_size % 3 == 0 else 0, 3):
+        column, *others = columns[start : start + 3]
+        if column is None or others != [column + 1, column + 2]:
+            continue
+        goals.append(start)
+        if column not in (0, *objects):
+            objects.append(column)
+            pairs.append((0, column))
+        pairs.append((column, size + start))
+    # Points are drawn around the starts of the objects, or of the goals of the hand.
+    centres = [first["observation"][:, k : k + 3] for k in objects]
+    if not objects:
+        centres = [first["desired_goal"][:, k : k + 3] for k in goals]
+    box = None
+    if centres:
+        lowest, highest = torch.cat(centres).aminmax(dim=0)
+        margin = lowest.new_tensor(_MARGINS if objects else ((0.0,) * 3,) * 2)
+        box = (
+            tuple((lowest - margin[0]).tolist()),
+            tuple((highest + margin[1]).tolist()),
+        )
+    return Geometry(
+        points=tuple(point + axis for _, point in pairs for axis in range(3)),
+        origins=tuple(origin + axis for origin, _ in pairs for axis in range(3)),
+        observation=(1.0,) * size,
+        goal=(1.0,) * goal_size,
+        action=None,  # whether the task is symmetric is unknown
+        positions=(0, *objects),
+        goal_positions=tuple(goals),
+        goal_height=None,
+        orientation=None,
+        box=box,
+    )
+
+
+def _find_columns(observation: Tensor, achieved: Tensor) -> list[int | None]:
+    """The column of the observation that equals each number of the achieved goal."""
+    differences = (observation.unsqueeze(-1) - achieved.unsqueeze(-2)).abs().amax(0)
+    columns: list[int | None] = []
+    for difference in differences.T:
+        equal = (difference < _SAME).nonzero().flatten().tolist()
+        # Constant numbers may have several equal columns. Prefer the next one.
+        follows = bool(columns) and columns[-1] is not None
+        following = [k for k in equal if follows and k - 1 == columns[-1]]
+        columns.append(next(iter(following or equal), None))
+    return columns
 
 
 def locate(layout: Sequence[Quantity]) -> list[Part]:

@@ -25,7 +25,7 @@ from torch_panda.learning.user_modules import Imports
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 
-Preset = Literal["paper", "tuned", "sample-efficient"]
+Preset = Literal["recipe", "paper", "tuned", "sample-efficient"]
 
 
 @dataclass
@@ -33,9 +33,10 @@ class Args(Hyperparameters):
     """What to train, how long, and where to write."""
 
     preset: Preset = "paper"
-    """defaults of the other options: those of the panda-gym paper ("paper"), the task's
-    recipe ("tuned"), or its recipe for fewer environment steps ("sample-efficient").
-    With the last two, the replay buffer drops a random 90 % of the rollouts whose
+    """defaults of the other options: one recipe for all tasks, also for your own
+    ("recipe"); those of the panda-gym paper ("paper"); those tuned for each shipped
+    task ("tuned"), or for fewer environment steps of each ("sample-efficient"). With
+    all but "paper", the replay buffer drops a random 90 % of the rollouts whose
     achieved goal does not change"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
@@ -61,6 +62,9 @@ class Args(Hyperparameters):
     total_steps: Count = 4_000
     """environment steps, summed over all environments; 0 stops after the
     `pretrain_updates`"""
+    stop_when_solved: bool = False
+    """end the training when three evaluations in a row are successful in all episodes.
+    A --total-steps on the command line turns this off"""
     updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
     batch_size: Positive = 256

@@ -13,7 +13,7 @@ from torchrl.data import Bounded, TensorSpec
 from typing_extensions import Self
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.learning.geometry import Geometry, read_geometry
+from torch_panda.learning.geometry import Geometry, find_geometry, read_geometry
 from torch_panda.tasks import Task
 
 
@@ -71,9 +71,18 @@ class Spaces:
         return Bounded(-1.0, 1.0, shape, device=device)
 
 
-def read_spaces(env: RobotTaskEnv) -> Spaces:
-    """Read the sizes and the layout of an environment."""
+def read_spaces(env: RobotTaskEnv, *, finds_layout: bool = False) -> Spaces:
+    """Read the sizes and the layout of an environment.
+
+    Args:
+        env: The environment.
+        finds_layout: Whether to find a layout that the task does not declare, from some
+            episodes with random actions; see `find_geometry`.
+    """
     robot, task = env.robot, env.task
+    geometry = read_geometry(env)
+    if geometry is None and finds_layout:
+        geometry = find_geometry(env)
     return Spaces(
         observation_size=env.observation_spec["observation"].shape[-1],
         goal_size=env.observation_spec["desired_goal"].shape[-1],
@@ -82,7 +91,7 @@ def read_spaces(env: RobotTaskEnv) -> Spaces:
         max_episode_steps=env.max_episode_steps,
         has_free_gripper=robot.has_free_gripper,
         has_sparse_reward=has_sparse_reward(task),
-        geometry=read_geometry(env),
+        geometry=geometry,
         action_scale=float(robot.action_scale),
         moves_joints=robot.control_type == "joints",
     )

@@ -49,6 +49,8 @@ MAX_STEPS_FROM_MIDDLE = 50
 # the replay buffer stores this fraction. A sequence is the steps of one environment in
 # one iteration. The preset "paper" stores all of them.
 KEEP_UNMOVED = 0.1
+# A task is solved after this many evaluations in a row in which all episodes succeed.
+SOLVED_EVALUATIONS = 3
 
 
 class Run:
@@ -189,7 +191,7 @@ class Run:
 
         bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
         bar.set_description(f"{args.env_id} {args.algo}")
-        finished = stopped = progress.steps >= args.total_steps
+        finished = stopped = self.is_finished()
         batches = iter(self.collector)
         while not stopped:
             started, before = time.perf_counter(), progress.steps
@@ -202,15 +204,24 @@ class Run:
             progress.seconds += time.perf_counter() - started
 
             bar.update(data.numel())
-            finished = progress.steps >= args.total_steps
-            if finished or crossed(args.eval_interval, before, progress.steps):
+            is_last = progress.steps >= args.total_steps
+            if is_last or crossed(args.eval_interval, before, progress.steps):
                 self.curve.add(progress, losses)
+            finished = self.is_finished()
             bar.set_postfix(success=progress.success)
             stopped = finished or bool(stop)
             if stopped or crossed(SAVE_INTERVAL, before, progress.steps):
                 checkpoint.save()
         bar.close()
         return finished
+
+    def is_finished(self) -> bool:
+        """Whether the last step was taken, or the task is solved."""
+        args, progress = self.args, self.progress
+        last = [row["success"] for row in progress.curve[-SOLVED_EVALUATIONS:]]
+        is_solved = len(last) == SOLVED_EVALUATIONS and min(last) == 1.0
+        is_last = progress.steps >= args.total_steps
+        return is_last or (args.stop_when_solved and is_solved)
 
     def store(self, data: TensorDictBase) -> None:
         """Add a batch [num_envs, steps] to the buffer and to the normaliser."""

@@ -26,8 +26,12 @@ __all__ = ["AGENTS", "CRL", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparamete
 def make_agent(env: RobotTaskEnv, hp: Hyperparameters) -> Agent:
     """Make an untrained agent on the device of the environments that it will explore.
 
+    If the agent needs a layout that the task does not declare, the environments play
+    some episodes with random actions, from which it is found.
+
     Raises:
         ValueError: The hyperparameters do not fit the environment.
     """
     with torch.device(env.device or "cpu"):
-        return AGENTS[hp.algo](read_spaces(env), hp)
+        finds_layout = hp.relative_inputs != "none" or hp.exploration == "points"
+        return AGENTS[hp.algo](read_spaces(env, finds_layout=finds_layout), hp)

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
 from torch_panda.learning.augmentation import augment
-from torch_panda.learning.exploration import RandomPointModule
+from torch_panda.learning.exploration import BOX, RandomPointModule
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.normalizer import Normalizer
 from torch_panda.learning.spaces import Spaces
@@ -121,6 +121,7 @@ class Agent(nn.Module, ABC):
             num_arm_actions=spaces.num_arm_actions,
             # The first position of an observation is the hand's.
             object_columns=() if geometry is None else geometry.positions[1:],
+            box=BOX if geometry is None or geometry.box is None else geometry.box,
         )
 
     def update(
