@@ -307,7 +307,14 @@ def test_the_command_line_overrules_the_recipe():
     assert args == replace(recipe, gamma=0.9)
     assert args.desired_ratio > 0
     assert parse(["--random-eps", "0.1", "0.2"]).random_eps == (0.1, 0.2)
-    assert parse([]) == Args()
+    assert parse([]) == default_args("recipe", "PandaReach-v1")
+    assert parse(["--preset", "paper"]) == Args()
+
+
+def test_a_number_of_steps_on_the_command_line_is_always_trained():
+    assert parse([]).stop_when_solved
+    assert not parse(["--total-steps", "4000"]).stop_when_solved
+    assert not parse(["--total_steps=4000"]).stop_when_solved
 
 
 def test_physics_and_options_of_the_task_hold_in_all_environments(tmp_path):

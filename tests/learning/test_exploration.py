@@ -77,12 +77,17 @@ def test_actions_towards_a_point_have_noise():
 @pytest.mark.parametrize("eps", [0.0, 0.3])
 def test_after_the_warm_up_the_ratio_of_exploring_steps_is_eps(eps):
     torch.manual_seed(0)
-    module = make_module(eps)
+    # The three observed numbers are also the position of an object.
+    module = make_module(eps, object_columns=(0,))
     warm_up = explore(module, steps=250)[..., 0]
     assert (warm_up != 9.0).all()
     explore(module, steps=12)  # the last moves of the warm-up end
     replaced = explore(module, steps=1000)[..., 0] != 9.0
     assert replaced.float().mean() == pytest.approx(eps, abs=0.015)
+
+
+def test_without_objects_there_is_no_warm_up():
+    assert (explore(make_module(0.0), steps=5)[..., 0] == 9.0).all()
 
 
 def test_a_point_and_the_gripper_are_kept_for_several_steps():

@@ -1,10 +1,13 @@
 """Layout and symmetry that agents assume hold in the physics of the tasks."""
 
+import re
+
 import pytest
 import torch
 from torch.nn.functional import normalize
 
 import torch_panda
+from tests.ids import TASK_IDS
 from torch_panda.experts.cube_orientations import (
     STRAIGHT,
     compose,
@@ -12,7 +15,7 @@ from torch_panda.experts.cube_orientations import (
     to_matrix,
 )
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.geometry import read_geometry
+from torch_panda.learning.geometry import find_geometry, read_geometry
 from torch_panda.rotations import rotation_distance
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
@@ -111,15 +114,37 @@ class PushAndTell(torch_panda.Push):
         return torch.cat((super().observation(simulation), height), 1)
 
 
-@pytest.mark.parametrize(
-    "options", [{"relative_inputs": "coarse"}, {"augmentation": "mirror-shift"}]
-)
-def test_unknown_layouts_need_no_relative_inputs_and_no_augmentation(options):
+def test_a_layout_that_is_not_declared_is_found():
     scene = {"robot": torch_panda.Panda(block_gripper=True), "task": PushAndTell()}
-    with torch_panda.RobotTaskEnv(**scene, num_envs=2) as env:
-        with pytest.raises(
-            ValueError, match="pass --relative-inputs none --augmentation none"
-        ):
-            make_agent(env, Hyperparameters(**options))
-        agent = make_agent(env, Hyperparameters())
+    with torch_panda.RobotTaskEnv(**scene, num_envs=2, seed=0) as env:
+        agent = make_agent(env, Hyperparameters(relative_inputs="fine"))
+        found = agent.spaces.geometry
+        assert (found.positions, found.goal_positions) == ((0, 6), (0,))
         assert env.rollout(2, agent.policy)["action"].shape == (2, 2, 3)
+        for augmentation in ("mirror", "mirror-shift"):
+            with pytest.raises(ValueError, match="otherwise pass --augmentation none"):
+                make_agent(
+                    env,
+                    Hyperparameters(relative_inputs="fine", augmentation=augmentation),
+                )
+
+
+@pytest.mark.parametrize(
+    "env_id", [x for x in TASK_IDS if not re.search("Flip|Stack|PegInsertion", x)]
+)
+def test_the_found_layout_is_the_declared_one(env_id):
+    torch.manual_seed(0)
+    with torch_panda.make(env_id, num_envs=4, seed=0) as env:
+        found, declared = find_geometry(env), read_geometry(env)
+    for name in ("points", "origins", "positions", "goal_positions"):
+        assert getattr(found, name) == getattr(declared, name), name
+
+
+def test_each_object_of_a_stack_is_found_and_a_quaternion_is_no_position():
+    for env_id, positions, goals in (
+        ("PandaStack-v1", (0, 7, 19), (0, 3)),
+        ("PandaFlip-v1", (0,), ()),
+    ):
+        with torch_panda.make(env_id, num_envs=4, seed=0) as env:
+            found = find_geometry(env)
+        assert (found.positions, found.goal_positions) == (positions, goals)

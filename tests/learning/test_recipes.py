@@ -22,7 +22,7 @@ from torch_panda.learning.recipes import RECIPES, SAMPLE_EFFICIENT, find_recipe
 from torch_panda.learning.training import Run
 
 TABLE = Path(__file__).with_name("recipes.json")
-PRESETS = ("tuned", "sample-efficient")
+PRESETS = ("recipe", "tuned", "sample-efficient")
 # The ids that stand for their task in the table.
 PANDA = [
     env_id
@@ -128,3 +128,20 @@ def test_training_episodes_can_go_on_after_success(continues, tmp_path):
 
 if __name__ == "__main__":
     write_table()
+
+
+@pytest.mark.usefixtures("quick")
+def test_three_full_evaluations_in_a_row_end_a_training(tmp_path):
+    args = default_args("recipe", "PandaReach-v1")
+    args.num_envs = 2
+    run = Run(args, tmp_path)
+    for success, is_finished in (
+        ((1.0, 1.0), False),
+        ((1.0, 0.9, 1.0, 1.0), False),
+        ((0.0, 1.0, 1.0, 1.0), True),
+    ):
+        run.progress.curve = [{"success": x} for x in success]
+        assert run.is_finished() == is_finished
+    args.stop_when_solved = False
+    assert not run.is_finished()
+    run.close()

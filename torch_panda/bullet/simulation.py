@@ -84,7 +84,7 @@ class VectorSimulation:
             # This is half of the work of building a client, so use all threads. The
             # scenes above are built one by one, because users write that code.
             self._pool.run(self._plan_resets, range(num_envs))
-            self._pool.close()  # steps use the threads of the loop
+            self._pool.close()  # it starts again where Python code needs threads
         except BaseException:
             self._free_clients()
             raise
@@ -195,7 +195,7 @@ class VectorSimulation:
     def reset(self, envs: Sequence[int], randomize: Work | None = None) -> None:
         """Move the bodies of clients to the start of an episode.
 
-        Before the call, write the start into the tensors of `state`. The reset moves
+        Before the call, write the start into the tensors of the attribute `state`. The reset moves
         the bodies there. It then overwrites these tensors, except ``marker_pose``, with
         the state that Bullet reports.
 

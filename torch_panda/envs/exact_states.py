@@ -19,7 +19,7 @@ _MAX_UNUSED_STEPS = 1000
 # Longest episode that has an exact state [steps]. This limit bounds the memory of
 # episodes that never end.
 _MAX_STEPS = 20_000
-# Replaces the index of an episode's first step after its actions were dropped.
+# Stands for the first step of an episode whose actions were dropped.
 _DROPPED = -1
 
 TakeStep = Callable[[Tensor, Tensor, list[int]], None]
@@ -81,8 +81,8 @@ class ExactStates:
     """Starts of the present episodes of n environments, and the actions since.
 
     Args:
-        state: The tensors of the state, (n, ...) by key. They hold the starts of
-            episodes whenever `begin` is called.
+        state: The tensors of the state, (n, ...) by key. Before each call of `begin`,
+            they must hold the starts of the episodes.
         action_dim: Size of an action.
     """
 

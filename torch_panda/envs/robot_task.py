@@ -350,7 +350,7 @@ class RobotTaskEnv(EnvBase):
             or "next" in keys
         ):
             return super().step(tensordict)
-        # torchrl's own step would complete the result, which is complete already.
+        # The result of `_step` has all keys, so skip torchrl's search for missing ones.
         return tensordict.set("next", self._step(tensordict))
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:

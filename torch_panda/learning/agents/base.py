@@ -278,6 +278,7 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
     has_mirror = spaces.geometry is None or spaces.geometry.action is not None
     if hp.augmentation != "none" and not has_mirror:
         raise ValueError(
-            f"augmentation {hp.augmentation!r} needs end-effector control: for joint "
-            "control pass --augmentation none"
+            f"augmentation {hp.augmentation!r} needs end-effector control, and a task "
+            f"that declares observation_layout and goal_entries: otherwise pass "
+            f"--augmentation none"
         )
