@@ -195,9 +195,9 @@ class VectorSimulation:
     def reset(self, envs: Sequence[int], randomize: Work | None = None) -> None:
         """Move the bodies of clients to the start of an episode.
 
-        Before the call, write the start into the tensors of the attribute `state`. The reset moves
-        the bodies there. It then overwrites these tensors, except ``marker_pose``, with
-        the state that Bullet reports.
+        Before the call, write the start into the tensors of the attribute `state`. The
+        reset moves the bodies there. It then overwrites these tensors, except
+        ``marker_pose``, with the state that Bullet reports.
 
         The reset also restores Bullet's broad phase, so that an episode depends on its
         start and its actions only. See ``broad_phase.py``.
