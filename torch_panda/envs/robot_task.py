@@ -13,7 +13,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import _update_during_reset
 from typing_extensions import Self
 
 from torch_panda.arguments import argument_names
@@ -328,7 +327,11 @@ class RobotTaskEnv(EnvBase):
         # torchrl's reset would keep the entries of this tensordict for environments
         # that are not reset. But this tensordict holds a state, whose
         # ``desired_goal`` is not the goal of these environments.
-        self._assert_tensordict_shape(tensordict)
+        if tensordict.batch_size != self.batch_size:
+            raise ValueError(
+                f"the state must have batch size {self.batch_size}, got "
+                f"{tensordict.batch_size}"
+            )
         start = self._reset(tensordict, set_state=True, **kwargs)
         return tensordict.exclude("_reset", *EXACT_KEYS).update(start)
 
@@ -572,7 +575,7 @@ class RobotTaskEnv(EnvBase):
     # ---- called by torchrl ---------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict._get_str("action", None)
+        action = tensordict.get("action", None)
         is_on_cpu = isinstance(action, Tensor) and action.is_cpu
         if isinstance(action, Tensor) and is_on_cpu != (self.device == _CPU):
             raise ValueError(
@@ -624,9 +627,9 @@ class RobotTaskEnv(EnvBase):
         if tensordict is None:
             return tensordict_reset
         for key, value in tensordict_reset.items():
-            if tensordict._get_str(key, None) is None:
+            if tensordict.get(key, None) is None:
                 tensordict.set(key, value)
-        return _update_during_reset(tensordict_reset, tensordict, self.reset_keys)
+        return super()._reset_proc_data(tensordict, tensordict_reset)
 
     def _create_done_specs(self) -> None:
         """Do nothing, because the done specs are complete.
