@@ -74,7 +74,7 @@ def test_a_family_with_changes_for_v3_has_ids_of_both_versions():
         ("robot", Panda(), r"use an id, or RobotTaskEnv\(robot=..., task"),
         ("num_env", 3, "did you mean 'num_envs'"),
         ("max_steps", 3, "did you mean 'max_episode_steps'"),
-        ("colour", "red", "accepted are env_id, num_envs, .*max_episode_steps"),
+        ("colour", "red", "accepted are env_id, .*num_envs, .*max_episode_steps"),
     ],
 )
 def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
