@@ -19,6 +19,9 @@ from PIL import Image
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
+from torch_panda.learning.geometry import find_geometry
+from torch_panda.learning.user_modules import import_modules, read_modules
+from torch_panda.testing import check_task
 from torch_panda.transforms import HindsightRelabel
 
 ROOT = Path(__file__).parents[2]
@@ -120,6 +123,24 @@ def test_own_task_is_a_valid_environment():
 
 def test_the_arm_of_own_task_moves_the_balls():
     assert (own_task.main() > 0.005).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id", "num_objects"),
+    [
+        ("ball", "Ball-v0", 1),
+        ("two_cubes", "TwoCubes-v0", 2),
+        ("lever", "Lever-v0", 1),
+        ("kuka_cylinder", "KukaCylinder-v0", 1),
+    ],
+)
+def test_the_layout_of_each_own_task_is_found(name, env_id, num_objects):
+    import_modules(read_modules([str(ROOT / "examples" / "own_tasks" / f"{name}.py")]))
+    check_task(env_id)
+    with torch_panda.make(env_id, num_envs=4, seed=0) as env:
+        geometry = find_geometry(env)
+    assert len(geometry.positions) == 1 + num_objects
+    assert geometry.goal_positions == tuple(3 * k for k in range(num_objects))
 
 
 def test_workers_run_different_episodes():
