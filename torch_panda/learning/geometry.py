@@ -127,6 +127,15 @@ class Geometry:
         return observation, to_goal, to_matrix(to_goal).flatten(-2), similarity
 
 
+def declares_layout(task: Task) -> bool:
+    """Whether a task declares a layout that fits its observations and goals."""
+    if task.observation_layout is None or task.goal_entries is None:
+        return False
+    size = sum(len(_MIRROR[quantity]) for quantity in task.observation_layout)
+    sizes = size, len(task.goal_entries.indices)
+    return sizes == (task.observation_dim, task.goal_dim)
+
+
 def read_geometry(env: RobotTaskEnv) -> Geometry | None:
     """Return the geometry of an environment.
 

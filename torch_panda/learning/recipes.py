@@ -11,6 +11,7 @@ An option on the command line overrides the recipe.
 from dataclasses import asdict
 from typing import Any
 
+from torch_panda.learning.geometry import declares_layout
 from torch_panda.registry import Registration, find_registration
 from torch_panda.tasks import (
     Drawer,
@@ -207,8 +208,7 @@ def derive_options(registration: Registration) -> dict[str, Any]:
     task, robot = registration.make_task(), registration.make_robot()
     steps = registration.max_episode_steps or task.max_episode_steps
     options: dict[str, Any] = {"gamma": round(1 - 1 / (HORIZON * steps), 4)}
-    has_layout = None not in (task.observation_layout, task.goal_entries)
-    if has_layout and robot.control_type == "ee":
+    if declares_layout(task) and robot.control_type == "ee":
         options["augmentation"] = "mirror-shift"
     if robot.control_type not in ("ee", "joints"):
         options["exploration"] = "actions"
