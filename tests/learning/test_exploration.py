@@ -214,3 +214,29 @@ def test_points_need_a_control_type_that_moves_to_them(control_type):
         pytest.raises(ValueError, match='exploration "points" needs the control type'),
     ):
         make_agent(env, Hyperparameters(exploration="points"))
+
+
+class HighReach(torch_panda.Reach):
+    """Goals in a small box high above the table, and no declared layout."""
+
+    goal_entries = None
+
+    def sample_goal(self, rng):
+        return rng.uniform((0.09, 0.09, 0.29), (0.11, 0.11, 0.31))
+
+
+def test_points_lie_in_the_box_that_is_found():
+    torch.manual_seed(0)
+    hp = Hyperparameters(exploration="points", random_eps=(1.0, 1.0))
+    robot = torch_panda.Panda(block_gripper=True)
+    with torch_panda.RobotTaskEnv(
+        robot=robot, task=HighReach(), num_envs=4, seed=0
+    ) as env:
+        agent = make_agent(env, hp)
+        (module,) = (x for x in agent.explore.modules() if hasattr(x, "steps_left"))
+        start = env.reset()
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(20):
+                agent.explore(start.clone())
+                offset = module.point - torch.tensor((0.1, 0.1, 0.3))
+                assert (offset.abs() <= 0.0101).all()
