@@ -3,9 +3,9 @@
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
 
-The default preset has the hyperparameters of the panda-gym paper (arXiv 2106.13687) or,
-where the paper gives none, those of the HER of OpenAI Baselines. `--preset tuned`
-and `--preset sample-efficient` use the recipes of the task in
+The default preset has one set of hyperparameters for every task. `--preset paper` has
+those of the panda-gym paper (arXiv 2106.13687) or, where the paper gives none, those of
+the HER of OpenAI Baselines. The other presets are tuned for each shipped task, see
 `torch_panda.learning.recipes`.
 
 With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
@@ -32,6 +32,7 @@ from torch_panda.learning.checkpoint import (
     lock_folder,
     write_options,
 )
+from torch_panda.learning.geometry import declares_layout
 from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.offline.options import (
     KINDS,
@@ -175,7 +176,8 @@ def main(args: Args | OfflineArgs) -> None:
         )
         run = make_run(args, out)
         if isinstance(args, Args) and args.preset == "recipe":
-            print(describe_recipe(args, run.agent.spaces))
+            is_declared = declares_layout(registration.make_task(args.task_options))
+            print(describe_recipe(args, run.agent.spaces, is_declared=is_declared))
         is_tuned = isinstance(args, Args) and args.preset == "tuned"
         if is_tuned and not find_recipe(args.env_id):
             print(
@@ -209,18 +211,17 @@ def main(args: Args | OfflineArgs) -> None:
         print(f"stopped and saved in {out}: the same command with --resume goes on")
 
 
-def describe_recipe(args: Args, spaces: Spaces) -> str:
-    """What the recipe derived from the task, on one line."""
+def describe_recipe(args: Args, spaces: Spaces, *, is_declared: bool) -> str:
+    """Describe the options that the recipe derived from a task, on one line."""
     geometry = spaces.geometry
     num_objects = num_goals = 0
     if geometry is not None:
         num_objects = len(geometry.positions) - 1
         num_goals = len(geometry.goal_positions)
-    declares = geometry is not None and geometry.box is None
     parts = [
         f"discount {args.gamma} for {spaces.max_episode_steps} steps",
         f"{num_objects} objects and {num_goals} goal positions "
-        f"({'declared' if declares else 'found'})",
+        f"({'declared' if is_declared else 'found'})",
         f"hindsight {args.her!r} with {args.desired_ratio:.0%} desired goals",
         f"inputs {args.relative_inputs!r}",
         f"augmentation {args.augmentation!r}",

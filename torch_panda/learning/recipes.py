@@ -61,7 +61,7 @@ OBJECT: dict[str, Any] = {
 # summarizes.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
-    *("out", "resume", "device", "video", "logger", "imports"),
+    *("out", "resume", "device", "video", "logger", "imports", "stop_when_solved"),
 }
 # Options that need the control type "ee". `find_recipe` drops them for other types.
 END_EFFECTOR_OPTIONS = ("augmentation", "start_at_object")
