@@ -51,8 +51,8 @@ def check_task(
       its pair of goals, such as the other goals of the batch;
     * an observation that does not hold the achieved goal where ``goal_entries`` says;
     * episodes that differ although they have the same seed and the same actions;
-    * sensors that observe other entries than they declare, or that overwrite tensors
-      which they have returned.
+    * sensors that observe other entries than they declare, or that later overwrite the
+      tensors that they returned.
 
     Args:
         task: An id, or a task.
@@ -70,8 +70,8 @@ def check_task(
     check = _TaskCheck(copy.deepcopy(task), copy.deepcopy(robot))
     if problems := check.find_problems(sensors):
         raise ValueError("\n".join(problems)) from check.error
-    # What is left is refused by every environment of the task, for example a key that
-    # is reserved.
+    # Every environment of the task refuses the remaining problems, such as a reserved
+    # key.
     with RobotTaskEnv(
         robot=copy.deepcopy(robot),
         task=copy.deepcopy(task),
@@ -255,7 +255,7 @@ class _TaskCheck:
         return achieved_goal.clone(), desired_goal.clone()
 
     def _find_changed_entries(self, name: str, value: dict[str, Tensor]) -> list[str]:
-        """Compare what a hook returned with what it returned first."""
+        """Compare the entries of a hook with the entries of its first call."""
         entries = {key: (tuple(x.shape), x.dtype) for key, x in value.items()}
         first = self._hook_entries.setdefault(name, entries)
         if entries == first:

@@ -184,7 +184,7 @@ def find_geometry(env: RobotTaskEnv) -> Geometry:
     observed numbers are a position. It is an object's position, unless it is the
     hand's, which every shipped robot observes first.
 
-    What cannot be found is left out. The result then has fewer ``points``.
+    A position that the observation does not contain is left out of the result.
 
     Args:
         env: The environments, which play some episodes.
