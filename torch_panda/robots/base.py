@@ -295,11 +295,10 @@ class Robot(Configured):
                 return scaled * forces[: self.num_arm_joints]
             case "joints":
                 return simulation.joint_position[:, : self.num_arm_joints] + scaled
-            case "ee":
-                position = simulation.ee_position + scaled
-                return position.clamp(self._lowest, self._highest)
         position = simulation.ee_position + scaled[:, :3]
         position = position.clamp(self._lowest, self._highest)
+        if self.control_type == "ee":
+            return position
         rotation = rotation_vector_to_quaternion(scaled[:, 3:].double())
         orientation = quaternion_product(simulation.ee_orientation, rotation)
         return torch.cat((position, orientation), dim=1)
