@@ -128,6 +128,7 @@ class VectorSimulation:
         self.ee_state = state.ee_state
         self.ee_orientation = state.ee_orientation
         self.object_pose = state.object_pose
+        self.object_position = state.object_position
         self.object_state = state.object_state
         self.object_velocity = state.object_velocity
         self.object_euler = state.object_euler

@@ -23,6 +23,7 @@ class SimulationState:
         ee_state: (num_envs, 6), position and velocity.
         ee_orientation: (num_envs, 4), quaternion xyzw.
         object_pose: (num_envs, n_objects, 7), position [m] and quaternion xyzw.
+        object_position: (num_envs, n_objects, 3) [m].
         object_state: (num_envs, n_objects, 12), position [m], Euler angles [rad] and
             velocity.
         object_velocity: (num_envs, n_objects, 6), linear [m/s] and angular [rad/s].
@@ -58,6 +59,7 @@ class SimulationState:
         self.ee_column = 2 * n_joints
         self.ee_state = self.rows[:, self.ee_column : self.ee_column + 6]
         self.object_pose = object_pose.unflatten(1, (n_objects, 7))
+        self.object_position = self.object_pose[..., :3]
         self.object_state = object_state.unflatten(1, (n_objects, 12))
         self.object_euler = self.object_state[..., 3:6]
         self.object_velocity = self.object_state[..., 6:]

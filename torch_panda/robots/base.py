@@ -295,13 +295,17 @@ class Robot(Configured):
                 return scaled * forces[: self.num_arm_joints]
             case "joints":
                 return simulation.joint_position[:, : self.num_arm_joints] + scaled
-        position = simulation.ee_position + scaled[:, :3]
-        position = position.clamp(self._lowest, self._highest)
-        if self.control_type == "ee":
-            return position
+            case "ee":
+                return self._move_ee(scaled, simulation)
+        position = self._move_ee(scaled[:, :3], simulation)
         rotation = rotation_vector_to_quaternion(scaled[:, 3:].double())
         orientation = quaternion_product(simulation.ee_orientation, rotation)
         return torch.cat((position, orientation), dim=1)
+
+    def _move_ee(self, offset: Tensor, simulation: VectorSimulation) -> Tensor:
+        """Positions of the end-effector at an offset [m], within the workspace."""
+        position = simulation.ee_position + offset
+        return position.clamp(self._lowest, self._highest)
 
     def control(
         self, client: PhysicsClient, body: int, setpoint: npt.NDArray[np.float64]

@@ -91,4 +91,4 @@ class Push(Task):
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Position of the cube, (num_envs, 3)."""
-        return simulation.object_pose[:, 0, :3]
+        return simulation.object_position.select(1, 0)

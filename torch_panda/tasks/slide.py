@@ -120,4 +120,4 @@ class Slide(Task):
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
         """Position of the puck, (num_envs, 3)."""
-        return simulation.object_pose[:, 0, :3]
+        return simulation.object_position.select(1, 0)
