@@ -356,6 +356,19 @@ def test_runs_from_before_these_options_are_resumed(tmp_path):
         train.main(replace(args, resume=True, physics="fast"))
 
 
+def test_a_run_of_another_machine_goes_on_with_other_devices(tmp_path):
+    """The state of a machine with more GPUs than this one is resumed here."""
+    args = Args(num_envs=2, total_steps=100, updates_per_step=0.1, video=False)
+    args.out = tmp_path
+    train.main(args)
+    state = torch.load(tmp_path / "resume.pt")
+    state["args"]["device"] = "cuda"
+    state["cuda_random"] = [state["random"]] * (torch.cuda.device_count() + 1)
+    torch.save(state, tmp_path / "resume.pt")
+    train.main(replace(args, resume=True, total_steps=200))
+    assert read_curve(tmp_path)[-1]["step"] == "200"
+
+
 def test_help_shows_the_defaults_of_the_preset(capsys):
     with pytest.raises(SystemExit):
         parse(["--help", "--preset", "tuned", "--env-id", "PandaSlide-v1"])

@@ -26,7 +26,9 @@ RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
 # offline learning.
 SAVE_INTERVAL = 20_000
 # Options that may change when a run is resumed.
-FREE_OPTIONS = {"resume", "out", "video", "imports", "logger", "stop_when_solved"}
+FREE_OPTIONS = {
+    *("resume", "out", "device", "video", "imports", "logger", "stop_when_solved"),
+}
 
 
 @dataclass
@@ -108,7 +110,10 @@ class Checkpoint:
         )
         finite = ("agent", "optimizer")
         path = self.out / "resume.pt"
-        state = files.read(path, "the state of a run", keys, finite=finite)
+        # The run may go on on another device.
+        state = files.read(
+            path, "the state of a run", keys, finite=finite, map_location="cpu"
+        )
         # Runs of earlier versions had no such options.
         saved = {"task_options": {}, "physics": "exact", **state["args"]}
         options = fixed_options(self.args)
@@ -132,7 +137,8 @@ class Checkpoint:
             setattr(self.progress, name, value)
         # Last, so that nothing draws random numbers before the run continues.
         torch.set_rng_state(state["random"])
-        torch.cuda.set_rng_state_all(state["cuda_random"])
+        if len(state["cuda_random"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda_random"])
 
 
 def crossed(interval: int, before: int, after: int) -> bool:
