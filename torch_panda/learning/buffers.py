@@ -37,15 +37,15 @@ STORED_KEYS: list[NestedKey] = [
 
 
 class ResumableReplayBuffer(TensorDictReplayBuffer):
-    """A replay buffer that also loads the state of a buffer with a smaller capacity."""
+    """A replay buffer that also loads the state of another device or smaller buffer."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state of a buffer whose capacity is at most that of this one."""
         storage = state_dict["_storage"]
-        rows = TensorDict().load_state_dict(storage["_storage"], strict=False)
-        missing = self.storage.max_size - len(rows)
-        if storage["initialized"] and missing > 0:
-            padded = pad(rows, [0, missing])
+        if storage["initialized"]:
+            rows = TensorDict().load_state_dict(storage["_storage"], strict=False)
+            rows = rows.to(self.storage.device)
+            padded = pad(rows, [0, self.storage.max_size - len(rows)])
             storage = {**storage, "_storage": padded.state_dict()}
         super().load_state_dict({**state_dict, "_storage": storage})
 
