@@ -307,6 +307,11 @@ def register(
     _REGISTRATIONS[env_id] = registration
 
 
+def is_registered(env_id: str) -> bool:
+    """Whether an id is shipped, or was registered with `register`."""
+    return env_id in _REGISTRATIONS
+
+
 def find_registration(env_id: str) -> Registration:
     """Return the registration of an id.
 

@@ -15,7 +15,7 @@ from torch_panda.experts.cube_orientations import (
     to_matrix,
 )
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.geometry import find_geometry, read_geometry
+from torch_panda.learning.geometry import find_geometry, probe, read_geometry
 from torch_panda.rotations import rotation_distance
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
@@ -135,7 +135,7 @@ def test_a_layout_that_is_not_declared_is_found():
 def test_the_found_layout_is_the_declared_one(env_id):
     torch.manual_seed(0)
     with torch_panda.make(env_id, num_envs=4, seed=0) as env:
-        found, declared = find_geometry(env), read_geometry(env)
+        found, declared = find_geometry(probe(env)), read_geometry(env)
     for name in ("points", "origins", "positions", "goal_positions"):
         assert getattr(found, name) == getattr(declared, name), name
 
@@ -146,5 +146,5 @@ def test_each_object_of_a_stack_is_found_and_a_quaternion_is_no_position():
         ("PandaFlip-v1", (0,), ()),
     ):
         with torch_panda.make(env_id, num_envs=4, seed=0) as env:
-            found = find_geometry(env)
+            found = find_geometry(probe(env))
         assert (found.positions, found.goal_positions) == (positions, goals)

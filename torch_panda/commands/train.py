@@ -32,6 +32,7 @@ from torch_panda.learning.checkpoint import (
     lock_folder,
     write_options,
 )
+from torch_panda.learning.environments import is_from_gymnasium, make_env
 from torch_panda.learning.geometry import declares_layout
 from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.offline.options import (
@@ -170,13 +171,14 @@ def main(args: Args | OfflineArgs) -> None:
             check(args)
             preset, default = {}, default_args(args.preset, args.env_id, args.algo)
         check_folder(out, resume=args.resume)
-        registration = find_registration(args.env_id)
-        check_task(
-            registration.make_task(args.task_options), robot=registration.make_robot()
-        )
+        is_declared = False
+        if not is_from_gymnasium(args.env_id):
+            registration = find_registration(args.env_id)
+            task = registration.make_task(args.task_options)
+            check_task(task, robot=registration.make_robot())
+            is_declared = declares_layout(task)
         run = make_run(args, out)
         if isinstance(args, Args) and args.preset == "recipe":
-            is_declared = declares_layout(registration.make_task(args.task_options))
             print(describe_recipe(args, run.agent.spaces, is_declared=is_declared))
         is_tuned = isinstance(args, Args) and args.preset == "tuned"
         if is_tuned and not find_recipe(args.env_id):
@@ -193,11 +195,12 @@ def main(args: Args | OfflineArgs) -> None:
     run.close()
     if finished and args.video:
         try:
-            with torch_panda.make(
+            with make_env(
                 args.env_id,
                 num_envs=4,
                 seed=args.seed,
                 device=args.device,
+                renders=True,
                 **args.env_options,
             ) as env:
                 record(env, run.agent.policy, out / "video.mp4")

@@ -19,6 +19,7 @@ from torchrl.envs.utils import RandomPolicy
 
 import torch_panda
 from torch_panda.experts import make_expert
+from torch_panda.learning.environments import make_env, refusal
 from torch_panda.learning.limits import Port, Positive, Seed, check_limits
 from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
@@ -139,7 +140,11 @@ def main(args: Args) -> None:
             trained = load_policy(args.policy)
         env_id = args.env_id or (trained.env_id if trained else "PandaPush-v1")
         num_envs = 1 if args.human else args.num_envs
-        with torch_panda.make(env_id, num_envs=num_envs, seed=args.seed) as env:
+        with make_env(env_id, num_envs=num_envs, seed=args.seed, renders=True) as env:
+            if args.human or args.web:
+                if not isinstance(env, torch_panda.RobotTaskEnv):
+                    raise refusal(env_id, "window", "viewer")
+                robot_env = env
             policy: TensorDictModuleBase
             if trained:
                 policy = trained
@@ -153,14 +158,14 @@ def main(args: Args) -> None:
                 if trained and Path(args.policy).exists():
                     policies = follow(Path(args.policy))
                 serve(
-                    env,
+                    robot_env,
                     policies,
                     host=args.host,
                     port=args.port,
                     allowed_hosts=args.allowed_hosts,
                 )
             elif args.human:
-                show(env, policy, args.num_envs)
+                show(robot_env, policy, args.num_envs)
             else:
                 record(env, policy, args.out)
                 print(f"wrote {args.out}")

@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, pad
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.environments import GoalEnv
 from torch_panda.transforms import HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "geometric", "none"]
@@ -51,7 +51,7 @@ class ResumableReplayBuffer(TensorDictReplayBuffer):
 
 
 def make_buffer(
-    env: RobotTaskEnv,
+    env: GoalEnv,
     capacity: int,
     *,
     her: Hindsight = "relabel",
@@ -83,7 +83,8 @@ def make_buffer(
     # `success_fn` is None below, because success is not stored (see `STORED_KEYS`).
     transform = None
     if her != "none":
-        num_objects, rest = divmod(env.task.goal_dim, POSITION_SIZE)
+        goal_size = env.observation_spec["desired_goal"].shape[-1]
+        num_objects, rest = divmod(goal_size, POSITION_SIZE)
         if her == "parts" and (rest or num_objects < 2):
             raise ValueError(
                 "--her parts needs goals of several objects, such as those of Stack: "

@@ -11,6 +11,7 @@ from torchrl.record.loggers import Logger
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
 from torch_panda.learning.checkpoint import Checkpoint, Progress
+from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.evaluation import (
     evaluate_episodes,
     evaluate_fixed_starts,
@@ -19,7 +20,6 @@ from torch_panda.learning.evaluation_tasks import evaluation_tasks
 from torch_panda.learning.logger import close_logger
 from torch_panda.learning.plots import plot_curve
 from torch_panda.learning.policy_files import AnyAgent, save_policy
-from torch_panda.registry import make
 
 EPISODES = 80  # episodes of each evaluation
 NUM_ENVS = 16  # environments that run these episodes in parallel
@@ -36,7 +36,7 @@ class Curve:
         logger: Also gets each row, under the names of the columns.
         offline: Whether the agent learns offline. If so, steps are gradient steps, and
             the policy is also evaluated from the five `evaluation_tasks`.
-        **env_options: Other arguments of `torch_panda.make`.
+        **env_options: Other arguments of `make_env`.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Curve:
         self.logger = logger
         self.xlabel = "gradient steps" if offline else "environment steps"
         self.tasks = evaluation_tasks(env_id) if offline else {}
-        self.env = make(env_id, num_envs=NUM_ENVS, device=device, **env_options)
+        self.env = make_env(env_id, num_envs=NUM_ENVS, device=device, **env_options)
 
     def begin(self, checkpoint: Checkpoint) -> None:
         """Evaluate the policy of a new run.
@@ -91,6 +91,7 @@ class Curve:
             "seconds": round(progress.seconds, 2),
         }
         if self.tasks:
+            assert isinstance(self.env, RobotTaskEnv)
             fixed = evaluate_fixed_starts(
                 self.env, self.agent.policy, EPISODES, self.tasks, seed=draw_seed()
             )
@@ -123,7 +124,7 @@ def draw_seed() -> int:
     return int(torch.randint(2**62, ()))
 
 
-def reseed(env: RobotTaskEnv) -> None:
+def reseed(env: GoalEnv) -> None:
     """Seed the next episodes from torch's global generator.
 
     A run saves the state of this generator. So a resumed run has the same episodes.

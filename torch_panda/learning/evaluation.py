@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.environments import GoalEnv, make_env, refusal
 from torch_panda.learning.evaluation_tasks import evaluation_tasks
 from torch_panda.learning.rollouts import Policy, play_episodes
-from torch_panda.registry import make
 
 Tasks = Literal["random", "fixed"]
 
@@ -106,7 +106,8 @@ def evaluate(
             five, so that each start gets the same number of episodes. Each episode
             begins with `RANDOM_ACTIONS` random actions, drawn from ``seed``, so that
             the episodes from one start differ.
-        **options: Other arguments of `make`, such as ``task_options`` and ``device``.
+        **options: Other arguments of `make`, such as ``task_options`` and ``device``,
+            or ``workers`` for an id of Gymnasium.
 
     Raises:
         ValueError: The id is unknown, or an argument is out of range.
@@ -126,9 +127,11 @@ def evaluate(
     num_envs = min(num_envs, episodes)
     with (
         _evaluation_mode(policy),
-        make(env_id, num_envs=num_envs, seed=seed, **options) as env,
+        make_env(env_id, num_envs=num_envs, seed=seed, **options) as env,
     ):
         if tasks == "fixed":
+            if not isinstance(env, RobotTaskEnv):
+                raise refusal(env_id, "fixed tasks")
             states = evaluation_tasks(env_id)
             return evaluate_fixed_starts(env, policy, episodes, states, seed=seed)
         return evaluate_episodes(env, policy, episodes)
@@ -170,7 +173,7 @@ def _check_results(policy: Policy) -> Policy:
     return act
 
 
-def evaluate_episodes(env: RobotTaskEnv, policy: Policy, episodes: int) -> Evaluation:
+def evaluate_episodes(env: GoalEnv, policy: Policy, episodes: int) -> Evaluation:
     """Evaluate a policy over the next episodes of a batch of environments."""
     parts: list[Evaluation] = []
     while sum(len(part.success) for part in parts) < episodes:

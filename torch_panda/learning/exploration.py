@@ -52,13 +52,14 @@ class RandomPointModule(TensorDictModuleBase):
         action_scale: Displacement that an action of 1 causes in one step, [m] for the
             end-effector and [rad] for joints.
         moves_joints: Whether the actions are displacements of joints. Otherwise the
-            first three entries of an action displace the end-effector, and the first
-            three entries of ``observation`` are its position [m].
+            first three entries of an action displace the end-effector.
         num_arm_actions: Number of entries of an action that move the arm. They come
             first.
         object_columns: For each object, the first of the three columns of
             ``observation`` with its position [m]. Without objects, all points are
             anywhere in the box.
+        hand_column: The first of the three columns of ``observation`` with the position
+            of the end-effector [m].
         box: Lowest and highest (x, y, z) of the points, in the world frame [m].
     """
 
@@ -78,6 +79,7 @@ class RandomPointModule(TensorDictModuleBase):
         moves_joints: bool,
         num_arm_actions: int,
         object_columns: Sequence[int],
+        hand_column: int = 0,
         box: tuple[Sequence[float], Sequence[float]] = BOX,
     ) -> None:
         super().__init__()
@@ -93,6 +95,7 @@ class RandomPointModule(TensorDictModuleBase):
         )
         self.action_scale = action_scale
         self.moves_joints = moves_joints
+        self.hand = slice(hand_column, hand_column + 3)
         self.box = box
         self.num_objects = len(object_columns)
         # Columns of the three coordinates of each object, (num_objects, 3).
@@ -159,7 +162,7 @@ class RandomPointModule(TensorDictModuleBase):
     def _move(self, observation: Tensor) -> Tensor:
         """Return the arm's actions towards the points, before noise and clipping."""
         if not self.moves_joints:
-            return (self.point - observation[..., :3]) / self.action_scale
+            return (self.point - observation[..., self.hand]) / self.action_scale
         # The positions of the joints are not observed. So `point` holds the remaining
         # displacement, and each action reduces it.
         action = (self.point / self.action_scale).clamp(-1.0, 1.0)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.experts.cube_orientations import (
@@ -39,6 +40,11 @@ WIDTH: Quantity = "number"  # the distance between the fingers is one number
 # Rollouts, and steps of each, with which `find_geometry` looks at a task.
 _PROBE_ROLLOUTS, _PROBE_STEPS = 4, 30
 _SAME = 1e-5  # largest difference of equal numbers
+_AXES = 3
+# Steps over which the change of a position is compared with the actions, and the least
+# correlation of the two along each axis.
+_PROBE_WINDOW = 10
+_FOLLOWS = 0.6
 # Distances from the lowest and the highest start of an object to the ends of the box of
 # points, along x, y and z [m].
 _MARGINS = ((0.05, 0.05, 0.02), (0.05, 0.05, 0.06))
@@ -71,7 +77,8 @@ class Geometry:
         observation: Factors that mirror an observation, (observation size,).
         goal: Factors that mirror a goal, (goal size,).
         action: Factors that mirror an action, (action size,); None for joint control.
-        positions: First column of each position in an observation.
+        positions: First column of each position in an observation. The first one is
+            the hand's, unless the hand is unknown.
         goal_positions: First column of each position in a goal.
         goal_height: Height of all goals that the task draws [m]. Networks that see
             differences of positions get this height for all goals, because achieved
@@ -177,24 +184,80 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
     )
 
 
-def find_geometry(env: RobotTaskEnv) -> Geometry:
-    """Find the geometry of a task that does not declare it, from random actions.
+class Hand(NamedTuple):
+    """Where an environment observes the hand, and how actions move it.
 
-    Three successive numbers of the achieved goal that are equal to three successive
-    observed numbers are a position. It is an object's position, unless it is the
-    hand's, which every shipped robot observes first.
+    Attributes:
+        column: First of the three columns of ``observation`` with its position.
+        action_scale: Displacement that an action of 1 causes in one step.
+    """
 
-    A position that the observation does not contain is left out of the result.
+    column: int
+    action_scale: float
 
-    Args:
-        env: The environments, which play some episodes.
+
+def probe(env: EnvBase) -> TensorDict:
+    """Play some episodes with random actions, for `find_geometry` and `find_hand`.
+
+    Returns:
+        Transitions [rollouts, steps].
     """
     played = [
         env.rollout(_PROBE_STEPS, break_when_any_done=False)
         for _ in range(_PROBE_ROLLOUTS)
     ]
-    rollouts = TensorDict.stack(played).reshape(-1, _PROBE_STEPS)
-    first, following = rollouts[:, 0], rollouts.reshape(-1).get("next")
+    return TensorDict.stack(played).reshape(-1, _PROBE_STEPS)
+
+
+def find_hand(rollouts: TensorDict) -> Hand | None:
+    """Find the hand of an environment whose first three actions displace it.
+
+    Its position is the three successive observed numbers that follow these actions
+    best. A velocity follows them for a few steps only, so the change of a number over
+    `_PROBE_WINDOW` steps is compared with the sum of the actions.
+
+    Args:
+        rollouts: Transitions with random actions, [rollouts, steps].
+
+    Returns:
+        None if no three numbers follow the actions.
+    """
+    action, observation = rollouts["action"], rollouts["observation"]
+    if action.shape[-1] < _AXES:
+        return None
+    window = _PROBE_WINDOW
+    sums = action[..., :_AXES].unfold(1, window, 1).sum(-1)[:, :-1]
+    change = observation[:, window:] - observation[:, :-window]
+    sums, change = (x.double().flatten(0, 1) for x in (sums, change))
+    sums, change = sums - sums.mean(0), change - change.mean(0)
+    slopes = (change.T @ sums) / sums.square().sum(0)  # (observed numbers, 3)
+    norms = change.norm(dim=0)[:, None] * sums.norm(dim=0)
+    correlations = (change.T @ sums) / norms.clamp(min=_SAME**2)
+    best = Hand(0, 0.0)
+    least = _FOLLOWS
+    for column in range(observation.shape[-1] - _AXES + 1):
+        rows = slice(column, column + _AXES)
+        if correlations[rows].diagonal().min() > least:
+            least = float(correlations[rows].diagonal().min())
+            best = Hand(column, float(slopes[rows].diagonal().mean()))
+    return best if best.action_scale > 0 else None
+
+
+def find_geometry(rollouts: TensorDict, hand: int | None = 0) -> Geometry:
+    """Find the geometry of a task that does not declare it, from random actions.
+
+    Three successive numbers of the achieved goal that are equal to three successive
+    observed numbers are a position. It is an object's position, unless it is the
+    hand's.
+
+    A position that the observation does not contain is left out of the result.
+
+    Args:
+        rollouts: Transitions with random actions, [rollouts, steps].
+        hand: First column of ``observation`` with the position of the hand. Every
+            shipped robot observes it first. None means that it is unknown.
+    """
+    following = rollouts.reshape(-1).get("next")
     observation, achieved = following["observation"], following["achieved_goal"]
     size, goal_size = observation.shape[-1], achieved.shape[-1]
     columns = _find_columns(observation, achieved)
@@ -207,14 +270,14 @@ def find_geometry(env: RobotTaskEnv) -> Geometry:
         if column is None or others != [column + 1, column + 2]:
             continue
         goals.append(start)
-        if column not in (0, *objects):
+        if column not in (hand, *objects):
             objects.append(column)
-            pairs.append((0, column))
+            pairs += [] if hand is None else [(hand, column)]
         pairs.append((column, size + start))
     # Points are drawn around the starts of the objects, or of the goals of the hand.
-    centres = [first["observation"][:, k : k + 3] for k in objects]
+    centres = [rollouts["observation"][:, 0, k : k + 3] for k in objects]
     if not objects:
-        centres = [first["desired_goal"][:, k : k + 3] for k in goals]
+        centres = [rollouts["desired_goal"][:, 0, k : k + 3] for k in goals]
     box = None
     if centres:
         lowest, highest = torch.cat(centres).aminmax(dim=0)
@@ -229,7 +292,7 @@ def find_geometry(env: RobotTaskEnv) -> Geometry:
         observation=(1.0,) * size,
         goal=(1.0,) * goal_size,
         action=None,  # whether the task is symmetric is unknown
-        positions=(0, *objects),
+        positions=tuple(objects) if hand is None else (hand, *objects),
         goal_positions=tuple(goals),
         goal_height=None,
         orientation=None,

@@ -8,6 +8,7 @@ from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
 from torch_panda.learning.agents import Hyperparameters
 from torch_panda.learning.buffers import Hindsight
+from torch_panda.learning.environments import is_from_gymnasium, refusal
 from torch_panda.learning.hyperparameters import Algo
 from torch_panda.learning.limits import (
     Count,
@@ -59,6 +60,9 @@ class Args(Hyperparameters):
     """seed of the environments, the networks and the sampling"""
     num_envs: Positive = 4
     """number of environments stepped in parallel"""
+    workers: Positive = 1
+    """processes for environments of Gymnasium: 1 steps them in this process, and a
+    larger number gives each of them a process of its own"""
     total_steps: Count = 4_000
     """environment steps, summed over all environments; 0 stops after the
     `pretrain_updates`"""
@@ -110,6 +114,13 @@ class Args(Hyperparameters):
     def env_options(self) -> dict[str, Any]:
         """Arguments of `torch_panda.make` for all environments of the run."""
         return {"task_options": self.task_options, "physics": self.physics}
+
+
+# Options that environments of Gymnasium do not have.
+OWN_OPTIONS = (
+    *("task_options", "physics", "start_at_object", "continue_after_success"),
+    *("randomize", "demos"),
+)
 
 
 # CRL needs these goals: the critic's positive goals are achieved k steps later in the
@@ -169,6 +180,11 @@ def check(args: Args) -> None:
         )
     if not args.total_steps and not args.pretrain_updates:
         raise ValueError("total_steps must be positive without pretrain_updates, got 0")
+    if is_from_gymnasium(args.env_id):
+        default = Args()
+        refused = [x for x in OWN_OPTIONS if getattr(args, x) != getattr(default, x)]
+        if refused:
+            raise refusal(args.env_id, *refused)
     check_device(args.device)
     check_logger(args.logger)
 

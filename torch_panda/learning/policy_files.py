@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from typing_extensions import Self
 
-from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
 from torch_panda.learning.agents import AGENTS, Agent, Hyperparameters
+from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.offline.base import OfflineAgent, OfflineHyperparameters
 from torch_panda.learning.spaces import Spaces, read_spaces
@@ -111,7 +111,7 @@ class SavedPolicy:
             ) from None
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
-    def make_agent(self, env: RobotTaskEnv | None = None) -> AnyAgent:
+    def make_agent(self, env: GoalEnv | None = None) -> AnyAgent:
         """Make an agent with this policy, and with untrained critics.
 
         Args:

@@ -8,10 +8,18 @@ An option that is not in a recipe keeps its default, the value of the preset "pa
 An option on the command line overrides the recipe.
 """
 
+import functools
 from dataclasses import asdict
 from typing import Any
 
-from torch_panda.learning.geometry import declares_layout
+from torch_panda.learning.environments import is_from_gymnasium
+from torch_panda.learning.geometry import (
+    declares_layout,
+    find_geometry,
+    find_hand,
+    probe,
+)
+from torch_panda.learning.gym_goal_env import GymGoalEnv
 from torch_panda.registry import Registration, find_registration
 from torch_panda.tasks import (
     Drawer,
@@ -218,6 +226,24 @@ def derive_options(registration: Registration) -> dict[str, Any]:
     return options
 
 
+@functools.cache
+def derive_gym_options(env_id: str) -> dict[str, Any]:
+    """Find options of the preset "recipe" for an environment of Gymnasium.
+
+    It plays some episodes with random actions.
+    """
+    with GymGoalEnv(env_id, num_envs=4, seed=0) as env:
+        rollouts, steps = probe(env), env.max_episode_steps
+    hand = find_hand(rollouts)
+    geometry = find_geometry(rollouts, None if hand is None else hand.column)
+    options: dict[str, Any] = {"gamma": round(1 - 1 / (HORIZON * steps), 4)}
+    if hand is None:
+        options["exploration"] = "actions"
+    if len(geometry.goal_positions) > 1:
+        options["her"] = "parts"
+    return options
+
+
 def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
     """Return the recipe of a preset for the task of an id.
 
@@ -232,6 +258,13 @@ def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
     Raises:
         ValueError: The id is unknown.
     """
+    if is_from_gymnasium(env_id):
+        if preset != "recipe":
+            raise ValueError(
+                f"the preset {preset} is tuned for the tasks of torch_panda: {env_id} "
+                "needs --preset recipe"
+            )
+        return RECIPE | derive_gym_options(env_id)
     registration = find_registration(env_id)
     if preset == "recipe":
         return RECIPE | derive_options(registration)

@@ -8,12 +8,13 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.environments import GoalEnv
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 def play_episodes(
-    env: RobotTaskEnv,
+    env: GoalEnv,
     policy: Policy,
     exploration: ExplorationType = ExplorationType.DETERMINISTIC,  # type: ignore[assignment]
     start: TensorDictBase | None = None,
@@ -36,7 +37,8 @@ def play_episodes(
             env.max_episode_steps,
             policy,
             break_when_any_done=False,
-            break_when_all_done=True,
+            # An environment of Gymnasium cannot wait for the others, so it goes on.
+            break_when_all_done=isinstance(env, RobotTaskEnv),
             auto_reset=start is None,
             tensordict=start,
         )

@@ -13,7 +13,14 @@ from torchrl.data import Bounded, TensorSpec
 from typing_extensions import Self
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.learning.geometry import Geometry, find_geometry, read_geometry
+from torch_panda.learning.environments import GoalEnv
+from torch_panda.learning.geometry import (
+    Geometry,
+    find_geometry,
+    find_hand,
+    probe,
+    read_geometry,
+)
 from torch_panda.tasks import Task
 
 
@@ -71,7 +78,7 @@ class Spaces:
         return Bounded(-1.0, 1.0, shape, device=device)
 
 
-def read_spaces(env: RobotTaskEnv, *, finds_layout: bool = False) -> Spaces:
+def read_spaces(env: GoalEnv, *, finds_layout: bool = False) -> Spaces:
     """Read the sizes and the layout of an environment.
 
     Args:
@@ -79,22 +86,49 @@ def read_spaces(env: RobotTaskEnv, *, finds_layout: bool = False) -> Spaces:
         finds_layout: Whether to find a layout that the task does not declare, from some
             episodes with random actions; see `find_geometry`.
     """
-    robot, task = env.robot, env.task
+    if isinstance(env, RobotTaskEnv):
+        return _read_robot_spaces(env, finds_layout=finds_layout)
+    hand = geometry = None
+    if finds_layout:
+        rollouts = probe(env)
+        hand = find_hand(rollouts)
+        geometry = find_geometry(rollouts, None if hand is None else hand.column)
+    sizes = _read_sizes(env)
+    return Spaces(
+        **sizes,
+        # After the three numbers that move the hand, one more moves the fingers.
+        has_free_gripper=hand is not None and sizes["action_size"] == 4,
+        has_sparse_reward=env.has_sparse_reward,
+        geometry=geometry,
+        action_scale=1.0 if hand is None else hand.action_scale,
+        moves_joints=False,
+    )
+
+
+def _read_robot_spaces(env: RobotTaskEnv, *, finds_layout: bool) -> Spaces:
+    robot = env.robot
     geometry = read_geometry(env)
     if geometry is None and finds_layout:
-        geometry = find_geometry(env)
+        geometry = find_geometry(probe(env))
     return Spaces(
-        observation_size=env.observation_spec["observation"].shape[-1],
-        goal_size=env.observation_spec["desired_goal"].shape[-1],
-        action_size=robot.action_dim,
-        num_envs=env.batch_size.numel(),
-        max_episode_steps=env.max_episode_steps,
+        **_read_sizes(env),
         has_free_gripper=robot.has_free_gripper,
-        has_sparse_reward=has_sparse_reward(task),
+        has_sparse_reward=has_sparse_reward(env.task),
         geometry=geometry,
         action_scale=float(robot.action_scale),
         moves_joints=robot.control_type == "joints",
     )
+
+
+def _read_sizes(env: GoalEnv) -> dict[str, int]:
+    """The sizes among the attributes of `Spaces`."""
+    return {
+        "observation_size": env.observation_spec["observation"].shape[-1],
+        "goal_size": env.observation_spec["desired_goal"].shape[-1],
+        "action_size": env.action_spec.shape[-1],
+        "num_envs": env.batch_size.numel(),
+        "max_episode_steps": env.max_episode_steps,
+    }
 
 
 def has_sparse_reward(task: Task) -> bool:

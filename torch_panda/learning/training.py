@@ -35,11 +35,11 @@ from torch_panda.learning.checkpoint import (
     crossed,
 )
 from torch_panda.learning.curve import Curve, reseed
+from torch_panda.learning.environments import make_env
 from torch_panda.learning.logger import make_logger
 from torch_panda.learning.options import DEMO_RATIO, Args
 from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.starts import StartFrom, states_at_objects
-from torch_panda.registry import make
 
 # With ``--start-at-object``, each environment takes at most this number of steps in an
 # iteration. Episodes that start in the middle of the task need no more. The limit also
@@ -93,9 +93,10 @@ class Run:
         options = dict(args.env_options)
         if args.continue_after_success:
             options["terminate_on_success"] = False
-        self.env = make(
+        self.env = make_env(
             args.env_id,
             num_envs=args.num_envs,
+            workers=args.workers,
             # The constructor of the collector calls the exploration once, before the
             # first `reseed`. With exploration "points", this call may draw a point near
             # an object. The point depends on the first observation, and therefore on
@@ -151,6 +152,7 @@ class Run:
             out,
             device=args.device,
             logger=make_logger(args.logger, out, asdict(args)),
+            workers=args.workers,
             **args.env_options,
         )
         self.progress = Progress()

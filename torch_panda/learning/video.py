@@ -18,7 +18,7 @@ from torchrl.envs import step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.files import prepare
 
 CELL = (240, 320)  # height and width of a cell [pixels]
@@ -27,7 +27,7 @@ BORDER = 4  # width of a cell's frame [pixels]
 GREEN, GREY = (40, 170, 70), (120, 120, 120)
 
 
-def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
+def record(env: GoalEnv, policy: TensorDictModuleBase, path: Path) -> None:
     """Write one episode of each environment into a video.
 
     Args:
@@ -54,7 +54,7 @@ def record(env: RobotTaskEnv, policy: TensorDictModuleBase, path: Path) -> None:
     iio.imwrite(path, np.stack(frames), **options)
 
 
-def play(env: RobotTaskEnv, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
+def play(env: GoalEnv, policy: TensorDictModuleBase) -> Iterator[TensorDictBase]:
     """Run one episode, and yield its first state and the state after every step."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
@@ -64,7 +64,7 @@ def play(env: RobotTaskEnv, policy: TensorDictModuleBase) -> Iterator[TensorDict
             yield state
 
 
-def draw(env: RobotTaskEnv, state: TensorDictBase, step: int) -> npt.NDArray[np.uint8]:
+def draw(env: GoalEnv, state: TensorDictBase, step: int) -> npt.NDArray[np.uint8]:
     """Draw all environments into one picture, (height, width, 3)."""
     cells = []
     for pixels, success in zip(env.render(size=CELL), state["success"], strict=True):

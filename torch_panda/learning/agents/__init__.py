@@ -2,13 +2,13 @@
 
 import torch
 
-from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.crl import CRL
 from torch_panda.learning.agents.ddpg import DDPG
 from torch_panda.learning.agents.sac import SAC
 from torch_panda.learning.agents.td3 import TD3
 from torch_panda.learning.agents.tqc import TQC
+from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.spaces import read_spaces
 
@@ -23,7 +23,7 @@ AGENTS: dict[str, type[Agent]] = {
 __all__ = ["AGENTS", "CRL", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
 
 
-def make_agent(env: RobotTaskEnv, hp: Hyperparameters) -> Agent:
+def make_agent(env: GoalEnv, hp: Hyperparameters) -> Agent:
     """Make an untrained agent on the device of the environments that it will explore.
 
     If the agent needs a layout that the task does not declare, the environments play

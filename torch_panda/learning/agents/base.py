@@ -121,6 +121,7 @@ class Agent(nn.Module, ABC):
             num_arm_actions=spaces.num_arm_actions,
             # The first position of an observation is the hand's.
             object_columns=() if geometry is None else geometry.positions[1:],
+            hand_column=0 if geometry is None else geometry.positions[0],
             box=BOX if geometry is None or geometry.box is None else geometry.box,
         )
 

@@ -1,0 +1,77 @@
+"""Environments to learn in: those of torch_panda, or of Gymnasium with goals."""
+
+from typing import Any, TypeAlias
+
+import gymnasium
+
+from torch_panda.envs import RobotTaskEnv
+from torch_panda.learning.gym_goal_env import GymGoalEnv
+from torch_panda.registry import find_registration, is_registered, make
+
+GoalEnv: TypeAlias = RobotTaskEnv | GymGoalEnv
+"""What agents learn in. The Python interface also takes another `EnvBase` of torchrl
+with a batch size [n], the entries ``observation``, ``achieved_goal``, ``desired_goal``
+and ``success``, and the attributes ``max_episode_steps``, ``has_sparse_reward``,
+``terminate_on_success``, ``compute_reward`` and ``is_success`` of `GymGoalEnv`."""
+
+# Values of the options of `torch_panda.make` that change nothing.
+_NEUTRAL: tuple[object, ...] = (None, {}, "exact")
+
+
+def is_from_gymnasium(env_id: str) -> bool:
+    """Whether an id is one of Gymnasium, and not of torch_panda.
+
+    Raises:
+        ValueError: The id is unknown.
+    """
+    if is_registered(env_id):
+        return False
+    if env_id in gymnasium.registry:
+        return True
+    try:
+        find_registration(env_id)
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; an id of Gymnasium needs the module that registers it, such as "
+            "--import gymnasium_robotics"
+        ) from None
+    return False
+
+
+def make_env(
+    env_id: str,
+    *,
+    workers: int = 1,
+    renders: bool = False,
+    **options: Any,  # noqa: ANN401 (options of `make`)
+) -> GoalEnv:
+    """Make the environments of an id, of torch_panda or of Gymnasium.
+
+    Args:
+        env_id: The id.
+        workers: Processes of a `GymGoalEnv`.
+        renders: Whether a `GymGoalEnv` will render.
+        **options: Arguments of `torch_panda.make`. A `GymGoalEnv` takes ``num_envs``,
+            ``seed`` and ``device`` only.
+
+    Raises:
+        ValueError: The id is unknown, or an argument does not fit it.
+        TypeError: An argument is unknown.
+    """
+    if not is_from_gymnasium(env_id):
+        return make(env_id, **options)
+    accepted = {
+        name: options.pop(name)
+        for name in ("num_envs", "seed", "device")
+        if name in options
+    }
+    if refused := [name for name, x in options.items() if x not in _NEUTRAL]:
+        raise refusal(env_id, *refused)
+    return GymGoalEnv(env_id, workers=workers, renders=renders, **accepted)
+
+
+def refusal(env_id: str, *names: str) -> ValueError:
+    """The error for options that an environment of Gymnasium cannot have."""
+    return ValueError(
+        f"{env_id} is an environment of Gymnasium, which has no {' or '.join(names)}"
+    )
