@@ -99,7 +99,7 @@ def make_buffer(
             goal_parts=(POSITION_SIZE,) * num_objects if her == "parts" else None,
             seed=seed,
         )
-    storage = LazyTensorStorage(min(capacity, BUFFER_SIZE), device=env.device)
+    storage = LazyTensorStorage(min(capacity, BUFFER_SIZE), device=env.device or "cpu")
     return ResumableReplayBuffer(storage=storage, transform=transform)
 
 

@@ -34,6 +34,7 @@ class Curve:
         out: Folder of curve.csv, curve.png and checkpoint.pt.
         device: Device of the environments' outputs.
         logger: Also gets each row, under the names of the columns.
+        env: Environments for the evaluations; None makes `NUM_ENVS` of the id.
         offline: Whether the agent learns offline. If so, steps are gradient steps, and
             the policy is also evaluated from the five `evaluation_tasks`.
         **env_options: Other arguments of `make_env`.
@@ -47,6 +48,7 @@ class Curve:
         *,
         device: str,
         logger: Logger | None = None,
+        env: GoalEnv | None = None,
         offline: bool = False,
         **env_options: Any,  # noqa: ANN401 (options of `make`)
     ) -> None:
@@ -54,7 +56,9 @@ class Curve:
         self.logger = logger
         self.xlabel = "gradient steps" if offline else "environment steps"
         self.tasks = evaluation_tasks(env_id) if offline else {}
-        self.env = make_env(env_id, num_envs=NUM_ENVS, device=device, **env_options)
+        self.env = env or make_env(
+            env_id, num_envs=NUM_ENVS, device=device, **env_options
+        )
 
     def begin(self, checkpoint: Checkpoint) -> None:
         """Evaluate the policy of a new run.

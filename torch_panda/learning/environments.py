@@ -9,10 +9,13 @@ from torch_panda.learning.gym_goal_env import GymGoalEnv
 from torch_panda.registry import find_registration, is_registered, make
 
 GoalEnv: TypeAlias = RobotTaskEnv | GymGoalEnv
-"""What agents learn in. The Python interface also takes another `EnvBase` of torchrl
-with a batch size [n], the entries ``observation``, ``achieved_goal``, ``desired_goal``
-and ``success``, and the attributes ``max_episode_steps``, ``has_sparse_reward``,
-``terminate_on_success``, ``compute_reward`` and ``is_success`` of `GymGoalEnv`."""
+"""What agents learn in.
+
+From Python, `torch_panda.learning.training.Run` also takes another `EnvBase` of torchrl
+that has a batch size [n], the entries ``observation``, ``achieved_goal``,
+``desired_goal``, ``success`` and ``reward``, and the attributes ``max_episode_steps``,
+``terminate_on_success`` and ``compute_reward`` of `GymGoalEnv`. Rewards of -1 and 0 are
+learned sooner if it also has ``has_sparse_reward``."""
 
 # Values of the options of `torch_panda.make` that change nothing.
 _NEUTRAL: tuple[object, ...] = (None, {}, "exact")

@@ -12,7 +12,7 @@ import functools
 from dataclasses import asdict
 from typing import Any
 
-from torch_panda.learning.environments import is_from_gymnasium
+from torch_panda.learning.environments import GoalEnv, is_from_gymnasium
 from torch_panda.learning.geometry import (
     declares_layout,
     find_geometry,
@@ -228,15 +228,21 @@ def derive_options(registration: Registration) -> dict[str, Any]:
 
 @functools.cache
 def derive_gym_options(env_id: str) -> dict[str, Any]:
-    """Find options of the preset "recipe" for an environment of Gymnasium.
-
-    It plays some episodes with random actions.
-    """
+    """Derive options of the preset "recipe" for an environment of Gymnasium."""
     with GymGoalEnv(env_id, num_envs=4, seed=0) as env:
-        rollouts, steps = probe(env), env.max_episode_steps
+        return find_options(env)
+
+
+def find_options(env: GoalEnv) -> dict[str, Any]:
+    """Find options of the preset "recipe" for environments that declare nothing.
+
+    They play some episodes with random actions.
+    """
+    rollouts = probe(env)
     hand = find_hand(rollouts)
     geometry = find_geometry(rollouts, None if hand is None else hand.column)
-    options: dict[str, Any] = {"gamma": round(1 - 1 / (HORIZON * steps), 4)}
+    gamma = 1 - 1 / (HORIZON * env.max_episode_steps)
+    options: dict[str, Any] = {"gamma": round(gamma, 4)}
     if hand is None:
         options["exploration"] = "actions"
     if len(geometry.goal_positions) > 1:

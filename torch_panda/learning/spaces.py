@@ -98,7 +98,7 @@ def read_spaces(env: GoalEnv, *, finds_layout: bool = False) -> Spaces:
         **sizes,
         # After the three numbers that move the hand, one more moves the fingers.
         has_free_gripper=hand is not None and sizes["action_size"] == 4,
-        has_sparse_reward=env.has_sparse_reward,
+        has_sparse_reward=getattr(env, "has_sparse_reward", False),
         geometry=geometry,
         action_scale=1.0 if hand is None else hand.action_scale,
         moves_joints=False,

@@ -13,6 +13,7 @@ for bit. Gradient steps use OMP_NUM_THREADS threads, by default one.
 import os
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -34,8 +35,8 @@ from torch_panda.learning.checkpoint import (
     Progress,
     crossed,
 )
-from torch_panda.learning.curve import Curve, reseed
-from torch_panda.learning.environments import make_env
+from torch_panda.learning.curve import NUM_ENVS, Curve, reseed
+from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.logger import make_logger
 from torch_panda.learning.options import DEMO_RATIO, Args
 from torch_panda.learning.pretraining import pretrain
@@ -63,6 +64,8 @@ class Run:
             returns them. They are a part of each batch.
         demos_hash: Hash of the demonstrations, which must be the same when the run is
             resumed.
+        make_own_env: Makes environments of your own, from their number; see `GoalEnv`.
+            The id of the options is then only a name. None makes those of the id.
 
     Raises:
         TypeError: The task does not have one of the ``task_options``.
@@ -76,6 +79,8 @@ class Run:
         out: Path,
         demos: TensorDictBase | None = None,
         demos_hash: str = "",
+        *,
+        make_own_env: Callable[[int], GoalEnv] | None = None,
     ) -> None:
         self.args = args
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
@@ -84,28 +89,14 @@ class Run:
         # rounded to bfloat16 inside a product.
         torch.set_float32_matmul_precision("medium")
         torch.manual_seed(args.seed)
-        randomize = None
-        if args.randomize > 1:
-            factors = (1 / args.randomize, args.randomize)
-            randomize = Randomization(
-                object_mass=factors, object_friction=factors, table_friction=factors
-            )
-        options = dict(args.env_options)
-        if args.continue_after_success:
-            options["terminate_on_success"] = False
-        self.env = make_env(
-            args.env_id,
-            num_envs=args.num_envs,
-            workers=args.workers,
-            # The constructor of the collector calls the exploration once, before the
-            # first `reseed`. With exploration "points", this call may draw a point near
-            # an object. The point depends on the first observation, and therefore on
-            # this seed.
-            seed=args.seed,
-            device=args.device,
-            randomize=randomize,
-            **options,
-        )
+        # The constructor of the collector calls the exploration once, before the first
+        # `reseed`. With exploration "points", this call may draw a point near an
+        # object. The point depends on the first observation, and therefore on the seed.
+        if make_own_env is None:
+            self.env = self._make_env()
+        else:
+            self.env = make_own_env(args.num_envs)
+            self.env.set_seed(args.seed)
         self.agent = make_agent(self.env, args)
         steps = self.env.max_episode_steps
         if args.start_at_object:
@@ -152,6 +143,7 @@ class Run:
             out,
             device=args.device,
             logger=make_logger(args.logger, out, asdict(args)),
+            env=None if make_own_env is None else make_own_env(NUM_ENVS),
             workers=args.workers,
             **args.env_options,
         )
@@ -161,6 +153,25 @@ class Run:
         )
         if args.resume:
             self.checkpoint.load()
+
+    def _make_env(self) -> GoalEnv:
+        """Make the environments of the options, for training."""
+        args, options = self.args, dict(self.args.env_options)
+        if args.randomize > 1:
+            factors = (1 / args.randomize, args.randomize)
+            options["randomize"] = Randomization(
+                object_mass=factors, object_friction=factors, table_friction=factors
+            )
+        if args.continue_after_success:
+            options["terminate_on_success"] = False
+        return make_env(
+            args.env_id,
+            num_envs=args.num_envs,
+            workers=args.workers,
+            seed=args.seed,
+            device=args.device,
+            **options,
+        )
 
     def train(self, stop: object = False) -> bool:
         """Train until the last step, or until ``stop`` is true after an iteration.
