@@ -3,7 +3,7 @@
 import json
 import os
 import signal
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import imageio.v3 as iio
 import pytest
@@ -376,6 +376,22 @@ def test_help_shows_the_defaults_of_the_preset(capsys):
     default = words[words.index("--total-steps") :]
     steps = default_args("tuned", "PandaSlide-v1").total_steps
     assert f"{steps})" in default[: default.index("--eval-interval")]
+
+
+def test_help_separates_what_one_may_change_from_what_research_varies(capsys):
+    with pytest.raises(SystemExit):
+        parse(["--help"])
+    text = capsys.readouterr().out
+    run, research = text.split(" run options ")[1].split(" research options ")
+    assert "What one may want to change" in run
+    assert "What research varies" in research
+    for option in ("--env-id", "--total-steps", "--out", "--seed"):
+        assert option in run
+    for option in ("--gamma", "--her", "--batch-size"):
+        assert option in research
+    for option in fields(Args):
+        name = "import" if option.name == "imports" else option.name
+        assert f"--{name.replace('_', '-')} " in text.replace(",", " ")
 
 
 @pytest.mark.parametrize("preset", ["paper", "tuned"])

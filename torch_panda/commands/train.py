@@ -42,7 +42,7 @@ from torch_panda.learning.offline.options import (
     make_args_class,
 )
 from torch_panda.learning.offline.training import OfflineRun
-from torch_panda.learning.options import Args, check, default_args
+from torch_panda.learning.options import ArgGroups, Args, check, default_args
 from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.training import Run
@@ -92,7 +92,14 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
     names = [x.split("=")[0].replace("_", "-") for x in arguments]
     if "--total-steps" in names:
         default.stop_when_solved = False
-    return tyro.cli(Args, prog=PROG, args=arguments, default=default)
+    groups = tyro.cli(
+        ArgGroups,
+        prog=PROG,
+        args=arguments,
+        default=ArgGroups.from_args(default),
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    return groups.to_args()
 
 
 def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:

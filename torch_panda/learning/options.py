@@ -1,8 +1,10 @@
 """Options of a training run, and checks of their values."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
+
+from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
@@ -30,23 +32,9 @@ Preset = Literal["recipe", "paper", "tuned", "sample-efficient"]
 
 
 @dataclass
-class Args(Hyperparameters):
-    """What to train, how long, and where to write."""
+class ResearchOptions(Hyperparameters):
+    """What research varies. The recipe sets the same values for every task."""
 
-    preset: Preset = "paper"
-    """defaults of the other options: one recipe for all tasks, also for your own
-    ("recipe"); those of the panda-gym paper ("paper"); those tuned for each shipped
-    task ("tuned"), or for fewer environment steps of each ("sample-efficient"). With
-    all but "paper", the replay buffer drops a random 90 % of the rollouts whose
-    achieved goal does not change"""
-    env_id: str = "PandaReach-v1"
-    """id of the environment, shipped or registered by --import"""
-    task_options: dict[str, Finite] = field(default_factory=dict)
-    """arguments of the task to change, such as `clearance 0.0005`, also in
-    evaluations"""
-    physics: PhysicsName = "exact"
-    """how Bullet integrates, also in evaluations: "exact" as in panda-gym, or "fast"
-    and coarser"""
     her: Hindsight = "relabel"
     """hindsight goals. "relabel" relabels four of five transitions when they are
     sampled. "parts" does the same with a separate draw for each object's part of the
@@ -56,29 +44,14 @@ class Args(Hyperparameters):
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of random transitions. The
     rest are goals achieved later in the same episode"""
-    seed: Seed = 0
-    """seed of the environments, the networks and the sampling"""
     num_envs: Positive = 4
     """number of environments stepped in parallel"""
-    workers: Positive = 1
-    """processes for environments of Gymnasium: 1 steps them in this process, and a
-    larger number gives each of them a process of its own"""
-    total_steps: Count = 4_000
-    """environment steps, summed over all environments; 0 stops after the
-    `pretrain_updates`"""
-    stop_when_solved: bool = False
-    """end the training when three evaluations in a row are successful in all episodes.
-    A --total-steps on the command line turns this off"""
     updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
     batch_size: Positive = 256
     """transitions per gradient step"""
     anneal_lr: bool = False
     """let the learning rate fall linearly to 0 during the training"""
-    start_at_object: Ratio = 0.0
-    """fraction of training episodes that start in the middle of the task: the hand is
-    at an object or holds it, or the first cube of Stack is at its goal. If it is above
-    0, all training episodes last at most 50 steps"""
     continue_after_success: bool = False
     """let training episodes last until their time limit, even if the id ends them at
     success, as -v3 does. Evaluations still follow the id"""
@@ -86,34 +59,96 @@ class Args(Hyperparameters):
     """largest factor f of domain randomization. For every training episode, the mass
     and friction of the objects and the friction of the table are drawn between 1 / f
     and f times the task's values; 1 changes nothing"""
-    demos: Path | None = None
-    """demonstrations to learn from, in addition to the transitions of the run: a file
-    of `record`, or the folder of a data set"""
     pretrain_updates: Count = 0
     """gradient steps that imitate the demonstrations before the first environment step.
     During these, the learning rate falls to 0"""
-    eval_interval: Positive = 400
-    """environment steps between evaluations"""
-    out: Path | None = None
-    """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
+
+
+@dataclass
+class RunOptions:
+    """What one may want to change: what to train, how long, and where to write."""
+
+    preset: Preset = "paper"
+    """defaults of the other options: one recipe for all tasks, also for your own
+    ("recipe"); those of the panda-gym paper ("paper"); those tuned for each shipped
+    task ("tuned"), or for fewer environment steps of each ("sample-efficient"). With
+    all but "paper", the replay buffer drops a random 90 % of the rollouts whose
+    achieved goal does not change"""
+    env_id: str = "PandaReach-v1"
+    """id of the environment, shipped or registered by --import"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
+    task_options: dict[str, Finite] = field(default_factory=dict)
+    """arguments of the task to change, such as `clearance 0.0005`, also in
+    evaluations"""
+    physics: PhysicsName = "exact"
+    """how Bullet integrates, also in evaluations: "exact" as in panda-gym, or "fast"
+    and coarser"""
+    seed: Seed = 0
+    """seed of the environments, the networks and the sampling"""
+    total_steps: Count = 4_000
+    """environment steps, summed over all environments; 0 stops after the
+    `pretrain_updates`"""
+    stop_when_solved: bool = False
+    """end the training when three evaluations in a row are successful in all episodes.
+    A --total-steps on the command line turns this off"""
+    eval_interval: Positive = 400
+    """environment steps between evaluations"""
+    start_at_object: Ratio = 0.0
+    """fraction of training episodes that start in the middle of the task: the hand is
+    at an object or holds it, or the first cube of Stack is at its goal. If it is above
+    0, all training episodes last at most 50 steps"""
+    demos: Path | None = None
+    """demonstrations to learn from, in addition to the transitions of the run: a file
+    of `record`, or the folder of a data set"""
+    out: Path | None = None
+    """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
     resume: bool = False
     """continue the run in the folder. Only --out, --video, --import and --logger may
     differ from the options with which it was started, and --total-steps may be larger
     if the learning rate does not fall"""
     device: str = "cpu"
     """device of the networks and the replay buffer"""
+    workers: Positive = 1
+    """processes for environments of Gymnasium: 1 steps them in this process, and a
+    larger number gives each of them a process of its own"""
     video: bool = True
     """record a video of 4 episodes at the end"""
     logger: LoggerName = "none"
     """also log each evaluation to TensorBoard (folder "tensorboard" of the run) or to
     Weights & Biases (project "torch_panda"); curve.csv is always written"""
 
+
+@dataclass
+class Args(RunOptions, ResearchOptions):
+    """All options of a training."""
+
     @property
     def env_options(self) -> dict[str, Any]:
         """Arguments of `torch_panda.make` for all environments of the run."""
         return {"task_options": self.task_options, "physics": self.physics}
+
+
+@dataclass
+class ArgGroups:
+    """Train an agent in a task of torch_panda, of your own, or of Gymnasium."""
+
+    run: RunOptions
+    research: ResearchOptions
+
+    @classmethod
+    def from_args(cls, args: Args) -> Self:
+        """Divide options into the groups."""
+        groups = (
+            {field.name: getattr(args, field.name) for field in fields(group)}
+            for group in (RunOptions, ResearchOptions)
+        )
+        run, research = groups
+        return cls(RunOptions(**run), ResearchOptions(**research))
+
+    def to_args(self) -> Args:
+        """Join the groups."""
+        return Args(**vars(self.run), **vars(self.research))
 
 
 # Options that environments of Gymnasium do not have.
