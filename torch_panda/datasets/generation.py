@@ -14,11 +14,15 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-import torch_panda
 from torch_panda import RobotTaskEnv
 from torch_panda.checks import check_positive, check_seed
 from torch_panda.experts import make_expert
-from torch_panda.registry import max_episode_steps
+from torch_panda.learning.environments import (
+    GoalEnv,
+    episode_length,
+    is_from_gymnasium,
+    make_env,
+)
 from torch_panda.tasks import Task
 
 Kind = Literal["noisy", "play", "random"]
@@ -131,10 +135,16 @@ def generate_parts(
     num_envs = min(num_envs, num_episodes - first)
     if num_envs < 1:
         return
-    with torch_panda.make(
+    if is_from_gymnasium(env_id):
+        make_options.pop("terminate_on_success")
+    with make_env(
         env_id, num_envs=num_envs, num_threads=num_threads, **make_options
     ) as env:
-        if kind == "play" and type(env.task).sample_start is not Task.sample_start:
+        draws_with_start = (
+            isinstance(env, RobotTaskEnv)
+            and type(env.task).sample_start is not Task.sample_start
+        )
+        if kind == "play" and draws_with_start:
             raise ValueError(
                 'kind "play" needs goals that do not depend on the start of an '
                 f'episode, but those of {env_id} do: use "noisy" or "random"'
@@ -144,8 +154,13 @@ def generate_parts(
             episode_ids = torch.arange(start, min(start + num_envs, num_episodes))
             batch = _Batch(env, expert, kind, seed, start)
             rows = []
-            for _ in range(steps):
+            for step in range(steps):
                 rows.append(batch.step())
+                if rows[-1]["next", "truncated"].any() and step < steps - 1:
+                    raise ValueError(
+                        f"{env_id} ends episodes before their time limit, and data "
+                        "sets hold whole episodes only"
+                    )
                 if progress is not None:
                     progress(len(episode_ids))
             part = TensorDict.stack(rows, 1)[: len(episode_ids)]
@@ -169,7 +184,7 @@ def batch_shape(
 ) -> tuple[int, int]:
     """Batch shape [episodes, steps] of the data set that `generate` returns."""
     options = {**make_options, **fixed_options(kind)}
-    steps = options.get("max_episode_steps") or max_episode_steps(env_id)
+    steps = options.get("max_episode_steps") or episode_length(env_id)
     return -(-transitions // steps), steps
 
 
@@ -195,7 +210,7 @@ class _Batch:
 
     def __init__(
         self,
-        env: RobotTaskEnv,
+        env: GoalEnv,
         expert: TensorDictModuleBase | None,
         kind: Kind,
         seed: int,
@@ -211,13 +226,17 @@ class _Batch:
             # Draw it for all kinds, because the published hashes depend on this draw.
             noise.append(generator.uniform(0.0, MAX_NOISE))
         self._noise = torch.tensor(noise, dtype=torch.float32).unsqueeze(1)
-        outcome = {"success", *env.episodes.info_keys}
+        outcome = {"success"}
+        if isinstance(env, RobotTaskEnv):
+            outcome |= env.episodes.info_keys
         self._keys = [key for key in env.observation_spec if key not in outcome]
         self._observations = env.reset()
         if kind == "play":
             self._goal = self._observations["desired_goal"].clone()
             self._steps_at_goal = torch.zeros(env.batch_size[0], dtype=torch.int64)
             self._steps_since_goal = torch.zeros_like(self._steps_at_goal)
+            assert isinstance(env, RobotTaskEnv)  # the others have no expert
+            self._task = env.task
             self._max_steps_per_goal = type(env.task).max_episode_steps
 
     @torch.no_grad()
@@ -269,7 +288,7 @@ class _Batch:
         changes = self._steps_at_goal >= HOLD_STEPS
         changes |= self._steps_since_goal >= self._max_steps_per_goal
         for index in changes.nonzero().flatten().tolist():
-            goal = self._env.task.sample_start(self._generators[index]).goal
+            goal = self._task.sample_start(self._generators[index]).goal
             self._goal[index] = torch.as_tensor(goal, dtype=self._goal.dtype)
         self._steps_at_goal[changes] = 0
         self._steps_since_goal[changes] = 0

@@ -6,7 +6,12 @@ import gymnasium
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.gym_goal_env import GymGoalEnv
-from torch_panda.registry import find_registration, is_registered, make
+from torch_panda.registry import (
+    find_registration,
+    is_registered,
+    make,
+    max_episode_steps,
+)
 
 GoalEnv: TypeAlias = RobotTaskEnv | GymGoalEnv
 """What agents learn in.
@@ -78,3 +83,14 @@ def refusal(env_id: str, *names: str) -> ValueError:
     return ValueError(
         f"{env_id} is an environment of Gymnasium, which has no {' or '.join(names)}"
     )
+
+
+def episode_length(env_id: str) -> int:
+    """Number of steps after which the episodes of an id are truncated.
+
+    Raises:
+        ValueError: The id is unknown.
+    """
+    if is_from_gymnasium(env_id):
+        return int(gymnasium.spec(env_id).max_episode_steps or 0)
+    return max_episode_steps(env_id)

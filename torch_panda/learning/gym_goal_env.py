@@ -9,13 +9,12 @@ import numpy.typing as npt
 import torch
 from gymnasium.spaces import Box, Dict, Space
 from gymnasium.vector import AutoresetMode, VectorEnv
-from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_panda.checks import check_positive
+from torch_panda.checks import check_positive, check_seed
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 SUCCESS_KEYS = ("is_success", "success")  # in ``info``, the first one that is there
@@ -234,6 +233,10 @@ class GymGoalEnv(EnvBase):
         }
         return self._emit(observed)
 
+    def set_env_seed(self, env: int, seed: int) -> None:
+        """Seed the next episode of one environment."""
+        self._seeds[env] = check_seed(seed)
+
     def _set_seed(self, seed: int | None) -> None:
         sequence = np.random.SeedSequence(seed)
         self._seeds = [int(x) for x in sequence.generate_state(self.batch_size[0])]
@@ -252,6 +255,8 @@ class GymGoalEnv(EnvBase):
         Raises:
             OSError: The environment cannot be rendered.
         """
+        from PIL import Image  # of the extra "learning"
+
         try:
             frames = self._vector.render()
         except Exception as error:  # each simulator has errors of its own
