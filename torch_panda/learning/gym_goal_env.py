@@ -94,6 +94,7 @@ class GymGoalEnv(EnvBase):
             render_mode="rgb_array" if renders else None,
         )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.is_closed = False
         self._declare_specs()
         self._has_ended = np.zeros(num_envs, dtype=bool)
         self._seeds: list[int | None] = [None] * num_envs
@@ -210,7 +211,8 @@ class GymGoalEnv(EnvBase):
         if self._has_ended.any():
             self._start(self._has_ended.copy())
         action = tensordict["action"].detach().clamp(-1, 1).cpu().double().numpy()
-        scaled = self._low + (action + 1) / 2 * (self._high - self._low)
+        # This sum is exact at -1 and 1, so no rounding leads out of the bounds.
+        scaled = (1 - action) / 2 * self._low + (1 + action) / 2 * self._high
         observation, reward, terminated, truncated, info = self._vector.step(
             scaled.astype(self._low.dtype)
         )
