@@ -100,7 +100,7 @@ class GymGoalEnv(EnvBase):
         self._seeds: list[int | None] = [None] * num_envs
         if seed is not None:
             self.set_seed(seed)
-        reached, missed = self._probe_rewards()
+        self._takes_batches, reached, missed = self._probe_rewards()
         self._reached_reward = reached
         self.has_sparse_reward = (reached, missed) == (0.0, -1.0)
         self._rewards_show_success = reached > missed and missed in (0.0, -1.0)
@@ -134,13 +134,23 @@ class GymGoalEnv(EnvBase):
         ends = {key: flag() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=(n,), device=device)  # type: ignore[misc]
 
-    def _probe_rewards(self) -> tuple[float, float]:
-        """Rewards of an achieved goal, and of a goal that is far away."""
+    def _probe_rewards(self) -> tuple[bool, float, float]:
+        """Look at the rewards of an achieved goal and of a goal that is far away.
+
+        Returns:
+            Whether `compute_reward` takes batches of goals, and the two rewards.
+        """
         observation, _ = self._single.reset(seed=0)
-        goal = torch.as_tensor(observation["achieved_goal"], dtype=torch.float32)
-        goals = torch.stack((goal, goal + _FAR))
-        rewards = self.compute_reward(goal.expand_as(goals), goals)
-        return float(rewards[0]), float(rewards[1])
+        goal = np.asarray(observation["achieved_goal"], dtype=float)
+        achieved, desired = np.stack((goal, goal)), np.stack((goal, goal + _FAR))
+        rewards = self._compute_singly(achieved, desired)
+        try:
+            batch = self._compute_batch(achieved, desired)
+        except Exception:  # whatever its arithmetic raises for arrays
+            takes_batches = False
+        else:
+            takes_batches = batch.size == 2 and np.allclose(batch.ravel(), rewards)
+        return takes_batches, float(rewards[0]), float(rewards[1])
 
     # ---- goals -------------------------------------------------------------------
 
@@ -159,12 +169,22 @@ class GymGoalEnv(EnvBase):
             goal.detach().cpu().double().reshape(-1, goal.shape[-1]).numpy()
             for goal in (achieved_goal, desired_goal)
         )
+        compute = self._compute_batch if self._takes_batches else self._compute_singly
+        rewards = torch.from_numpy(compute(achieved, desired))
+        return rewards.reshape(*shape, 1).to(achieved_goal.device)
+
+    def _compute_batch(
+        self, achieved: npt.NDArray[Any], desired: npt.NDArray[Any]
+    ) -> npt.NDArray[np.float32]:
         compute = self._single.unwrapped.compute_reward  # type: ignore[attr-defined]
-        rewards = np.asarray(compute(achieved, desired, {}), dtype=np.float32)
-        if rewards.size != len(achieved):  # it takes single goals only
-            pairs = zip(achieved, desired, strict=True)
-            rewards = np.array([compute(*pair, {}) for pair in pairs], dtype=np.float32)
-        return torch.from_numpy(rewards.reshape(*shape, 1)).to(achieved_goal.device)
+        return np.asarray(compute(achieved, desired, {}), dtype=np.float32)
+
+    def _compute_singly(
+        self, achieved: npt.NDArray[Any], desired: npt.NDArray[Any]
+    ) -> npt.NDArray[np.float32]:
+        pairs = zip(achieved, desired, strict=True)
+        rewards = [self._compute_batch(*pair).item() for pair in pairs]
+        return np.array(rewards, dtype=np.float32)
 
     def is_success(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Whether goals are reached, by their reward: (..., 1) bool.
