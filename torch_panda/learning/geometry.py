@@ -228,9 +228,9 @@ def find_hand(rollouts: TensorDict) -> Hand | None:
     window = _PROBE_WINDOW
     sums = action[..., :_AXES].unfold(1, window, 1).sum(-1)[:, :-1]
     change = observation[:, window:] - observation[:, :-window]
-    ends = rollouts["next", "done"].float().squeeze(-1)
-    in_one_episode = ends.unfold(1, window, 1).sum(-1)[:, :-1] == 0
-    sums, change = (x[in_one_episode].double() for x in (sums, change))
+    ends = rollouts["next", "done"].squeeze(-1).unfold(1, window, 1)[:, :-1]
+    in_episode = ~ends.any(-1)
+    sums, change = (x[in_episode].double() for x in (sums, change))
     sums, change = sums - sums.mean(0), change - change.mean(0)
     slopes = (change.T @ sums) / sums.square().sum(0)  # (observed numbers, 3)
     norms = change.norm(dim=0)[:, None] * sums.norm(dim=0)
