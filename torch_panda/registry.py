@@ -320,6 +320,11 @@ def find_registration(env_id: str) -> Registration:
     """
     if isinstance(env_id, str) and env_id in _REGISTRATIONS:
         return _REGISTRATIONS[env_id]
+    if isinstance(env_id, str) and env_id in gymnasium.registry:
+        raise ValueError(
+            f"an environment of torch_panda is needed here, but {env_id} is one of "
+            "Gymnasium, without experts and data sets"
+        )
     hint = suggest(str(env_id), _REGISTRATIONS)
     own = ", ".join(sorted(_REGISTRATIONS.keys() - set(ENV_IDS)))
     raise ValueError(
