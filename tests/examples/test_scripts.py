@@ -131,7 +131,7 @@ def test_the_arm_of_own_task_moves_the_balls():
         ("ball", "Ball-v0", 1),
         ("two_cubes", "TwoCubes-v0", 2),
         ("lever", "Lever-v0", 1),
-        ("kuka_cylinder", "KukaCylinder-v0", 1),
+        ("xarm_box", "XArmBox-v0", 1),
     ],
 )
 def test_the_layout_of_each_own_task_is_found(name, env_id, num_objects):

@@ -16,6 +16,7 @@ from tests.commands.runs import read_curve, weights
 from tests.learning.hand_env import HIGH, LOW, MAX_STEPS, NEAR, SPEED, HandEnv, register
 from torch_panda.commands import evaluate, main, train, watch
 from torch_panda.commands.train import parse
+from torch_panda.datasets import generate, sha256
 from torch_panda.learning.environments import is_from_gymnasium, make_env
 from torch_panda.learning.geometry import find_geometry, find_hand, probe
 from torch_panda.learning.gym_goal_env import GymGoalEnv
@@ -501,3 +502,29 @@ def test_an_environment_of_gymnasium_has_no_expert_and_no_data(
     with pytest.raises(SystemExit, match=message) as stop:
         main([command, "--env-id", env_id, *options])
     assert "\n" not in str(stop.value)
+
+
+def test_random_data_depend_on_the_seed_alone():
+    env_id = register()
+
+    def make_data(seed, num_envs):
+        return generate(
+            env_id,
+            kind="random",
+            transitions=4 * MAX_STEPS,
+            seed=seed,
+            num_envs=num_envs,
+        )
+
+    data = make_data(5, 2)
+    assert data.shape == (4, MAX_STEPS)
+    assert sha256(data) == sha256(make_data(5, 3)) != sha256(make_data(6, 2))
+    following = data["next", "observation"][:, :-1]
+    assert torch.equal(data["observation"][:, 1:], following)
+    assert (data["observation"][:, :, TIME] == torch.arange(MAX_STEPS)).all()
+
+
+@pytest.mark.parametrize("ends", ["success", "failure"])
+def test_data_of_episodes_that_end_early_are_refused(ends):
+    with pytest.raises(ValueError, match="ends episodes before their time limit"):
+        generate(register(ends=ends), kind="random", transitions=1, seed=0, num_envs=2)

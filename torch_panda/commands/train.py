@@ -179,7 +179,7 @@ def main(args: Args | OfflineArgs) -> None:
             preset, default = {}, default_args(args.preset, args.env_id, args.algo)
         check_folder(out, resume=args.resume)
         is_declared = False
-        if not is_from_gymnasium(args.env_id):
+        if isinstance(args, OfflineArgs) or not is_from_gymnasium(args.env_id):
             registration = find_registration(args.env_id)
             task = registration.make_task(args.task_options)
             check_task(task, robot=registration.make_robot())

@@ -154,13 +154,8 @@ def generate_parts(
             episode_ids = torch.arange(start, min(start + num_envs, num_episodes))
             batch = _Batch(env, expert, kind, seed, start)
             rows = []
-            for step in range(steps):
+            for _ in range(steps):
                 rows.append(batch.step())
-                if rows[-1]["next", "truncated"].any() and step < steps - 1:
-                    raise ValueError(
-                        f"{env_id} ends episodes before their time limit, and data "
-                        "sets hold whole episodes only"
-                    )
                 if progress is not None:
                     progress(len(episode_ids))
             part = TensorDict.stack(rows, 1)[: len(episode_ids)]
@@ -231,6 +226,7 @@ class _Batch:
             outcome |= env.episodes.info_keys
         self._keys = [key for key in env.observation_spec if key not in outcome]
         self._observations = env.reset()
+        self._has_ended = False
         if kind == "play":
             self._goal = self._observations["desired_goal"].clone()
             self._steps_at_goal = torch.zeros(env.batch_size[0], dtype=torch.int64)
@@ -245,8 +241,16 @@ class _Batch:
 
         Returns:
             The transitions of all environments, (num_envs,).
+
+        Raises:
+            ValueError: An episode has ended in an earlier step.
         """
         env = self._env
+        if self._has_ended:
+            raise ValueError(
+                f"{env.env_id} ends episodes before their time limit, and data sets "
+                "hold whole episodes only"
+            )
         row = self._observations.select(*self._keys)
         if self._kind == "play":
             row["desired_goal"] = self._goal.clone()
@@ -254,7 +258,10 @@ class _Batch:
         row = env.step(row)
         after: TensorDictBase = row["next"]  # type: ignore[assignment]
         self._observations = after.select(*self._keys)
-        # `Task.failure` terminates, but the episode goes on until its last step.
+        # `Task.failure` terminates, but the episode goes on until its last step. Those
+        # of Gymnasium end.
+        if not isinstance(env, RobotTaskEnv):
+            self._has_ended = bool(after["done"].any())
         after["terminated"] = torch.zeros_like(after["terminated"])
         after["done"] = after["truncated"].clone()
         if self._kind == "play":
