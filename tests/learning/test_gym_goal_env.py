@@ -105,13 +105,17 @@ def test_a_partial_reset_leaves_the_other_environments_alone(make, workers):
 
 def test_an_environment_that_is_stepped_after_its_end_begins_an_episode(make):
     env = make()
-    state = env.rollout(MAX_STEPS, break_when_any_done=True)[:, -1]
-    state = step_mdp(state)
-    assert state["done"].all()
-    first, second = env.rand_step(state)["next"], env.rand_step(state)["next"]
-    assert first["observation"][:, TIME].tolist() == [1, 1]
-    assert second["observation"][:, TIME].tolist() == [2, 2]
-    assert not first["done"].any()
+    state = env.rollout(3)[:, -1]["next"]
+    state = env.reset(state.set("_reset", torch.tensor([[True], [False]])))
+    times, ends = [], []
+    for _ in range(MAX_STEPS):
+        state = step_mdp(env.rand_step(state))
+        times.append(state["observation"][:, TIME].tolist())
+        ends.append(state["done"].flatten().tolist())
+    late = [*range(4, MAX_STEPS + 1), 1, 2, 3]
+    assert times == [list(x) for x in zip(range(1, MAX_STEPS + 1), late, strict=True)]
+    assert [k for k, end in enumerate(ends) if end[1]] == [MAX_STEPS - 4]
+    assert [k for k, end in enumerate(ends) if end[0]] == [MAX_STEPS - 1]
 
 
 def test_equal_seeds_give_equal_episodes_with_any_number_of_processes(make):
