@@ -34,9 +34,13 @@ EXTRAS = {
     "tensorboard": Extra("train --logger tensorboard", ("tensorboard",)),
     "wandb": Extra("train --logger wandb", ("wandb",)),
     "ray": Extra("training on several machines", ("ray",)),
+    "fetch": Extra(
+        "training in Fetch and others of Gymnasium-Robotics",
+        ("gymnasium_robotics", "mujoco"),
+    ),
     "bench": Extra(
         "the other environments of bench",
-        ("gymnasium_robotics", "panda_gym", "stable_baselines3", "envpool"),
+        ("panda_gym", "stable_baselines3", "envpool"),
     ),
 }
 
