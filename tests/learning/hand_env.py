@@ -25,12 +25,13 @@ class HandEnv(gymnasium.Env):
         parts: Parts of the observation, in this order.
         rewards: "sparse" are -1 and 0, "binary" 0 and 1, "dense" minus the distance.
         goals: Goals that `compute_reward` takes; given several, it raises
-            ("single, raises") or returns one number ("single, norm") or one number for
-            each coordinate ("single, indices").
+            ("raises") or returns one number ("norm") or one number for
+            each coordinate ("indices").
         tells: Entries of ``info`` that say whether the time is odd or even, or that
             exist only where the x of the hand is positive.
         ends: Ends an episode at success, or at failure, once the time is 5.
         follows: Whether the hand follows the actions.
+        goal_size: Number of coordinates of a goal.
         has_object: Whether the goal is the object's and not the hand's.
         is_broken: Whether rendering fails.
         render_mode: As in Gymnasium.
@@ -46,12 +47,14 @@ class HandEnv(gymnasium.Env):
         tells=(),
         ends: Literal["never", "success", "failure"] = "never",
         follows=True,
+        goal_size=3,
         has_object=True,
         is_broken=False,
         render_mode=None,
     ):
         self.parts, self.rewards, self.goals, self.tells = parts, rewards, goals, tells
         self.ends, self.follows, self.has_object = ends, follows, has_object
+        self.goal_size = goal_size
         self.is_broken, self.render_mode = is_broken, render_mode
         self.action_space = Box(LOW, HIGH)
         self._start()
@@ -73,8 +76,8 @@ class HandEnv(gymnasium.Env):
         observation = np.concatenate([getattr(self, part) for part in self.parts])
         return {
             "observation": observation,
-            "achieved_goal": achieved.copy(),
-            "desired_goal": self.goal.copy(),
+            "achieved_goal": achieved[: self.goal_size].copy(),
+            "desired_goal": self.goal[: self.goal_size].copy(),
         }
 
     def reset(self, *, seed=None, options=None):
@@ -102,7 +105,7 @@ class HandEnv(gymnasium.Env):
         is_end = bool(is_late and self.ends != "never")
         if self.ends == "success":
             info["is_success"] = is_end
-        reward = float(self.compute_reward(achieved, self.goal, info))
+        reward = float(self.compute_reward(achieved, observation["desired_goal"], info))
         return observation, reward, is_end, False, info
 
     def _does_tell(self, says):
@@ -116,12 +119,12 @@ class HandEnv(gymnasium.Env):
     def compute_reward(self, achieved_goal, desired_goal, info):
         difference = achieved_goal - desired_goal
         distance = np.linalg.norm(difference, axis=-1)
-        if self.goals == "single, raises" and distance > 1e9:  # no bool of an array
+        if self.goals == "raises" and distance > 1e9:  # no bool of an array
             raise AssertionError
-        if self.goals == "single, norm":
+        if self.goals == "norm":
             distance = np.linalg.norm(difference)
-        if self.goals == "single, indices":
-            distance = np.sqrt(sum(difference[k] ** 2 for k in range(3)))
+        if self.goals == "indices":
+            distance = np.sqrt(sum(difference[k] ** 2 for k in range(self.goal_size)))
         return {
             "sparse": -(distance > NEAR).astype(np.float32),
             "binary": (distance <= NEAR).astype(np.float32),
