@@ -454,7 +454,7 @@ def test_a_training_is_resumed_evaluated_and_watched(tmp_path, capsys):
     assert (whole / "video.mp4").exists()
 
     evaluate.main(evaluate.Args(run=stopped, episodes=3))
-    assert f"{env_id}, 3 episodes" in capsys.readouterr().out
+    assert f"{env_id}, 3 episodes\n" in capsys.readouterr().out
     watched = tmp_path / "watch.gif"
     main(["watch", "--policy", str(stopped), "--num-envs", "1", "--out", str(watched)])
     assert watched.stat().st_size

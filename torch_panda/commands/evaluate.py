@@ -13,6 +13,7 @@ import tyro
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsName
+from torch_panda.learning.environments import is_from_gymnasium
 from torch_panda.learning.evaluation import Tasks, evaluate, wilson_interval
 from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
 from torch_panda.learning.policy_files import load_policy
@@ -69,7 +70,8 @@ def main(args: Args) -> None:
         raise SystemExit(str(error)) from None
     changes = "".join(f", {key} {value}" for key, value in args.task_options.items())
     episodes = len(result.success)
-    print(f"{env_id}{changes}, {episodes} episodes, {args.physics} physics")
+    physics = "" if is_from_gymnasium(env_id) else f", {args.physics} physics"
+    print(f"{env_id}{changes}, {episodes} episodes{physics}")
     for name, task in result.tasks.items():
         print_share(f"success of {name}", task.success)
     print_share("success at the end", result.success)

@@ -268,7 +268,7 @@ def find_recipe(env_id: str, preset: str = "tuned") -> dict[str, Any]:
         if preset != "recipe":
             raise ValueError(
                 f"the preset {preset} is tuned for the tasks of torch_panda: {env_id} "
-                "needs --preset recipe"
+                "needs --preset recipe or paper"
             )
         return RECIPE | derive_gym_options(env_id)
     registration = find_registration(env_id)
