@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from ctypes import POINTER, Array, c_int, c_uint32, c_void_p, pointer
 from pathlib import Path
 
+import numpy as np
+
 from torch_panda.bullet import structs
 from torch_panda.bullet.body_state import Doubles
 from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
@@ -122,8 +124,9 @@ class Loop:
             marker_pose=state.marker_pose.data_ptr(),
             failures=self._failures,
         )
+        self._all = _ints(range(n))
         self._control: MotorControl | None = None  # control of the last step
-        self._setpoint_shape = (0, 0)
+        self._setpoint: Doubles = np.empty((0, 0))  # read by C
         self._threads: int | None = None  # address of the ``struct loop``
         self._process = os.getpid()
         for env, client in enumerate(clients):
@@ -138,8 +141,7 @@ class Loop:
     ) -> bool:
         """Set the motors, advance time and read the state; see `VectorSimulation.step`.
 
-        Ctrl-C raises when the step is done. ``setpoint`` must be contiguous float64,
-        and ``envs`` must have no duplicates.
+        Ctrl-C raises when the step is done. ``envs`` must have no duplicates.
 
         Returns:
             Whether a state is not finite.
@@ -148,16 +150,18 @@ class Loop:
             control.check(self._num_joints)
             self._batch.control = pointer(self._convert(control))
             self._control = control
-            self._setpoint_shape = len(self._clients), control.setpoint_dim
-        # C code would read beyond the end of the array.
-        if setpoint.shape != self._setpoint_shape:
+            self._setpoint = np.empty((len(self._clients), control.setpoint_dim))
+            self._batch.setpoint = self._setpoint.ctypes.data
+        # An assignment would broadcast other shapes.
+        if setpoint.shape != self._setpoint.shape:
             raise ValueError(
-                f"the setpoint must have shape {self._setpoint_shape}, got "
+                f"the setpoint must have shape {self._setpoint.shape}, got "
                 f"{setpoint.shape}"
             )
-        self._batch.setpoint = setpoint.ctypes.data
+        self._setpoint[:] = setpoint
         self._start()
-        if not self._library.loop_step(self._threads, _ints(envs), len(envs)):
+        chosen = self._all if len(envs) == len(self._all) else _ints(envs)
+        if not self._library.loop_step(self._threads, chosen, len(envs)):
             return False
         self._raise_first_error(envs)
         return True

@@ -4,7 +4,6 @@ import copy
 from collections.abc import Callable, Sequence
 from ctypes import pointer
 
-import numpy as np
 from typing_extensions import Self
 
 from torch_panda.bullet.blueprint import Blueprint
@@ -163,7 +162,6 @@ class VectorSimulation:
         if envs is not None:
             self._check_indices(envs)
         stepped = range(self.num_envs) if envs is None else envs
-        setpoint = np.ascontiguousarray(setpoint, dtype=np.float64)
         if isinstance(control, MotorControl):
             if not self._loop.step(control, setpoint, stepped):
                 return []
