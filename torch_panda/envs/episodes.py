@@ -568,7 +568,7 @@ class Episodes:
                 f"the action must have a floating-point dtype, got {action.dtype}: "
                 f"pass action.float()"
             )
-        action = action.detach().to("cpu").view(-1, shape[-1])
+        action = action.detach().cpu().view(-1, shape[-1])
         if not all_finite(action):
             env = int((~action.isfinite()).any(dim=1).nonzero()[0])
             raise ValueError(
@@ -598,7 +598,7 @@ class Episodes:
         # A copy, because a task may return a tensor that the next step overwrites.
         achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
         desired_goal = self.goal.float()
-        success = task.is_success(achieved_goal, desired_goal)
+        success, reward = task.judge(achieved_goal, desired_goal)
         terminated = success if self.terminate_on_success else torch.zeros_like(success)
         if self._has_failure:
             terminated = terminated | task.failure(simulation)
@@ -621,7 +621,6 @@ class Episodes:
             )
             observed["reward"] = reward.to(torch.float32, copy=True)
         elif action is not None:
-            reward = task.compute_reward(achieved_goal, desired_goal)
             observed["reward"] = reward.float()
         if self._goal_observer is not None:
             observed["achieved_goal"] = observation.clone()

@@ -396,6 +396,27 @@ class Task(Configured, ABC):
         distance = self.success_distance(achieved_goal, desired_goal)
         return (distance > self.distance_threshold).float().neg()
 
+    def judge(
+        self, achieved_goal: Tensor, desired_goal: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """`is_success` and `compute_reward` of the same goals, from one distance.
+
+        The environment calls it in every step, where it saves a tenth of the time that
+        an observation takes.
+        """
+        cls = type(self)
+        uses_defaults = (
+            cls.is_success is Task.is_success
+            and cls.compute_reward is Task.compute_reward
+            and self.reward_type == "sparse"
+        )
+        if not uses_defaults:
+            success = self.is_success(achieved_goal, desired_goal)
+            return success, self.compute_reward(achieved_goal, desired_goal)
+        distance = self.success_distance(achieved_goal, desired_goal)
+        reward = (distance > self.distance_threshold).float().neg()
+        return distance < self.distance_threshold, reward
+
     def _check_goals(self, achieved_goal: Tensor, desired_goal: Tensor) -> None:
         size = (self.goal_dim,)
         if achieved_goal.shape[-1:] != size or desired_goal.shape[-1:] != size:
