@@ -598,7 +598,11 @@ class Episodes:
         # A copy, because a task may return a tensor that the next step overwrites.
         achieved_goal = task.achieved_goal(simulation).to(torch.float32, copy=True)
         desired_goal = self.goal.float()
-        success, reward = task.judge(achieved_goal, desired_goal)
+        reward = None
+        if action is None or self._has_reward:
+            success = task.is_success(achieved_goal, desired_goal)
+        else:
+            success, reward = task.judge(achieved_goal, desired_goal)
         terminated = success if self.terminate_on_success else torch.zeros_like(success)
         if self._has_failure:
             terminated = terminated | task.failure(simulation)
@@ -615,13 +619,13 @@ class Episodes:
             "truncated": truncated,
             "done": terminated | truncated,
         }
-        if action is not None and self._has_reward:
+        if reward is not None:
+            observed["reward"] = reward.float()
+        elif action is not None:
             reward = task.reward(
                 simulation, action.clone(), achieved_goal, desired_goal
             )
             observed["reward"] = reward.to(torch.float32, copy=True)
-        elif action is not None:
-            observed["reward"] = reward.float()
         if self._goal_observer is not None:
             observed["achieved_goal"] = observation.clone()
             observed["desired_goal"] = self._goal_observer.desired.clone()

@@ -401,8 +401,7 @@ class Task(Configured, ABC):
     ) -> tuple[Tensor, Tensor]:
         """`is_success` and `compute_reward` of the same goals, from one distance.
 
-        The environment calls it in every step, where it saves a tenth of the time that
-        an observation takes.
+        Environments call it in each step, unless the task overrides `reward`.
         """
         cls = type(self)
         uses_defaults = (
