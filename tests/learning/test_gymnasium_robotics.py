@@ -20,10 +20,10 @@ def learn(env_id, steps, out, *options):
 
 
 @pytest.mark.timeout(1200)
-def test_fetch_reach_is_learned_in_1200_steps(tmp_path):
-    policy = learn("FetchReach-v4", 1_200, tmp_path)
-    success = evaluate(policy, "FetchReach-v4", episodes=80).success
-    assert success.float().mean() >= 0.9
+def test_the_script_learns_fetch_reach_in_1200_steps(tmp_path):
+    from examples import fetch
+
+    assert fetch.main(tmp_path / "fetch_reach").success_rate >= 0.9
 
 
 @pytest.mark.usefixtures("quick")

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -34,13 +35,17 @@ WITHOUT_COMMAND = (
 FREE = {"seed", "demos", "device"}
 
 
+# Parsing a command of Fetch makes its environment.
+HAS_FETCH = find_spec("gymnasium_robotics") is not None
+
+
 def read_commands():
     """The commands of trainings that the pages print."""
     text = re.sub(r" \\\n +", " ", PAGE + POLICIES)
     found = re.findall(r"(?:^python -m torch_panda |`)(train [^`#\n]+)", text, re.M)
     commands = dict.fromkeys(command.strip() for command in found)
     del commands["train --preset tuned"]  # not a command: the page explains a preset
-    return list(commands)
+    return [x for x in commands if HAS_FETCH or "gymnasium_robotics" not in x]
 
 
 def read_options(command, algo="ddpg", env_id=None):
@@ -79,6 +84,8 @@ def runs():
     runs = {}
     for path in sorted(RESULTS.glob("*/args.json")):
         name = path.parent.name
+        if name.startswith("Fetch") and not HAS_FETCH:
+            continue
         if name[:-2] not in WITHOUT_COMMAND and "refined" not in name:
             args = default | json.loads(path.read_text())
             if args.get("layer_norm"):

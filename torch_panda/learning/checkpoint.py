@@ -27,7 +27,8 @@ RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
 SAVE_INTERVAL = 20_000
 # Options that may change when a run is resumed.
 FREE_OPTIONS = {
-    *("resume", "out", "device", "video", "imports", "logger", "stop_when_solved"),
+    *("resume", "out", "device", "workers", "video", "imports", "logger"),
+    "stop_when_solved",
 }
 
 

@@ -104,9 +104,9 @@ class RunOptions:
     out: Path | None = None
     """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
     resume: bool = False
-    """continue the run in the folder. Only --out, --video, --import and --logger may
-    differ from the options with which it was started, and --total-steps may be larger
-    if the learning rate does not fall"""
+    """continue the run in the folder. Only --out, --video, --import, --logger, --device
+    and --workers may differ from the options with which it was started, and
+    --total-steps may be larger if the learning rate does not fall"""
     device: str = "cpu"
     """device of the networks and the replay buffer"""
     workers: Positive = 1
