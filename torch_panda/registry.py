@@ -318,7 +318,7 @@ def find_registration(env_id: str) -> Registration:
     Raises:
         ValueError: The id is unknown.
     """
-    if isinstance(env_id, str) and env_id in _REGISTRATIONS:
+    if isinstance(env_id, str) and is_registered(env_id):
         return _REGISTRATIONS[env_id]
     if isinstance(env_id, str) and env_id in gymnasium.registry:
         raise ValueError(

@@ -383,8 +383,8 @@ def test_help_separates_what_one_may_change_from_what_research_varies(capsys):
         parse(["--help"])
     text = capsys.readouterr().out
     run, research = text.split(" run options ")[1].split(" research options ")
-    assert "What one may want to change" in run
-    assert "What research varies" in research
+    assert "Options that one may want to change" in run
+    assert "Options that research varies" in research
     for option in ("--env-id", "--total-steps", "--out", "--seed"):
         assert option in run
     for option in ("--gamma", "--her", "--batch-size"):

@@ -3,10 +3,10 @@
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
 
-The default preset has one set of hyperparameters for every task. `--preset paper` has
-those of the panda-gym paper (arXiv 2106.13687) or, where the paper gives none, those of
-the HER of OpenAI Baselines. The other presets are tuned for each shipped task, see
-`torch_panda.learning.recipes`.
+The default preset has one set of hyperparameters for every task. `--preset paper` takes
+the hyperparameters of the panda-gym paper (arXiv 2106.13687). Where the paper gives
+none, it takes those of the HER of OpenAI Baselines. The other presets are tuned for
+each shipped task, see `torch_panda.learning.recipes`.
 
 With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
 

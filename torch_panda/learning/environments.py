@@ -14,7 +14,7 @@ from torch_panda.registry import (
 )
 
 GoalEnv: TypeAlias = RobotTaskEnv | GymGoalEnv
-"""What agents learn in.
+"""The environments in which agents learn.
 
 From Python, `torch_panda.learning.training.Run` also takes another `EnvBase` of torchrl
 that has a batch size [n], the entries ``observation``, ``achieved_goal``,
@@ -34,16 +34,15 @@ def is_from_gymnasium(env_id: str) -> bool:
     """
     if is_registered(env_id):
         return False
-    if env_id in gymnasium.registry:
-        return True
-    try:
-        find_registration(env_id)
-    except ValueError as error:
-        raise ValueError(
-            f"{error}; an id of Gymnasium needs the module that registers it, such as "
-            "--import gymnasium_robotics"
-        ) from None
-    return False
+    if env_id not in gymnasium.registry:
+        try:
+            find_registration(env_id)
+        except ValueError as error:
+            raise ValueError(
+                f"{error}; an id of Gymnasium needs the module that registers it, such "
+                "as --import gymnasium_robotics"
+            ) from None
+    return True
 
 
 def make_env(

@@ -245,6 +245,16 @@ def find_hand(rollouts: TensorDict) -> Hand | None:
     return best if best.action_scale > 0 else None
 
 
+def find_layout(env: EnvBase) -> tuple[Hand | None, Geometry]:
+    """Find the hand and the geometry of an environment that declares nothing.
+
+    It plays some episodes with random actions.
+    """
+    rollouts = probe(env)
+    hand = find_hand(rollouts)
+    return hand, find_geometry(rollouts, None if hand is None else hand.column)
+
+
 def find_geometry(rollouts: TensorDict, hand: int | None = 0) -> Geometry:
     """Find the geometry of a task that does not declare it, from random actions.
 

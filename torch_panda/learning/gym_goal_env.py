@@ -18,6 +18,7 @@ from torch_panda.checks import check_positive, check_seed
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 SUCCESS_KEYS = ("is_success", "success")  # in ``info``, the first one that is there
+_ENDS = ("done", "terminated", "truncated")
 # A goal that is this much larger in every number is not achieved.
 _FAR = 1e3
 
@@ -131,7 +132,7 @@ class GymGoalEnv(EnvBase):
             device=device,
         )
         self.reward_spec = numbers(1)
-        ends = {key: flag() for key in ("done", "terminated", "truncated")}
+        ends = {key: flag() for key in _ENDS}
         self.done_spec = Composite(ends, shape=(n,), device=device)  # type: ignore[misc]
 
     def _probe_rewards(self) -> tuple[bool, float, float]:
@@ -305,11 +306,8 @@ class GymGoalEnv(EnvBase):
         self.close()
 
 
-_ENDS = ("done", "terminated", "truncated")
-
-
 def find_problems(env: gymnasium.Env[Any, Any]) -> list[str]:
-    """What keeps an environment of Gymnasium from being a `GymGoalEnv`."""
+    """The reasons for which `GymGoalEnv` refuses an environment of Gymnasium."""
     problems = []
     space = env.observation_space
     entries: Sequence[Space[Any]] = []

@@ -33,7 +33,7 @@ Preset = Literal["recipe", "paper", "tuned", "sample-efficient"]
 
 @dataclass
 class ResearchOptions(Hyperparameters):
-    """What research varies. The recipe sets the same values for every task."""
+    """Options that research varies. The recipe sets them for every task."""
 
     her: Hindsight = "relabel"
     """hindsight goals. "relabel" relabels four of five transitions when they are
@@ -66,7 +66,7 @@ class ResearchOptions(Hyperparameters):
 
 @dataclass
 class RunOptions:
-    """What one may want to change: what to train, how long, and where to write."""
+    """Options that one may want to change: the task, the training and its files."""
 
     preset: Preset = "paper"
     """defaults of the other options: one recipe for all tasks, also for your own

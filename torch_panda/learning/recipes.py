@@ -13,12 +13,7 @@ from dataclasses import asdict
 from typing import Any
 
 from torch_panda.learning.environments import GoalEnv, is_from_gymnasium
-from torch_panda.learning.geometry import (
-    declares_layout,
-    find_geometry,
-    find_hand,
-    probe,
-)
+from torch_panda.learning.geometry import declares_layout, find_layout
 from torch_panda.learning.gym_goal_env import GymGoalEnv
 from torch_panda.registry import Registration, find_registration
 from torch_panda.tasks import (
@@ -238,9 +233,7 @@ def find_options(env: GoalEnv) -> dict[str, Any]:
 
     They play some episodes with random actions.
     """
-    rollouts = probe(env)
-    hand = find_hand(rollouts)
-    geometry = find_geometry(rollouts, None if hand is None else hand.column)
+    hand, geometry = find_layout(env)
     gamma = 1 - 1 / (HORIZON * env.max_episode_steps)
     options: dict[str, Any] = {"gamma": round(gamma, 4)}
     if hand is None:

@@ -17,7 +17,7 @@ from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.geometry import (
     Geometry,
     find_geometry,
-    find_hand,
+    find_layout,
     probe,
     read_geometry,
 )
@@ -90,9 +90,7 @@ def read_spaces(env: GoalEnv, *, finds_layout: bool = False) -> Spaces:
         return _read_robot_spaces(env, finds_layout=finds_layout)
     hand = geometry = None
     if finds_layout:
-        rollouts = probe(env)
-        hand = find_hand(rollouts)
-        geometry = find_geometry(rollouts, None if hand is None else hand.column)
+        hand, geometry = find_layout(env)
     sizes = _read_sizes(env)
     return Spaces(
         **sizes,
