@@ -78,7 +78,7 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
     [
         {"algo": "sac", "desired_ratio": 0.5},
         {
-            **{"preset": "tuned", "relative_inputs": "fine", "target_interval": 3},
+            **{"preset": "recipe", "relative_inputs": "fine", "target_interval": 3},
             **{"augmentation": "mirror-shift", "start_at_object": 0.5},
             **{"exploration": "points", "ema_rate": 0.1, "anneal_lr": True},
         },
@@ -92,7 +92,7 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
             )
         ),
     ],
-    ids=["sac", "tuned", "td3", "tqc", "crl", "no-her"],
+    ids=["sac", "recipe", "td3", "tqc", "crl", "no-her"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_run_bit_for_bit(
     tmp_path, options, device
@@ -231,7 +231,7 @@ def test_the_learning_rate_falls_to_0(tmp_path):
 def test_a_tenth_of_the_episodes_in_which_nothing_moves_is_stored(tmp_path):
     """The preset "paper" stores all of them."""
     torch.manual_seed(0)
-    for preset, low, high in (("paper", 400, 400), ("tuned", 25, 60)):
+    for preset, low, high in (("paper", 400, 400), ("recipe", 25, 60)):
         args = Args(env_id="PandaPush-v1", num_envs=2, preset=preset)
         run = Run(replace(args, total_steps=20_000), tmp_path)
         run.agent.explore.forward = lambda td: td.set("action", torch.zeros(2, 3))
@@ -302,8 +302,9 @@ def test_a_run_ends_well_if_its_video_cannot_be_written(tmp_path, monkeypatch, c
 
 
 def test_the_command_line_overrules_the_recipe():
-    args = parse(["--preset", "tuned", "--env-id", "PandaSlide-v1", "--gamma", "0.9"])
-    recipe = default_args("tuned", "PandaSlide-v1")
+    args = parse(["--env-id", "PandaSlide-v1", "--gamma", "0.9", "--total-steps=9"])
+    recipe = default_args("recipe", "PandaSlide-v1")
+    recipe = replace(recipe, total_steps=9, stop_when_solved=False)
     assert args == replace(recipe, gamma=0.9)
     assert args.desired_ratio > 0
     assert parse(["--random-eps", "0.1", "0.2"]).random_eps == (0.1, 0.2)
@@ -371,10 +372,10 @@ def test_a_run_of_another_machine_goes_on_with_other_devices(tmp_path):
 
 def test_help_shows_the_defaults_of_the_preset(capsys):
     with pytest.raises(SystemExit):
-        parse(["--help", "--preset", "tuned", "--env-id", "PandaSlide-v1"])
+        parse(["--help", "--env-id", "PandaSlide-v1"])
     words = capsys.readouterr().out.split()
     default = words[words.index("--total-steps") :]
-    steps = default_args("tuned", "PandaSlide-v1").total_steps
+    steps = default_args("recipe", "PandaSlide-v1").total_steps
     assert f"{steps})" in default[: default.index("--eval-interval")]
 
 
@@ -394,7 +395,7 @@ def test_help_separates_what_one_may_change_from_what_research_varies(capsys):
         assert f"--{name.replace('_', '-')} " in text.replace(",", " ")
 
 
-@pytest.mark.parametrize("preset", ["paper", "tuned"])
+@pytest.mark.parametrize("preset", ["paper", "recipe"])
 @pytest.mark.parametrize("env_id", ["PandaSlide-v1", "PandaStack-v1"])
 def test_crl_draws_geometric_goals_in_every_preset(preset, env_id):
     args = parse(["--algo", "crl", "--preset", preset, "--env-id", env_id])

@@ -488,12 +488,6 @@ def test_options_of_our_own_environments_are_refused(tmp_path, options, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_presets_for_our_own_tasks_are_refused():
-    env_id = register()
-    with pytest.raises(SystemExit, match=f"{env_id} needs --preset recipe"):
-        main(["train", "--env-id", env_id, "--preset", "tuned"])
-
-
 @pytest.mark.usefixtures("quick")
 def test_other_commands_refuse_features_of_our_own_environments(tmp_path):
     env_id, run = register(), tmp_path / "run"

@@ -50,7 +50,7 @@ def inputs(spaces, *batch_size):
             **{"network": "layer-norm", "ema_rate": 0.1},
         },
     ],
-    ids=["paper", "tuned"],
+    ids=["paper", "recipe"],
 )
 def test_a_loaded_policy_acts_as_the_saved_agent(env, tmp_path, algo, options):
     agent = save(env, tmp_path / "checkpoint.pt", algo=algo, **options)

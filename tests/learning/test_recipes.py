@@ -1,7 +1,7 @@
-"""Recipes of the presets.
+"""The recipe, and the options of the panda-gym paper.
 
-The table recipes.json has the options of each preset. To accept changed options, write
-it again, and read its difference:
+The table recipes.json has the options of both. To accept changed options, write it
+again, and read its difference:
 
     python -m tests.learning.test_recipes
 """
@@ -16,15 +16,12 @@ import pytest
 import torch
 
 import torch_panda
-from torch_panda.commands import train
 from torch_panda.learning.agents import make_agent
 from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args, default_args
-from torch_panda.learning.recipes import RECIPES, SAMPLE_EFFICIENT, find_recipe
 from torch_panda.learning.training import Run
 
 TABLE = Path(__file__).with_name("recipes.json")
-PRESETS = ("recipe", "tuned", "sample-efficient")
 # The ids that stand for their task in the table.
 PANDA = [
     env_id
@@ -38,10 +35,10 @@ def to_json(args):
     return json.loads(json.dumps(asdict(args), default=str))
 
 
-def read_changes(preset, env_id):
-    """The options of a preset that differ from those of the preset "paper"."""
-    options, paper = (to_json(default_args(x, env_id)) for x in (preset, "paper"))
-    assert options.pop("preset") == preset
+def read_recipe(env_id):
+    """The options of the recipe that differ from those of the paper."""
+    options, paper = (to_json(default_args(x, env_id)) for x in ("recipe", "paper"))
+    assert options.pop("preset") == "recipe"
     return {key: value for key, value in options.items() if value != paper[key]}
 
 
@@ -52,63 +49,36 @@ def find_task(env_id):
 
 
 def write_table():
-    """Write the options of "paper", and the changes of the other presets by task."""
-    rows = [f'{{"paper": {json.dumps(to_json(Args()))}']
-    for preset in PRESETS:
-        changes = {find_task(env_id): read_changes(preset, env_id) for env_id in PANDA}
-        lines = [f'"{task}": {json.dumps(x)}' for task, x in changes.items()]
-        rows.append(f'"{preset}": {{\n ' + ",\n ".join(lines) + "\n}")
-    TABLE.write_text(",\n".join(rows) + "}\n")
+    """Write the options of the paper, and the recipe's changes by task."""
+    changes = {find_task(env_id): read_recipe(env_id) for env_id in PANDA}
+    lines = [f'"{task}": {json.dumps(x)}' for task, x in changes.items()]
+    recipe = '"recipe": {\n ' + ",\n ".join(lines) + "\n}"
+    TABLE.write_text(f'{{"paper": {json.dumps(to_json(Args()))},\n{recipe}}}\n')
 
 
-def test_the_options_of_the_presets_are_those_of_the_table():
+def test_the_options_of_recipe_and_paper_are_those_of_the_table():
     table = json.loads(TABLE.read_text())
     assert to_json(Args()) == table["paper"]
     for env_id in torch_panda.ENV_IDS:
         assert default_args("paper", env_id) == Args(env_id=env_id)
-        for preset in PRESETS:
-            expected = dict(table[preset][find_task(env_id)])
-            if "Joints" in env_id:  # these options need end-effector control
-                expected.pop("augmentation", None)
-                expected.pop("start_at_object", None)
-            assert read_changes(preset, env_id) == expected, env_id
-            check_limits(default_args(preset, env_id))
+        expected = dict(table["recipe"][find_task(env_id)])
+        if "Joints" in env_id:  # it needs end-effector control
+            expected.pop("augmentation", None)
+        assert read_recipe(env_id) == expected, env_id
+        check_limits(default_args("recipe", env_id))
 
 
 @pytest.mark.usefixtures("quick")
-def test_recipes_fit_joint_control(tmp_path):
-    args = default_args("tuned", "PandaFlipJointsDense-v3")
+def test_the_recipe_fits_joint_control(tmp_path):
+    args = default_args("recipe", "PandaFlipJointsDense-v3")
     args.num_envs, args.total_steps = 2, 100
     Run(args, tmp_path).close()
-
-
-class PushBall(torch_panda.Push):
-    """A task of a user."""
-
-
-def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(
-    tmp_path, capsys, monkeypatch
-):
-    blocked = partial(torch_panda.Panda, block_gripper=True)
-    torch_panda.register("PushBall-v0", robot=blocked, task=PushBall)
-    assert find_recipe("PushBall-v0") == {}
-    assert find_recipe("PushBall-v0", "sample-efficient") == SAMPLE_EFFICIENT
-    default = Args(preset="tuned", env_id="PushBall-v0")
-    assert default_args("tuned", "PushBall-v0") == default
-    near = partial(torch_panda.Push, goal_xy_range=0.1)
-    torch_panda.register("PushNear-v0", robot=blocked, task=near)
-    assert find_recipe("PushNear-v0") == RECIPES[torch_panda.Push]
-    monkeypatch.setattr(train, "make_run", lambda *args: None)
-    with pytest.raises(AttributeError):  # there is nothing to train
-        train.main(replace(default, out=tmp_path / "run"))
-    message = "PushBall-v0 has no recipe: using the options of the panda-gym paper"
-    assert message in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("quick")
 def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
     """An episode of Stack lasts 100 steps otherwise."""
-    args = default_args("tuned", "PandaStack-v1")
+    args = replace(default_args("recipe", "PandaStack-v1"), start_at_object=0.75)
     args.num_envs = 2
     run = Run(args, tmp_path)
     data = next(iter(run.collector))
@@ -126,10 +96,6 @@ def test_training_episodes_can_go_on_after_success(continues, tmp_path):
     assert after["success"].any()
     assert after["terminated"].any() != continues
     assert run.curve.env.terminate_on_success
-
-
-if __name__ == "__main__":
-    write_table()
 
 
 @pytest.mark.usefixtures("quick")
@@ -172,3 +138,7 @@ def test_the_recipe_fits_tasks_and_robots_of_users(control_type, exploration):
         agent = make_agent(env, args)
         assert agent.spaces.geometry.positions == (0, 6)
         env.rollout(2, agent.explore)
+
+
+if __name__ == "__main__":
+    write_table()

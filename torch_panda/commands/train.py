@@ -3,10 +3,9 @@
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
 
-The default preset has one set of hyperparameters for every task. `--preset paper` takes
-the hyperparameters of the panda-gym paper (arXiv 2106.13687). Where the paper gives
-none, it takes those of the HER of OpenAI Baselines. The other presets are tuned for
-each shipped task, see `torch_panda.learning.recipes`.
+One recipe has the hyperparameters for every task, see `torch_panda.learning.recipes`.
+`--preset paper` takes those of the panda-gym paper (arXiv 2106.13687). Where the paper
+gives none, it takes those of the HER of OpenAI Baselines.
 
 With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
 
@@ -43,7 +42,6 @@ from torch_panda.learning.offline.options import (
 )
 from torch_panda.learning.offline.training import OfflineRun
 from torch_panda.learning.options import ArgGroups, Args, check, default_args
-from torch_panda.learning.recipes import find_recipe
 from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.training import Run
 from torch_panda.learning.user_modules import import_modules, read_modules
@@ -187,11 +185,6 @@ def main(args: Args | OfflineArgs) -> None:
         run = make_run(args, out)
         if isinstance(args, Args) and args.preset == "recipe":
             print(describe_recipe(args, run.agent.spaces, is_declared=is_declared))
-        is_tuned = isinstance(args, Args) and args.preset == "tuned"
-        if is_tuned and not find_recipe(args.env_id):
-            print(
-                f"{args.env_id} has no recipe: using the options of the panda-gym paper"
-            )
         stop = StopSignal()
         with lock_folder(out):
             write_options(out, args, default, resume=args.resume, **preset)

@@ -28,7 +28,7 @@ from torch_panda.learning.user_modules import Imports
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 
-Preset = Literal["recipe", "paper", "tuned", "sample-efficient"]
+Preset = Literal["recipe", "paper"]
 
 
 @dataclass
@@ -70,10 +70,8 @@ class RunOptions:
 
     preset: Preset = "paper"
     """defaults of the other options: one recipe for all tasks, also for your own
-    ("recipe"); those of the panda-gym paper ("paper"); those tuned for each shipped
-    task ("tuned"), or for fewer environment steps of each ("sample-efficient"). With
-    all but "paper", the replay buffer drops a random 90 % of the rollouts whose
-    achieved goal does not change"""
+    ("recipe"), or those of the panda-gym paper ("paper"). With "recipe", the replay
+    buffer drops a random 90 % of the rollouts whose achieved goal does not change"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     imports: Imports = ()
@@ -226,7 +224,7 @@ def check(args: Args) -> None:
 
 def default_args(preset: Preset, env_id: str, algo: Algo = "ddpg") -> Args:
     """Return the default options of a preset for the task of an id and an algorithm."""
-    recipe = {} if preset == "paper" else find_recipe(env_id, preset)
+    recipe = {} if preset == "paper" else find_recipe(env_id)
     if algo == "crl":
         recipe = {**recipe, **CRL_OPTIONS}
     return Args(preset=preset, env_id=env_id, algo=algo, **recipe)
