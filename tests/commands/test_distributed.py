@@ -166,5 +166,5 @@ def test_plot_draws_a_distributed_run(address, tmp_path):
     runs = plot.read_runs([tmp_path])
     ((line, (drawn,)),) = runs["PandaReach-v1"].items()
     label = "distributed, num envs 4, steps per batch 5, updates per step 0.25"
-    assert line == ("DDPG", label)
+    assert line == f"DDPG, {label}"
     assert [row["step"] for row in drawn] == [0, 40]
