@@ -68,7 +68,7 @@ DEMOS = ["--demos", "nofile.pt"]
         ("bench", ["--ids", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
         ("bench", ["--num-envs", "4", "0"], "num_envs must be positive, got "),
         ("bench", ["--plot", "/dev/null/speed.png"], "File exists"),
-        ("bench", ["--plot", "a.png", "--buffers"], "plot does not work with buffers"),
+        ("bench", ["--others", "slow"], "others must be some of torch_panda, fast, .*"),
         ("bench", ["--plot", "a.xyz"], "plot must end in one of .*, got 'a.xyz'"),
         ("refine", ["missing.pt", "--out", "new"], "there is no file"),
         (
