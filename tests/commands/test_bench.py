@@ -1,9 +1,12 @@
 """The benchmark command, run in small."""
 
+from importlib.util import find_spec
 from types import SimpleNamespace
 
+import gymnasium
 import pytest
 
+import torch_panda
 from torch_panda.__main__ import main
 from torch_panda.commands import bench
 
@@ -17,7 +20,7 @@ def table_rows(output):
 def test_bench_prints_a_table_and_draws_a_plot(tmp_path, capsys):
     picture = tmp_path / "speed.png"
     options = ["--num-envs", "2", "1", "--num-threads", "2", "--rounds", "2"]
-    options += ["--steps", "2", "--others", "bare-bullet", "--plot", str(picture)]
+    options += ["--steps", "5", "--others", "bare-bullet", "--plot", str(picture)]
     main(["bench", *options])
     rows = table_rows(capsys.readouterr().out)
     names = ["torch_panda", "bare Bullet, C threads"]
@@ -46,7 +49,25 @@ def test_every_installed_contender_can_step(name):
     contender.close()
 
 
-def test_a_measurement_counts_the_steps_of_all_environments(monkeypatch):
+def test_the_table_knows_the_length_of_a_step():
+    physics = torch_panda.PhysicsParams()
+    lengths = {bench.OURS: physics.timestep * physics.n_substeps}
+    panda_gym = gymnasium.make("panda_gym:PandaReach-v3").unwrapped
+    lengths["async"] = lengths["sb3"] = lengths["parallel"] = panda_gym.sim.dt
+    panda_gym.close()
+    if find_spec("gymnasium_robotics") is not None:
+        setting = bench.Setting("PandaReach-v3", num_envs=1, num_threads=1)
+        lengths["fetch"] = bench._make_fetch_env(setting).unwrapped.dt
+    if find_spec("envpool") is not None:
+        import envpool
+
+        config = envpool.make_spec("PandaPickCube-v1").config
+        lengths["envpool-panda"] = config.ctrl_dt
+    expected = {name: bench.CONTENDERS[name].step_length for name in lengths}
+    assert lengths == pytest.approx(expected)
+
+
+def test_a_measurement_counts_the_simulated_time_of_all_environments(monkeypatch):
     now = 0.0  # time in seconds, which only `make` and `step` spend
 
     def spend(seconds):
@@ -62,16 +83,17 @@ def test_a_measurement_counts_the_steps_of_all_environments(monkeypatch):
     monkeypatch.setattr(bench, "_cpu_time", lambda: 2 * now)
     monkeypatch.setattr(bench, "_memory", lambda: 10 * now)
     monkeypatch.setattr(bench.os, "dup2", lambda *files: None)
-    monkeypatch.setitem(bench.CONTENDERS, "fake", bench.Contender("fake", make))
+    contender = bench.Contender("fake", make, step_length=0.05)
+    monkeypatch.setitem(bench.CONTENDERS, "fake", contender)
     measured = bench._measure_here("fake", bench.Setting("PandaPush-v3", 4, 1), steps=5)
-    assert measured == bench.Measurement(4 / 0.5, 4 / 1.0, 2.0 / 4, 20.0 / 4)
+    assert measured == bench.Measurement(4 * 0.1, 4 * 0.05, 2.0 / 4, 20.0 / 4)
 
 
 def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
     turns = iter(
         [
             bench.Measurement(200.0, 100.0, 0.05, 44.0),
-            bench.Measurement(100.0, 50.0, 0.1, 110.0),
+            bench.Measurement(100.0, 50.0, 0.01, 14.0),
             bench.Measurement(300.0, 150.0, 0.05, 44.0),
             RuntimeError("out of memory"),
             KeyboardInterrupt(),
@@ -85,18 +107,12 @@ def test_results_are_kept_when_a_later_turn_fails(monkeypatch, capsys):
         return turn
 
     monkeypatch.setattr(bench, "measure", measure)
-    main(["bench", "--others", "fast", "--rounds", "5"])
+    main(["bench", "--others", "envpool-panda", "--rounds", "5"])
     output = capsys.readouterr().out
-    ours, fast = table_rows(output)
-    assert ours[4] == "250 (200 to 300)"
-    assert fast[4:6] == ["100 (100 to 100)", "2.00 (2.00 to 2.00)"]
-    assert 'torch_panda, physics="fast" failed: RuntimeError: out of memory' in output
+    ours, panda = table_rows(output)
+    assert ours[4:6] == ["6250 (5000 to 7500)", "250 (200 to 300)"]
+    # A step of this contender is half as long.
+    assert panda[4:6] == ["5000 (5000 to 5000)", "100 (100 to 100)"]
+    assert panda[6] == "2.00 (2.00 to 2.00)"
+    assert "EnvPool failed: RuntimeError: out of memory" in output
     assert "interrupted" in output
-
-
-@pytest.mark.slow
-def test_bench_compares_buffers_with_and_without_hindsight(capsys):
-    print(bench.compare_buffers(rounds=1, capacity=2000))
-    rows = table_rows(capsys.readouterr().out)
-    assert [row[0] for row in rows] == ["plain", "with HindsightRelabel"]
-    assert all(float(row[1].partition(" ")[0]) > 0 for row in rows)

@@ -5,6 +5,8 @@ import json
 import pytest
 import torch
 
+from tests.commands.runs import read_curve
+from torch_panda import registry
 from torch_panda.commands import plot
 from torch_panda.learning import curve
 from torch_panda.learning.exploration import WARM_UP
@@ -14,6 +16,14 @@ ray = pytest.importorskip("ray")
 distributed = pytest.importorskip("torch_panda.commands.distributed")
 
 IDS = ("collector", "traj_ids")
+TASK = """
+import torch_panda
+from torch_panda import Panda, Reach
+
+torch_panda.register(
+    "Far-v0", robot=Panda, task=lambda: Reach(goal_range=0.1), max_episode_steps=10
+)
+"""
 # Ray's workers are nice by default: on a busy machine they would hardly run.
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -166,5 +176,26 @@ def test_plot_draws_a_distributed_run(address, tmp_path):
     runs = plot.read_runs([tmp_path])
     ((line, (drawn,)),) = runs["PandaReach-v1"].items()
     label = "distributed, num envs 4, steps per batch 5, updates per step 0.25"
-    assert line == ("DDPG", label)
+    assert line == f"DDPG, {label}"
     assert [row["step"] for row in drawn] == [0, 40]
+
+
+@pytest.mark.usefixtures("quick")
+def test_workers_know_the_task_of_a_users_file(address, tmp_path, monkeypatch):
+    # Not in the current folder, from which workers on the same machine could import it.
+    file = tmp_path / "far_task.py"
+    file.write_text(TASK)
+    known = dict(registry._REGISTRATIONS)
+    monkeypatch.setattr(registry, "_REGISTRATIONS", known)
+    args = distributed.Args(
+        address=address,
+        env_id="Far-v0",
+        imports=(str(file),),
+        num_envs=4,
+        steps_per_batch=5,
+        total_steps=40,
+        updates_per_step=0.25,
+        out=tmp_path / "run",
+    )
+    distributed.main(args)
+    assert [row["step"] for row in read_curve(args.out)] == ["0", "40"]

@@ -1,4 +1,4 @@
-"""Recording generated data sets: the files, their hash, and continuing after a stop."""
+"""Recording generated data sets: the files, their hash, and Ctrl-C."""
 
 import re
 from pathlib import Path
@@ -9,10 +9,9 @@ from tensordict import TensorDict
 
 import torch_panda
 from torch_panda import datasets
-from torch_panda.commands import record
+from torch_panda.commands import main, record
 from torch_panda.datasets import generation
 from torch_panda.datasets.demonstrations import read_demos
-from torch_panda.datasets.parts import Parts
 
 TRANSITIONS = 250
 
@@ -47,58 +46,30 @@ def test_the_file_holds_the_generated_data(tmp_path, capsys, kind):
     assert list(tmp_path.iterdir()) == [out]
 
 
-def stop_after(parts, monkeypatch):
-    """Let Ctrl-C arrive when this number of parts is saved."""
-    add = record.Parts.add
+@pytest.mark.parametrize("format", ["tensors", "minari"])
+def test_ctrl_c_leaves_no_file_and_the_command_can_be_repeated(
+    tmp_path, capsys, monkeypatch, format
+):
+    if format == "minari":
+        pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    out = tmp_path / "data.pt" if format == "tensors" else Path("panda/reach-v0")
+    arguments = ["record", "--env-id", "PandaReach-v3", "--kind", "noisy"]
+    arguments += ["--transitions", str(TRANSITIONS), "--num-envs", "2", "--seed", "7"]
+    arguments += ["--format", format, "--out", str(out)]
+    generate_parts = record.generate_parts
 
-    def add_and_stop(self, part):
-        add(self, part)
-        if len(list(self.folder.glob("*.pt"))) == parts:
-            raise KeyboardInterrupt
+    def stop_after_a_part(*args, **options):
+        yield next(generate_parts(*args, **options))
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(record.Parts, "add", add_and_stop)
-
-
-def test_a_stopped_data_set_continues_bit_for_bit(tmp_path, capsys, monkeypatch):
-    out = tmp_path / "data.pt"
     with monkeypatch.context() as patch:
-        stop_after(1, patch)
-        with pytest.raises(SystemExit, match="the same command with --resume"):
-            record.main(make_args(out))
-    assert not out.exists()
-    with pytest.raises(SystemExit, match="holds a part of a data set: continue with"):
-        record.main(make_args(out))
-    with pytest.raises(SystemExit, match="kind was 'noisy' and is now 'random'"):
-        record.main(make_args(out, "random", resume=True))
-    played = []
-    play = record.generate_parts
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            record,
-            "generate_parts",
-            lambda *args, **options: (
-                played.append(len(part)) or part for part in play(*args, **options)
-            ),
-        )
-        record.main(make_args(out, resume=True, num_envs=3))
-    assert sum(played) == 3  # two of the five episodes were there
+        patch.setattr(record, "generate_parts", stop_after_a_part)
+        with pytest.raises(SystemExit, match=r"^interrupted$"):
+            main(arguments)
+    assert not list(tmp_path.iterdir())
+    main(arguments)
     assert printed_hash(capsys) == datasets.sha256(generate("noisy"))
-    assert list(tmp_path.iterdir()) == [out]
-    with pytest.raises(SystemExit, match="no data set to resume"):
-        record.main(make_args(out, resume=True))
-
-
-def test_two_processes_do_not_mix_their_parts(tmp_path):
-    first, second = (
-        Parts(tmp_path / "data.pt.unfinished", {"seed": seed}, resume=False)
-        for seed in (0, 1)
-    )
-    ids = torch.zeros(1, 2, dtype=torch.int64)
-    part = TensorDict({"action": ids, "next": {}, ("collector", "traj_ids"): ids})
-    first.add(part)
-    with pytest.raises(ValueError, match="another process writes into"):
-        second.add(part)
-    first.add(part)
 
 
 def test_a_minari_data_set_holds_the_generated_data(tmp_path, capsys, monkeypatch):
@@ -106,11 +77,7 @@ def test_a_minari_data_set_holds_the_generated_data(tmp_path, capsys, monkeypatc
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     name = f"panda/reach-{kind}-v0"
-    with monkeypatch.context() as patch:
-        stop_after(1, patch)
-        with pytest.raises(SystemExit, match="resume"):
-            record.main(make_args(Path(name), kind, format="minari"))
-    record.main(make_args(Path(name), kind, format="minari", resume=True))
+    record.main(make_args(Path(name), kind, format="minari"))
     expected = generate(kind)
     assert printed_hash(capsys) == datasets.sha256(expected)
     with torch_panda.make("PandaReach-v3") as env:

@@ -53,7 +53,7 @@ DEMOS = ["--demos", "nofile.pt"]
         ("record", [*DATA, "--episodes", "3"], "do not work with the kind noisy"),
         ("record", [*DATA, "--noise-eps", "0.1"], "episodes and noise_eps do not work"),
         ("record", DATA[:2], "needs a file or name to write"),
-        ("record", ["--transitions", "9"], "transitions and resume do not work with"),
+        ("record", ["--transitions", "9"], "transitions does not work with the kind"),
         ("record", [*DATA, "--env-id", "KukaReach-v1"], "no expert for"),
         (
             "record",
@@ -68,7 +68,7 @@ DEMOS = ["--demos", "nofile.pt"]
         ("bench", ["--ids", "PandaFly-v1"], "unknown environment id 'PandaFly-v1'"),
         ("bench", ["--num-envs", "4", "0"], "num_envs must be positive, got "),
         ("bench", ["--plot", "/dev/null/speed.png"], "File exists"),
-        ("bench", ["--plot", "a.png", "--buffers"], "plot does not work with buffers"),
+        ("bench", ["--others", "slow"], "others must be some of torch_panda, fast, .*"),
         ("bench", ["--plot", "a.xyz"], "plot must end in one of .*, got 'a.xyz'"),
         ("refine", ["missing.pt", "--out", "new"], "there is no file"),
         (

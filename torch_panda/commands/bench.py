@@ -1,8 +1,11 @@
-"""Benchmark: steps per second of torch_panda and of other vector environments.
+"""Benchmark: speed of torch_panda and of other vector environments.
 
 The contenders take turns (A B C, A B C, ...), so that other work on the machine slows
 all of them alike. Each turn runs in a new process, which makes the environments, warms
 up and measures. Only one contender is in memory at any time.
+
+A step of one contender may last longer than that of another. So the contenders are
+compared by the time that they simulate in a second.
 """
 
 import math
@@ -17,14 +20,13 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
 import tyro
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, GymEnv, ParallelEnv
 from tqdm import tqdm
 
@@ -33,68 +35,18 @@ from torch_panda.bullet.pool import num_cores
 from torch_panda.bullet.solver import SOLVER_VARIABLE
 from torch_panda.learning import files
 from torch_panda.learning.limits import Positive, check_limits
-from torch_panda.learning.user_modules import (
-    Imports,
-    UserModule,
-    import_modules,
-    read_modules,
-)
-from torch_panda.transforms import HindsightRelabel
-
-OURS = "torch_panda"
-Other = Literal[
-    "fast",
-    "bullet-solver",
-    "bare-bullet",
-    "async",
-    "sb3",
-    "parallel",
-    "fetch",
-    "envpool",
-]
-
-
-@dataclass
-class Args:
-    """Compare steps per second with other vector environments, in turns."""
-
-    ids: tuple[str, ...] = ("PandaPush-v3",)
-    """environments to measure; `python -m torch_panda info` lists the ids"""
-    num_envs: tuple[Positive, ...] = (16,)
-    """numbers of environments stepped in parallel"""
-    num_threads: Positive | None = None
-    """number of threads of contenders that use threads; None means one per core
-    that the process may use, and at most one per environment"""
-    others: tuple[Other, ...] = get_args(Other)
-    """contenders beside torch_panda. A contender whose libraries are missing is left
-    out"""
-    rounds: Positive = 7
-    """number of turns of each contender; the table shows the median"""
-    steps: Positive = 50
-    """steps of each environment in a turn, after as many steps that warm up"""
-    render_size: Positive | None = None
-    """width and height of pictures to observe [pixels]; measures only torch_panda,
-    `fast` and `async`"""
-    buffers: bool = False
-    """measure replay buffers with and without hindsight instead of environments"""
-    plot: Path | None = None
-    """picture of the speeds to write, for instance speed.png"""
-    imports: Imports = ()
-    """module or .py file to import first, which registers ids of your own"""
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A workload that all contenders run. `Args` explains the attributes.
-
-    ``modules`` are the modules of ``imports``.
-    """
+    """A workload that all contenders run. `Args` explains the attributes."""
 
     env_id: str
     num_envs: int
     num_threads: int
     render_size: int | None = None
-    modules: tuple[UserModule, ...] = ()
+    imports: tuple[str, ...] = ()
 
 
 class Environments(NamedTuple):
@@ -102,23 +54,6 @@ class Environments(NamedTuple):
 
     step: Callable[[], object]
     close: Callable[[], object]
-
-
-class Measurement(NamedTuple):
-    """Result of one turn.
-
-    Attributes:
-        speed: Steps of all environments together [1/s].
-        cpu_speed: Steps divided by the processor time of all processes [1/s]. Other
-            work on the machine hardly changes it. NaN except on Linux.
-        creation: Time to create one environment, without imports [s].
-        memory: Memory of one environment [MB]. NaN except on Linux.
-    """
-
-    speed: float
-    cpu_speed: float
-    creation: float
-    memory: float
 
 
 # Contenders -------------------------------------------------------------------
@@ -145,7 +80,7 @@ def _wrap_vector_env(
     env.reset()
 
     def step() -> None:
-        env.step(rng.uniform(-1, 1, size=shape).astype(np.float32))
+        env.step(rng.uniform(-1, 1, size=shape).astype(action_space.dtype))
 
     return Environments(step, env.close)
 
@@ -250,11 +185,11 @@ def _make_fetch_env(setting: Setting) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(_fetch_id(setting))
 
 
-def _make_envpool(setting: Setting) -> Environments:
+def _make_envpool(setting: Setting, env_id: str | None = None) -> Environments:
     import envpool
 
     env = envpool.make(
-        _fetch_id(setting),
+        env_id or _fetch_id(setting),
         env_type="gymnasium",
         num_envs=setting.num_envs,
         num_threads=setting.num_threads,
@@ -268,38 +203,131 @@ class Contender(NamedTuple):
     Attributes:
         title: Name in the table.
         make: Makes the environments of a setting.
+        step_length: Time that a step simulates [s].
         solver: Value for the environment variable `SOLVER_VARIABLE`; None does not set
             the variable.
+        renders: Whether the environments can observe pictures.
     """
 
     title: str
     make: Callable[[Setting], Environments]
+    step_length: float = 0.04
     solver: str | None = None
+    renders: bool = False
 
 
+OURS = "torch_panda"
 CONTENDERS = {
-    OURS: Contender("torch_panda", _make_ours),
+    OURS: Contender("torch_panda", _make_ours, renders=True),
     "fast": Contender(
-        'torch_panda, physics="fast"', partial(_make_ours, physics="fast")
+        'torch_panda, physics="fast"', partial(_make_ours, physics="fast"), renders=True
     ),
     "bullet-solver": Contender(
-        "torch_panda, Bullet's own solver", _make_ours, "bullet"
+        "torch_panda, Bullet's own solver", _make_ours, solver="bullet"
     ),
-    "bare-bullet": Contender("bare Bullet, C threads", _make_bare_bullet, "bullet"),
+    "bare-bullet": Contender(
+        "bare Bullet, C threads", _make_bare_bullet, solver="bullet"
+    ),
     "async": Contender(
-        "panda-gym, AsyncVectorEnv", partial(_make_async, _make_panda_gym_env)
+        "panda-gym, AsyncVectorEnv",
+        partial(_make_async, _make_panda_gym_env),
+        renders=True,
     ),
     "sb3": Contender("panda-gym, SB3 SubprocVecEnv", _make_sb3),
     "parallel": Contender("panda-gym, torchrl ParallelEnv", _make_parallel),
     "fetch": Contender(
         "Fetch (MuJoCo), AsyncVectorEnv", partial(_make_async, _make_fetch_env)
     ),
-    "envpool": Contender("Fetch (MuJoCo), EnvPool", _make_envpool),
+    "envpool-fetch": Contender("Fetch (MuJoCo), EnvPool", _make_envpool),
+    # MuJoCo Playground's task, which is the same whatever the id of the setting.
+    "envpool-panda": Contender(
+        "PandaPickCube (MuJoCo), EnvPool",
+        partial(_make_envpool, env_id="PandaPickCube-v1"),
+        step_length=0.02,
+    ),
 }
-RENDERING = (OURS, "fast", "async")  # contenders that can observe pictures
+
+
+@dataclass
+class Args:
+    """Compare the speed of vector environments, which take turns."""
+
+    ids: tuple[str, ...] = ("PandaPush-v3",)
+    """environments to measure; `python -m torch_panda info` lists the ids"""
+    num_envs: tuple[Positive, ...] = (16,)
+    """numbers of environments stepped in parallel"""
+    num_threads: Positive | None = None
+    """number of threads of contenders that use threads; None means one per core
+    that the process may use, and at most one per environment"""
+    others: tuple[str, ...] = tuple(name for name in CONTENDERS if name != OURS)
+    """contenders beside torch_panda. A contender whose libraries are missing is left
+    out"""
+    rounds: Positive = 7
+    """number of turns of each contender; the table shows the median"""
+    steps: Positive = 300
+    """steps of each environment in a turn, after as many steps that warm up"""
+    render_size: Positive | None = None
+    """width and height of pictures to observe [pixels]; measures only torch_panda,
+    `fast` and `async`"""
+    plot: Path | None = None
+    """picture of the speeds to write, for instance speed.png"""
+    imports: Imports = ()
+    """module or .py file to import first, which registers ids of your own"""
 
 
 # Measurement ------------------------------------------------------------------
+
+
+class Measurement(NamedTuple):
+    """Result of one turn.
+
+    Attributes:
+        speed: Time that all environments together simulate in a second [s/s].
+        cpu_speed: The simulated time divided by the processor time of all processes
+            [s/s]. Other work on the machine hardly changes it. NaN except on Linux.
+        creation: Time to create one environment, without imports [s].
+        memory: Memory of one environment [MB]. NaN except on Linux.
+    """
+
+    speed: float
+    cpu_speed: float
+    creation: float
+    memory: float
+
+
+Results = dict[tuple[Setting, str], list[Measurement]]
+
+
+def compare(
+    settings: Sequence[Setting], names: Sequence[str], *, rounds: int, steps: int
+) -> tuple[Results, list[str]]:
+    """Measure contenders in turns: A B C, A B C, and so on.
+
+    A contender that fails takes no further turns. Ctrl-C ends the measurement. In both
+    cases the results until then are kept.
+
+    Returns:
+        The measurements of each setting and contender in the order of the turns, and
+        lines that explain missing measurements.
+    """
+    results: Results = {}
+    failures: list[str] = []
+    turns = [(setting, name) for setting in settings for name in names]
+    failed = set()
+    try:
+        for setting, name in tqdm(turns * rounds, unit="turn"):
+            if (setting, name) in failed:
+                continue
+            try:
+                measurement = measure(name, setting, steps)
+                results.setdefault((setting, name), []).append(measurement)
+            except Exception as error:  # a library may raise any error
+                failed.add((setting, name))
+                title = CONTENDERS[name].title
+                failures.append(f"{title} failed: {type(error).__name__}: {error}")
+    except KeyboardInterrupt:
+        failures.append("interrupted: later turns are missing")
+    return results, list(dict.fromkeys(failures))
 
 
 def measure(name: str, setting: Setting, steps: int) -> Measurement:
@@ -319,16 +347,16 @@ def measure(name: str, setting: Setting, steps: int) -> Measurement:
 
 def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     torch.set_num_threads(1)
-    import_modules(setting.modules)
+    import_modules(read_modules(setting.imports))
     # pybullet prints on stdout whenever it loads a robot.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    _, make, solver = CONTENDERS[name]
-    if solver is not None:
-        os.environ[SOLVER_VARIABLE] = solver
+    contender = CONTENDERS[name]
+    if contender.solver is not None:
+        os.environ[SOLVER_VARIABLE] = contender.solver
     # A first environment imports all modules, which should not count.
-    first = make(replace(setting, num_envs=1, num_threads=1))
+    first = contender.make(replace(setting, num_envs=1, num_threads=1))
     used_before, start = _memory(), time.perf_counter()
-    envs = make(setting)
+    envs = contender.make(setting)
     creation, used = time.perf_counter() - start, _memory() - used_before
     first.close()
     for _ in range(steps):
@@ -339,8 +367,9 @@ def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     seconds, cpu_seconds = time.perf_counter() - start, _cpu_time() - cpu_start
     envs.close()
     n = setting.num_envs
+    simulated = n * steps * contender.step_length
     return Measurement(
-        n * steps / seconds, n * steps / cpu_seconds, creation / n, used / n
+        simulated / seconds, simulated / cpu_seconds, creation / n, used / n
     )
 
 
@@ -387,58 +416,23 @@ _COLUMNS = (
     "threads",
     "contender",
     "steps/s",
+    "simulated s/s",
     "torch_panda / this",
-    "steps/CPU s",
+    "simulated s/CPU s",
     "created in [ms]",
     "memory [MB]",
 )
-
-Results = dict[tuple[Setting, str], list[Measurement]]
-
-
-def compare(
-    settings: Sequence[Setting], names: Sequence[str], *, rounds: int, steps: int
-) -> tuple[Results, list[str]]:
-    """Measure contenders in turns: A B C, A B C, and so on.
-
-    A contender that fails takes no further turns. Ctrl-C ends the measurement. In both
-    cases the results until then are kept.
-
-    Returns:
-        The measurements of each setting and contender in the order of the turns, and
-        lines that explain missing measurements.
-    """
-    results: Results = {}
-    failures: list[str] = []
-    remaining = [(setting, name) for setting in settings for name in names]
-    try:
-        with tqdm(total=rounds * len(remaining), unit="turn") as bar:
-            for _ in range(rounds):
-                for setting, name in list(remaining):
-                    bar.set_description(f"{setting.env_id} x {setting.num_envs} {name}")
-                    try:
-                        measurement = measure(name, setting, steps)
-                        results.setdefault((setting, name), []).append(measurement)
-                    except Exception as error:  # a library may raise any error
-                        remaining.remove((setting, name))
-                        title = CONTENDERS[name].title
-                        failures.append(
-                            f"{title} failed: {type(error).__name__}: {error}"
-                        )
-                    bar.update()
-    except KeyboardInterrupt:
-        failures.append("interrupted: later turns are missing")
-    return results, list(dict.fromkeys(failures))
 
 
 def table(results: Results) -> str:
     """Markdown table with a row for each setting and contender.
 
     Speeds are medians and ranges over the rounds. The ratio compares torch_panda's
-    speed with that of the row, round by round.
+    simulated time per second with that of the row, round by round.
     """
     rows: list[Sequence[str]] = [_COLUMNS]
     for (setting, name), turns in results.items():
+        title, _, step_length, *_ = CONTENDERS[name]
         ours = results.get((setting, OURS), [])
         pairs = zip(ours, turns, strict=False)  # one may have failed in a later round
         rows.append(
@@ -446,7 +440,8 @@ def table(results: Results) -> str:
                 setting.env_id,
                 str(setting.num_envs),
                 str(setting.num_threads),
-                CONTENDERS[name].title,
+                title,
+                _spread([turn.speed / step_length for turn in turns], digits=0),
                 _spread([turn.speed for turn in turns], digits=0),
                 _spread([a.speed / b.speed for a, b in pairs], digits=2),
                 _spread([turn.cpu_speed for turn in turns], digits=0),
@@ -454,10 +449,6 @@ def table(results: Results) -> str:
                 f"{median(turn.memory for turn in turns):.0f}",
             )
         )
-    return _markdown(rows)
-
-
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows]
     lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
@@ -475,7 +466,7 @@ def _spread(values: Sequence[float], *, digits: int) -> str:
 
 
 def plot(path: Path, results: Results) -> None:
-    """Draw steps per second: a panel for each setting, and a bar for each contender."""
+    """Draw the speeds: a panel for each setting, and a bar for each contender."""
     from matplotlib.figure import Figure
 
     from torch_panda.learning.plots import save
@@ -488,13 +479,14 @@ def plot(path: Path, results: Results) -> None:
         for (other, name), turns in results.items():
             if other != setting:
                 continue
+            title = CONTENDERS[name].title
             speeds = [turn.speed for turn in turns]
             middle = median(speeds)
             bar = axes.barh(
-                CONTENDERS[name].title,
+                title,
                 middle,
                 xerr=[[middle - min(speeds)], [max(speeds) - middle]],
-                color="tab:blue" if name == OURS else "tab:gray",
+                color="tab:blue" if title.startswith("torch_panda") else "tab:gray",
             )
             axes.bar_label(bar, fmt="%.0f", label_type="center", color="white")
         axes.invert_yaxis()
@@ -505,53 +497,34 @@ def plot(path: Path, results: Results) -> None:
             fontsize="medium",
             loc="left",
         )
-    grid[-1, 0].set_xlabel("steps/s")
+    grid[-1, 0].set_xlabel("simulated seconds per second")
     save(figure, path)
 
 
-def compare_buffers(rounds: int, capacity: int = 1_000_000) -> str:
-    """Time replay buffers with and without hindsight, in turns.
+def check(args: Args) -> None:
+    """Check the options before the measurement starts.
 
-    A cycle is ``extend`` of one episode of 50 steps and ``sample`` of 256 rows, in full
-    buffers that hold episodes of Push, on one thread.
-
-    Returns:
-        Markdown table of medians and ranges over the rounds.
+    Raises:
+        ValueError: An option is wrong.
+        OSError: The picture cannot be written.
     """
-    torch.set_num_threads(1)
-    num_episodes, cycles = 20, 20
-    with torch_panda.make("PandaPush-v1", num_envs=num_episodes, seed=0) as env:
-        episodes = env.rollout(env.max_episode_steps)
-        relabel = HindsightRelabel.from_env(env)
-    buffers = {
-        "plain": TensorDictReplayBuffer(
-            storage=LazyTensorStorage(capacity), batch_size=256
-        ),
-        "with HindsightRelabel": TensorDictReplayBuffer(
-            storage=LazyTensorStorage(capacity), transform=relabel, batch_size=256
-        ),
-    }
-    # `episodes` shares this tensor, so adding to it gives the episodes new ids.
-    ids = torch.arange(num_episodes)[:, None].expand(episodes.shape).clone()
-    episodes["collector", "traj_ids"] = ids
-    for _ in range(capacity // episodes.numel()):
-        for buffer in buffers.values():
-            buffer.extend(episodes.reshape(-1))
-        ids += num_episodes
-    times: dict[str, list[float]] = {name: [] for name in buffers}
-    for _ in range(rounds):
-        for name, buffer in buffers.items():
-            start = time.thread_time()
-            for episode in episodes[:cycles].unbind(0):
-                buffer.extend(episode)
-                buffer.sample()
-            times[name].append(1e6 * (time.thread_time() - start) / cycles)
-        ids += num_episodes
-    rows = [("replay buffer", "extend(50) + sample(256) [us]", "time / plain")]
-    for name, values in times.items():
-        ratios = [b / a for a, b in zip(times["plain"], values, strict=True)]
-        rows.append((name, _spread(values, digits=0), _spread(ratios, digits=2)))
-    return _markdown(rows)
+    check_limits(args)
+    if unknown := set(args.others) - set(CONTENDERS):
+        raise ValueError(
+            f"others must be some of {', '.join(CONTENDERS)}, got {min(unknown)!r}"
+        )
+    for env_id in args.ids:
+        torch_panda.max_episode_steps(env_id)  # refuses an unknown id
+    if args.plot is not None:
+        from matplotlib.backend_bases import FigureCanvasBase
+
+        args.plot = args.plot.with_suffix(args.plot.suffix or ".png")
+        formats = FigureCanvasBase.get_supported_filetypes()
+        if args.plot.suffix[1:].lower() not in formats:
+            raise ValueError(
+                f"plot must end in one of {', '.join(formats)}, got {args.plot.name!r}"
+            )
+        files.prepare(args.plot)
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -562,46 +535,27 @@ def run(arguments: Sequence[str]) -> None:
     """
     args = tyro.cli(Args, args=arguments, prog="python -m torch_panda bench")
     try:
-        check_limits(args)
-        modules = read_modules(args.imports)
-        import_modules(modules)
-        for env_id in args.ids:
-            torch_panda.max_episode_steps(env_id)  # refuses an unknown id
-        if args.plot is not None:
-            if args.buffers:
-                raise ValueError(
-                    "plot does not work with buffers: it draws the speeds of "
-                    "environments"
-                )
-            from matplotlib.backend_bases import FigureCanvasBase
-
-            args.plot = args.plot.with_suffix(args.plot.suffix or ".png")
-            formats = FigureCanvasBase.get_supported_filetypes()
-            if args.plot.suffix[1:].lower() not in formats:
-                raise ValueError(
-                    f"plot must end in one of {', '.join(formats)}, got "
-                    f"{args.plot.name!r}"
-                )
-            files.prepare(args.plot)
+        import_modules(read_modules(args.imports))
+        check(args)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
-    if args.buffers:
-        print(compare_buffers(args.rounds))
-        return
     settings = [
         Setting(
             env_id,
             n,
             min(n, args.num_threads or num_cores()),
             args.render_size,
-            modules,
+            args.imports,
         )
         for env_id in args.ids
         for n in args.num_envs
     ]
-    names = [OURS, *args.others]
-    if args.render_size is not None:
-        names = [name for name in names if name in RENDERING]
+    names = [
+        name
+        for name, contender in CONTENDERS.items()
+        if (name == OURS or name in args.others)
+        and (args.render_size is None or contender.renders)
+    ]
     results, failures = compare(settings, names, rounds=args.rounds, steps=args.steps)
     if results:
         print(table(results))

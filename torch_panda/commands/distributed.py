@@ -43,12 +43,7 @@ from torch_panda.learning.checkpoint import (
 from torch_panda.learning.curve import Curve, draw_seed
 from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
 from torch_panda.learning.options import CRL_OPTIONS, check_exploration
-from torch_panda.learning.user_modules import (
-    Imports,
-    UserModule,
-    import_modules,
-    read_modules,
-)
+from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
 
@@ -81,7 +76,8 @@ class Args(Hyperparameters):
     seed: Seed = 0
     """seed of the environments, the networks and the sampling"""
     imports: Imports = ()
-    """module or .py file to import first, which registers ids of your own"""
+    """module or .py file to import first, which registers ids of your own. Ray copies
+    a file to the machines of the workers, but not the modules that it imports"""
     out: Path | None = None
     """folder of the results; None means runs/<env-id>-<algo>-distributed-<seed>"""
 
@@ -181,40 +177,29 @@ def make_unique(
     return data.set(TRAJECTORY_KEY, data[TRAJECTORY_KEY] * num_workers + worker)
 
 
-def make_env(
-    modules: tuple[UserModule, ...],
-    env_id: str,
-    num_envs: int,
-    num_threads: int,
-    seed: int,
-) -> torch_panda.RobotTaskEnv:
-    """Make a worker's environments, and seed them and its exploration noise.
-
-    ``modules`` are modules of the user that register ids.
-    """
-    import_modules(modules)
+def make_env(args: Args, seed: int) -> torch_panda.RobotTaskEnv:
+    """Make a worker's environments, and seed them and its exploration noise."""
+    # Ray has copied the files of a user into a folder of `sys.path`.
+    names = [Path(x).stem if x.endswith(".py") else x for x in args.imports]
+    import_modules(read_modules(names))
     torch.manual_seed(seed)
     return torch_panda.make(
-        env_id, num_envs=num_envs, num_threads=num_threads, seed=seed
+        args.env_id,
+        num_envs=args.num_envs,
+        num_threads=args.cpus_per_worker,
+        seed=seed,
     )
 
 
 def make_collector(args: Args, policy: TensorDictModuleBase) -> RayCollector:
     """Start the workers on the machines of the cluster, each with a seed of its own."""
     workers = range(args.num_workers)
-    make = partial(
-        make_env,
-        read_modules(args.imports),
-        args.env_id,
-        args.num_envs,
-        args.cpus_per_worker,
-    )
     # torchrl would send weights through a process group at the address that this
     # machine's name resolves to. This is often 127.0.0.1, which other machines cannot
     # reach. So `send_weights` uses Ray instead, and torchrl's warning is ignored.
     warnings.filterwarnings("ignore", message="RayCollector iteration started before")
     return RayCollector(
-        [partial(make, draw_seed()) for _ in workers],  # type: ignore[arg-type]
+        [partial(make_env, args, draw_seed()) for _ in workers],  # type: ignore[arg-type]
         policy,
         frames_per_batch=args.batch_frames,
         total_frames=args.total_steps,
@@ -244,10 +229,12 @@ def connect(args: Args) -> None:
         ValueError: The cluster does not have enough CPUs for the workers.
     """
     local = args.address == "local"
+    files = [name for name in args.imports if name.endswith(".py")]
     ray.init(
         address=args.address,
         num_cpus=args.num_workers * args.cpus_per_worker if local else None,
         include_dashboard=False if local else None,
+        runtime_env={"py_modules": files} if files else None,
         logging_level=logging.WARNING,
         log_to_driver=False,  # each line would start with the long repr of a collector
     )

@@ -10,7 +10,7 @@ With ``--kind``, one of the kinds of `torch_panda.datasets.generate`, it prints 
 of the data.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +33,6 @@ from torch_panda.datasets.generation import (
     generate_parts,
     sha256,
 )
-from torch_panda.datasets.parts import Parts
 from torch_panda.datasets.recording import TensorWriter, add_noise, play
 from torch_panda.experts import make_expert
 from torch_panda.learning.files import prepare, save
@@ -83,8 +82,6 @@ class Args:
     transitions: Positive | None = None
     """number of generated transitions, rounded up to whole episodes; None means
     100,000"""
-    resume: bool = False
-    """continue to generate data after an interruption"""
 
 
 def open_writer(args: Args, out: Path, env: torch_panda.RobotTaskEnv) -> Writer:
@@ -114,18 +111,17 @@ def check(args: Args) -> None:
         )
     if is_generated and args.out is None:
         raise ValueError(f"the kind {args.kind} needs a file or name to write, --out")
-    if not is_generated and (args.transitions is not None or args.resume):
+    if not is_generated and args.transitions is not None:
         raise ValueError(
-            "transitions and resume do not work with the kind expert; use episodes, or "
-            "another kind"
+            "transitions does not work with the kind expert; use episodes, or another "
+            "kind"
         )
     if args.noise_eps and args.format == "minari":
         raise ValueError(
             "noise_eps does not work with the format minari, whose episodes hold "
             "the executed actions"
         )
-    has_file = args.out is not None and args.format == "tensors" and args.out.is_file()
-    if has_file and not args.resume:
+    if args.out is not None and args.format == "tensors" and args.out.is_file():
         raise ValueError(
             f"{args.out} exists already: remove it, or choose another --out"
         )
@@ -212,82 +208,61 @@ def record_generated_data(args: Args, kind: Kind) -> None:
     """Generate a data set, save it, and print its hash.
 
     Raises:
-        ValueError: The kind does not fit the id, the format refuses the name, or there
-            is no data set to resume.
+        ValueError: The kind does not fit the id, or the format refuses the name.
         TypeError: The task does not have one of the ``task_options``.
         OSError: The data cannot be written.
     """
     assert args.out is not None
     out = args.out
-    folder = out
-    if args.format == "tensors":
-        prepare(out)
-    else:
-        folder = load_format(args.format).find_folder(out)
     transitions = args.transitions or 100_000
     options = make_options(args)
-    recipe = {
-        "env_id": args.env_id,
-        "kind": kind,
-        "transitions": transitions,
-        "seed": args.seed,
-        "format": args.format,
-        **options,
-    }
-    parts = Parts(
-        folder.with_name(folder.name + ".unfinished"), recipe, resume=args.resume
-    )
     num_episodes, steps = batch_shape(args.env_id, kind, transitions, **options)
-    try:
-        with tqdm(
-            total=num_episodes * steps,
-            initial=parts.num_episodes * steps,
-            unit="transition",
-            desc=f"{args.env_id} {kind}",
-        ) as bar:
-            for part in generate_parts(
-                args.env_id,
-                kind=kind,
-                transitions=transitions,
-                seed=args.seed,
-                num_envs=args.num_envs,
-                num_threads=args.num_threads,
-                progress=bar.update,
-                first=parts.num_episodes,
-                **options,
-            ):
-                parts.add(part)
-        data = TensorDict.cat([part.exclude(*PIXELS) for part in parts])
+    with tqdm(
+        total=num_episodes * steps,
+        unit="transition",
+        desc=f"{args.env_id} {kind}",
+    ) as bar:
+        parts = generate_parts(
+            args.env_id,
+            kind=kind,
+            transitions=transitions,
+            seed=args.seed,
+            num_envs=args.num_envs,
+            num_threads=args.num_threads,
+            progress=bar.update,
+            **options,
+        )
         if args.format == "tensors":
+            prepare(out)
+            data = TensorDict.cat(list(parts))
             save(out, data.to_dict())
             place = str(out)
         else:
-            place = write_episodes(args, out, parts)
-    except KeyboardInterrupt:
-        if not parts.num_episodes:
-            raise
-        raise SystemExit("stopped: the same command with --resume continues") from None
+            place, data = write_episodes(args, out, parts)
     print(f"{data.numel()} transitions in {place}")
     print(f"sha256 {sha256(data)}")
-    parts.remove()
 
 
-def write_episodes(args: Args, out: Path, parts: Parts) -> str:
-    """Write the episodes of all parts as a data set.
+def write_episodes(
+    args: Args, out: Path, parts: Iterable[TensorDict]
+) -> tuple[str, TensorDict]:
+    """Write generated episodes in the format of another library.
 
     Returns:
-        The folder of the data set, and how to read it.
+        How to read the data set, and the data without pictures [episodes, steps].
     """
     options = {**make_options(args), **fixed_options(args.kind)}
+    without_pictures = []
     with torch_panda.make(args.env_id, **options) as env:
         writer = open_writer(args, out, env)
         for part in parts:
+            without_pictures.append(part.exclude(*PIXELS))
             goals = part["achieved_goal"], part["desired_goal"]
             part["success"] = env.is_success(*goals)
             for episode in part:
                 number = int(episode["collector", "traj_ids"][0])
                 writer.add(episode, episode_seed(args.seed, number))
-    return writer.close()
+    return writer.close(), TensorDict.cat(without_pictures)
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -47,13 +47,6 @@ class FormatModule(Protocol):
     the environment, the environment, and "expert" or a kind of
     `torch_panda.datasets.generate`."""
 
-    def find_folder(self, out: Path) -> Path:
-        """The folder that a new data set will have.
-
-        Raises:
-            ValueError: The name is invalid, or the data set exists already.
-        """
-
     def read(self, path: Path) -> TensorDict:
         """Read the transitions (n,) of a data set's folder, with torch_panda's keys.
 

@@ -99,13 +99,11 @@ def generate_parts(
     num_envs: int,
     num_threads: int | None,
     progress: Callable[[int], object] | None,
-    first: int = 0,
     **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> Iterator[TensorDict]:
     """Generate the data set of `generate` in parts of at most ``num_envs`` episodes.
 
-    ``first`` is the number of the first episode, for a data set whose earlier episodes
-    exist. The other arguments are those of `generate`.
+    The arguments are those of `generate`.
 
     Yields:
         Transitions [episodes, steps].
@@ -132,9 +130,7 @@ def generate_parts(
     expert = None if kind == "random" else make_expert(env_id)
     make_options = {**make_options, **fixed_options(kind)}
     num_episodes, steps = batch_shape(env_id, kind, transitions, **make_options)
-    num_envs = min(num_envs, num_episodes - first)
-    if num_envs < 1:
-        return
+    num_envs = min(num_envs, num_episodes)
     if is_from_gymnasium(env_id):
         make_options.pop("terminate_on_success")
     with make_env(
@@ -149,7 +145,7 @@ def generate_parts(
                 'kind "play" needs goals that do not depend on the start of an '
                 f'episode, but those of {env_id} do: use "noisy" or "random"'
             )
-        for start in range(first, num_episodes, num_envs):
+        for start in range(0, num_episodes, num_envs):
             # In the last batch, environments may be left over: drop their episodes.
             episode_ids = torch.arange(start, min(start + num_envs, num_episodes))
             batch = _Batch(env, expert, kind, seed, start)

@@ -38,7 +38,8 @@ class Writer:
     """
 
     def __init__(self, folder: Path, env_id: str, env: RobotTaskEnv, kind: str) -> None:
-        find_folder(folder)
+        if folder.exists():
+            raise ValueError(f"the folder {folder} exists already: choose another one")
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         task = type(env.task)
@@ -102,17 +103,6 @@ def features(env: RobotTaskEnv) -> dict[str, dict[str, object]]:
         "names": ["height", "width", "channels"],
     }
     return result
-
-
-def find_folder(out: Path) -> Path:
-    """The folder of a new data set, which is ``out``.
-
-    Raises:
-        ValueError: The folder exists.
-    """
-    if out.exists():
-        raise ValueError(f"the folder {out} exists already: choose another one")
-    return out
 
 
 def read(path: Path) -> TensorDict:

@@ -1,9 +1,7 @@
 """Plots of success curves: one panel per task, and one line per set of options.
 
 A run is a folder with args.json and curve.csv. A line is the median over the seeds, and
-a band shows the interquartile range, as in the panda-gym paper. A panel has at most
-four lines. A task with more lines has a panel for each algorithm. Colour and dashes of
-a line show the options, and its marker shows the algorithm, the same in all panels.
+a band shows the interquartile range, as in the panda-gym paper.
 
 The legend names the algorithm and the options that differ from the preset. An entry
 ``label`` in args.json replaces the options by a name. Runs of one task and algorithm
@@ -11,7 +9,6 @@ that have the same name form one line.
 """
 
 import csv
-import itertools
 import json
 import textwrap
 from pathlib import Path
@@ -25,20 +22,18 @@ from torch_panda.learning import files
 
 Curve = list[dict[str, float]]
 Metric = Literal["success", "ever_success", "return"]
-MAX_LINES = 4  # largest number of lines in a panel
 COLUMNS = 3  # largest number of panels side by side
 OFFLINE = ", offline"  # suffix of a title if the steps of the panel are gradient steps
 LABEL_WIDTH = 56  # characters after which a label is wrapped
-# Okabe and Ito's colours, which colour-blind readers can tell apart.
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-DASHES = ("-", "--", ":", "-.")
-# Markers of the algorithms in alphabetical order. The first algorithm has none.
-MARKERS = ("", "s", "^", "D", "v", "P", "X", "*")
+# Petroff's ten colours (arXiv 2107.02270), which colour-blind readers can tell apart.
+# A panel with more lines repeats them.
+COLORS = (
+    *("#3f90da", "#ffa90e", "#bd1f01", "#94a4a2", "#832db6"),
+    *("#a96b59", "#e76300", "#b9ac70", "#717581", "#92dadd"),
+)
 
-Line = tuple[str, str]
-"""Algorithm and label of the options."""
-Lines = dict[Line, list[Curve]]
-"""The curves of all seeds, by line."""
+Lines = dict[str, list[Curve]]
+"""The curves of all seeds, by the label of their algorithm and options."""
 
 
 def plot_curve(curve: Curve, title: str, path: Path, *, xlabel: str) -> None:
@@ -62,7 +57,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def plot_panels(runs: dict[str, Lines], metric: Metric, path: Path) -> None:
-    """Draw median and interquartile range over seeds.
+    """Draw median and interquartile range over seeds, in one panel for each task.
 
     Args:
         runs: Lines of each task.
@@ -73,85 +68,37 @@ def plot_panels(runs: dict[str, Lines], metric: Metric, path: Path) -> None:
         OSError: The picture cannot be written.
         ValueError: The ending of its name is not a format.
     """
-    panels = [panel for task in sorted(runs) for panel in split(task, runs[task])]
-    lines = [line for _, panel in panels for line in panel]
-    # The first 28 sets of options differ in dashes or colour.
-    looks = itertools.cycle(itertools.product(DASHES, COLORS))
-    ways = dict(zip(dict.fromkeys(way for _, way in lines), looks, strict=False))
-    names = sorted({algo for algo, _ in lines})
-    markers = dict(zip(names, itertools.cycle(MARKERS), strict=False))
-    width = min(COLUMNS, len(panels))
-    height = -(-len(panels) // width)
+    width = min(COLUMNS, len(runs))
+    height = -(-len(runs) // width)
     # Legends are below the panels.
-    figure = Figure(figsize=(4.2 * width, 4.0 * height), layout="constrained")
+    legend = 0.2 * max(map(len, runs.values()))
+    size = (4.2 * width, (3.2 + legend) * height)
+    figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(height, width, squeeze=False)
-    for axes in grid.flat[len(panels) :]:
+    for axes in grid.flat[len(runs) :]:
         axes.remove()
-    for axes, (title, panel) in zip(grid.flat, panels, strict=False):
-        draw_panel(axes, panel, metric, ways, markers)
+    for axes, (task, lines) in zip(grid.flat, sorted(runs.items()), strict=False):
+        draw_panel(axes, lines, metric)
         # `read_runs` gives offline runs panels of their own.
-        kind = "gradient" if OFFLINE in title else "environment"
-        _label(axes, title, metric, f"{kind} steps")
+        kind = "gradient" if task.endswith(OFFLINE) else "environment"
+        _label(axes, task, metric, f"{kind} steps")
     save(figure, path)
 
 
-def split(task: str, lines: Lines) -> list[tuple[str, Lines]]:
-    """Distribute the lines of a task over panels.
-
-    All algorithms share a panel if it has at most `MAX_LINES` lines. Otherwise each
-    algorithm has its own panels.
-
-    Returns:
-        Title and lines of each panel.
-    """
-    ordered = sorted(lines.items())
-    if len(ordered) <= MAX_LINES:
-        return [(task, dict(ordered))]
-    panels = []
-    for algo, group in itertools.groupby(ordered, lambda item: item[0][0]):
-        of_algo = list(group)
-        for first in range(0, len(of_algo), MAX_LINES):
-            panels.append((f"{task}, {algo}", dict(of_algo[first : first + MAX_LINES])))
-    return panels
-
-
-def draw_panel(
-    axes: Axes,
-    panel: Lines,
-    metric: Metric,
-    ways: dict[str, tuple[str, str]],
-    markers: dict[str, str],
-) -> None:
-    """Draw lines with a band over their seeds.
-
-    Args:
-        axes: Where to draw.
-        panel: Curves of each line.
-        metric: Column of the curves to draw.
-        ways: Dashes and colour of each way to train.
-        markers: Marker of each algorithm.
-    """
-    for (algo, way), curves in panel.items():
+def draw_panel(axes: Axes, lines: Lines, metric: Metric) -> None:
+    """Draw lines with a band over their seeds."""
+    axes.set_prop_cycle(color=COLORS)
+    for label, curves in sorted(lines.items()):
         # Unfinished runs are shorter, so draw only the steps that all seeds have.
         points = [{row["step"]: row[metric] for row in curve} for curve in curves]
         steps = sorted(set.intersection(*map(set, points)))
         values = np.array([[curve[step] for step in steps] for curve in points])
         low, median, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
         seeds = f"{len(curves)} seed{'s' if len(curves) > 1 else ''}"
-        label = textwrap.fill(f"{algo}, {way} ({seeds})", LABEL_WIDTH)
-        dashes, color = ways[way]
-        axes.plot(
-            steps,
-            median,
-            dashes,
-            color=color,
-            # A line of one point needs a marker to be seen.
-            marker=markers[algo] or ("o" if len(steps) == 1 else ""),
-            markersize=4,
-            markevery=0.1,  # at most one marker in a tenth of the panel's diagonal
-            label=label,
-        )
-        axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
+        name = textwrap.fill(f"{label} ({seeds})", LABEL_WIDTH)
+        # The dots show a line of one point.
+        (line,) = axes.plot(steps, median, ".-", markersize=4, label=name)
+        axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.2, lw=0)
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
@@ -171,7 +118,7 @@ def read_runs(folders: list[Path]) -> dict[str, Lines]:
             if args["preset"] == "offline":
                 task += OFFLINE
             changed = args.get("changed", {})
-            label = str(args.get("label") or line_label(str(args["preset"]), changed))
+            options = args.get("label") or line_label(str(args["preset"]), changed)
             with path.open() as file:
                 curve = [
                     {key: float(value) for key, value in row.items() if value}
@@ -180,7 +127,7 @@ def read_runs(folders: list[Path]) -> dict[str, Lines]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"cannot read the run {path.parent}: {error!r}") from None
         if curve:
-            runs.setdefault(task, {}).setdefault((algo, label), []).append(curve)
+            runs.setdefault(task, {}).setdefault(f"{algo}, {options}", []).append(curve)
     if not runs:
         names = ", ".join(map(str, folders))
         raise ValueError(
