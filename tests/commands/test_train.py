@@ -86,13 +86,12 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
             pytest.param(options, marks=pytest.mark.slow)
             for options in (
                 {"algo": "td3", "network": "layer-norm"},
-                {"algo": "tqc"},
                 {"algo": "crl", "her": "geometric"},
                 {"her": "none", "random_eps": (0.1, 0.9)},
             )
         ),
     ],
-    ids=["sac", "tuned", "td3", "tqc", "crl", "no-her"],
+    ids=["sac", "tuned", "td3", "crl", "no-her"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_run_bit_for_bit(
     tmp_path, options, device

@@ -17,17 +17,17 @@ from torch_panda.bullet import FAST
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
 from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.options import make_args_class
+from torch_panda.learning.offline.options import OfflineArgs
 from torch_panda.learning.policy_files import save_policy
 
 pytestmark = pytest.mark.usefixtures("quick")
 
-SMALL = {"hidden_size": 32, "batch_size": 64, "num_envs": 4, "video": False}
+SMALL = {"batch_size": 64, "num_envs": 4, "video": False}
 
 
 def make_args(out, algo="gcbc", **options):
     options = {**SMALL, "transitions": 200, "total_steps": 6, **options}
-    return make_args_class(algo)(out=out, eval_interval=4, **options)
+    return OfflineArgs(algo=algo, out=out, eval_interval=4, **options)
 
 
 def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
@@ -161,10 +161,10 @@ def test_dropped_relative_inputs_are_warned_of(tmp_path, make_demos, relative_in
         train.make_run(args, tmp_path).close()
 
 
-def test_the_options_are_those_of_the_algorithm():
-    options = ["--algo", "hiql", "--subgoal-steps", "7", "--data", "play"]
+def test_the_command_line_sets_the_options():
+    options = ["--algo", "hiql", "--alpha", "7", "--data", "play"]
     args = parse(["--offline", *options])
-    assert args == make_args_class("hiql")(subgoal_steps=7, data="play")
+    assert args == OfflineArgs(algo="hiql", alpha=7.0, data="play")
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,8 @@ def test_the_options_are_those_of_the_algorithm():
         ("--offline --algo ddpg", "--offline learns by gcbc, .* got --algo ddpg"),
         ("--algo hiql", "^hiql learns offline: add --offline$"),
         ("--offline --data nofile.pt", "data must be one of noisy, play, random"),
-        ("--offline --expectile 1.5", "expectile must be from 0 to 1"),
+        ("--offline --alpha -1", "alpha must be at least 0 and finite"),
+        ("--offline --algo gcbc --alpha 1", "algo gcbc has no alpha: drop --alpha"),
         ("--offline --env-id PandaFly-v1", "unknown environment id"),
         ("--offline --resume", "there is no run to resume"),
     ],

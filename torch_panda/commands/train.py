@@ -1,4 +1,4 @@
-"""Train DDPG, TD3, SAC, TQC or CRL with hindsight experience replay on any task.
+"""Train DDPG, TD3, SAC or CRL with hindsight experience replay on any task.
 
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
@@ -39,7 +39,6 @@ from torch_panda.learning.offline.options import (
     KINDS,
     OfflineArgs,
     check_offline,
-    make_args_class,
 )
 from torch_panda.learning.offline.training import OfflineRun
 from torch_panda.learning.options import ArgGroups, Args, check, default_args
@@ -66,21 +65,18 @@ class Mode:
 def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
     """Read the command line.
 
-    With ``--offline``, the algorithm determines the other options and their defaults.
-    Otherwise preset, task and algorithm determine the defaults. So these options are
-    read first.
+    Preset, task and algorithm determine the defaults, so these options are read first.
 
     Raises:
-        ValueError: A module of ``--import`` does not exist, or ``--offline`` and the
-            algorithm do not fit together.
+        ValueError: A module of ``--import`` does not exist, or an algorithm needs
+            ``--offline``.
     """
     # The help is printed at the end, with the defaults of this preset and algorithm.
     without_help = [x for x in arguments if x not in ("-h", "--help")]
     mode, _ = tyro.cli(Mode, args=without_help, return_unknown_args=True)
     if mode.offline:
-        cls = make_args_class(mode.algo or OfflineArgs.algo)
         arguments = [x for x in arguments if x != "--offline"]
-        offline_args = tyro.cli(cls, prog=f"{PROG} --offline", args=arguments)
+        offline_args = tyro.cli(OfflineArgs, prog=f"{PROG} --offline", args=arguments)
         import_modules(read_modules(offline_args.imports))
         return offline_args
     if mode.algo in OFFLINE_AGENTS and mode.algo not in AGENTS:

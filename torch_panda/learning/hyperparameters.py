@@ -8,7 +8,7 @@ from typing import Literal
 
 from torch_panda.learning.limits import Discount, Positive, Ratio, Weight
 
-Algo = Literal["ddpg", "td3", "sac", "tqc", "crl"]
+Algo = Literal["ddpg", "td3", "sac", "crl"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 Exploration = Literal["actions", "points"]
 Network = Literal["paper", "layer-norm", "wide"]
@@ -22,8 +22,8 @@ class Hyperparameters:
     algo: Algo = "ddpg"
     """algorithm"""
     double_q: bool = True
-    """learn two critics, and use the smaller value (TD3, SAC) or the lower quantiles
-    (TQC) as target. DDPG and CRL always have one critic"""
+    """TD3, SAC: learn two critics, and use the smaller value as target. DDPG and CRL
+    always have one critic"""
     gamma: Discount | None = None
     """discount factor; None means 1 - 1 / (steps of an episode), as in OpenAI
     Baselines"""
@@ -45,12 +45,11 @@ class Hyperparameters:
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)
     """fraction of exploring steps in the first and in the last of the parallel
     environments. The fractions of the other environments are evenly spaced between
-    them. SAC and TQC use this option only with exploration "points" """
+    them. SAC uses this option only with exploration "points" """
     exploration: Exploration = "actions"
     """how to explore. "actions" takes random actions with DDPG, TD3 and CRL. With SAC
-    and TQC it has no effect, because their policies are random. "points" moves the hand
-    towards random points, or under joint control the joints towards random
-    positions"""
+    it has no effect, because its policy is random. "points" moves the hand towards
+    random points, or under joint control the joints towards random positions"""
     relative_inputs: RelativeInputs = "none"
     """additional inputs of the networks. "coarse" adds the offsets from the hand to
     objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,

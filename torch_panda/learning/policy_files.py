@@ -155,11 +155,10 @@ def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> AnyHyperpara
         ValueError: This version of torch_panda does not know one of their names or
             values.
     """
-    offline_agent = OFFLINE_AGENTS.get(values.get("algo", ""))
     cls: type[AnyHyperparameters] = Hyperparameters
     # CRL learns online and offline. Only online agents have an option `gamma`.
-    if offline_agent is not None and "gamma" not in values:
-        cls = offline_agent.Hyperparameters
+    if values.get("algo") in OFFLINE_AGENTS and "gamma" not in values:
+        cls = OfflineHyperparameters
     accepted = {field.name for field in fields(cls)}
     if unknown := values.keys() - accepted:
         raise ValueError(
@@ -180,7 +179,7 @@ def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
     """Write the policy of an agent into a file that `load_policy` reads."""
     cls: type[AnyHyperparameters] = Hyperparameters
     if isinstance(agent, OfflineAgent):
-        cls = agent.Hyperparameters
+        cls = OfflineHyperparameters
     # `agent.hp` may be the options of a run. Leave out the fields that are not
     # hyperparameters.
     hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}

@@ -1,4 +1,4 @@
-"""Agents for goal-conditioned tasks: DDPG, TD3, SAC, TQC and CRL."""
+"""Agents for goal-conditioned tasks: DDPG, TD3, SAC and CRL."""
 
 import torch
 
@@ -7,20 +7,13 @@ from torch_panda.learning.agents.crl import CRL
 from torch_panda.learning.agents.ddpg import DDPG
 from torch_panda.learning.agents.sac import SAC
 from torch_panda.learning.agents.td3 import TD3
-from torch_panda.learning.agents.tqc import TQC
 from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.spaces import read_spaces
 
-AGENTS: dict[str, type[Agent]] = {
-    "ddpg": DDPG,
-    "td3": TD3,
-    "sac": SAC,
-    "tqc": TQC,
-    "crl": CRL,
-}
+AGENTS: dict[str, type[Agent]] = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "crl": CRL}
 
-__all__ = ["AGENTS", "CRL", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
+__all__ = ["AGENTS", "CRL", "DDPG", "SAC", "TD3", "Agent", "Hyperparameters"]
 
 
 def make_agent(env: GoalEnv, hp: Hyperparameters) -> Agent:

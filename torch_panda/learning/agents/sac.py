@@ -1,12 +1,10 @@
 """Soft actor-critic (arXiv 1801.01290), with torchrl's loss."""
 
-from typing import Any
-
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
-from torchrl.objectives import LossModule, SACLoss, SoftUpdate
+from torchrl.objectives import SACLoss, SoftUpdate
 
 from torch_panda.learning.agents.base import TAU, Agent
 from torch_panda.learning.hyperparameters import Hyperparameters
@@ -18,12 +16,7 @@ ALPHA = 0.2  # entropy coefficient, which is not trained
 
 
 class SAC(Agent):
-    """A stochastic policy that maximises the value of critics and its entropy.
-
-    The subclass `TQC` has another loss, and critics with more outputs.
-    """
-
-    critic_outputs = 1
+    """A stochastic policy that maximises the value of critics and its entropy."""
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
@@ -36,13 +29,14 @@ class SAC(Agent):
             distribution_class=TanhNormal,
         )
         critic = TensorDictModule(
-            make_mlp(inputs + spaces.action_size, self.critic_outputs, hp.network),
+            make_mlp(inputs + spaces.action_size, 1, hp.network),
             ["normalized", "action"],
             ["state_action_value"],
         )
-        self.loss = self.make_loss(
+        self.loss = SACLoss(
             actor,
             critic,
+            loss_function="l2",
             num_qvalue_nets=2 if hp.double_q else 1,
             deactivate_vmap=True,  # faster on CPU
             alpha_init=ALPHA,
@@ -55,15 +49,6 @@ class SAC(Agent):
         self.soft_update = SoftUpdate(self.loss, tau=TAU)
         noise = [self.random_points()] if hp.exploration == "points" else []
         self.assemble(actor, noise, trained=list(self.loss.parameters()))
-
-    def make_loss(
-        self,
-        actor: ProbabilisticActor,
-        critic: TensorDictModule,
-        **options: Any,  # noqa: ANN401 (options of the loss)
-    ) -> LossModule:
-        """Make torchrl's loss module for actor and critics."""
-        return SACLoss(actor, critic, loss_function="l2", **options)
 
     def backward(
         self, state: Tensor, rows: Transitions, num_demos: int

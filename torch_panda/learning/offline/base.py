@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torch_panda.learning.hyperparameters import RelativeInputs
-from torch_panda.learning.limits import Discount, Positive, Ratio
+from torch_panda.learning.limits import Discount, Positive, Weight
 from torch_panda.learning.normalizer import Normalizer
 from torch_panda.learning.offline.data import OfflineData
 from torch_panda.learning.spaces import Spaces
@@ -30,30 +30,29 @@ MAX_WEIGHT = 100.0  # largest weight of a row in advantage-weighted regression
 # OGBench's mixture of strategies that draw the goals of value functions (arXiv
 # 2410.20092, appendix D).
 VALUE_GOALS = {"current": 0.2, "geometric": 0.5, "random": 0.3}
+# OGBench has 512 units and batches of 1,024. Here both are smaller, so that a gradient
+# step takes an eighth of the time, which suits a CPU.
+HIDDEN_SIZE = 256  # units of each of the three hidden layers
+# OGBench's learning rate of Adam, and the weight of the trained networks when target
+# networks are updated (not the tau of expectiles).
+LEARNING_RATE = 3e-4
+TAU = 0.005
 
 
 @dataclass
 class OfflineHyperparameters:
-    """Hyperparameters that all offline agents share.
+    """Hyperparameters of the offline agents, which are also options of the command."""
 
-    Learning rate, discount and target rate are OGBench's (arXiv 2410.20092). OGBench
-    has 512 units and batches of 1,024. Here both are smaller, so that a gradient step
-    takes an eighth of the time, which suits a CPU.
-    """
-
-    algo: str = ""
-    """algorithm"""
+    algo: str = "gcivl"
+    """algorithm: "gcbc", "gcivl", "gciql", "hiql", "qrl" or "crl\""""
     discount: Discount = 0.99
     """discount factor of the values, also used by the goal strategy "geometric" """
-    learning_rate: Ratio = 3e-4
-    """learning rate of Adam"""
-    tau: Ratio = 0.005
-    """in each step, target networks move this fraction of the way to the trained
-    networks (not the tau of expectiles). GCBC, QRL and CRL have no target networks"""
-    hidden_size: Positive = 256
-    """units of each of the three hidden layers, with GELU and LayerNorm"""
     batch_size: Positive = 256
     """transitions per gradient step"""
+    alpha: Weight | None = None
+    """weight of the imitation in the policy's loss (GCIQL, CRL), or inverse temperature
+    of the weights of imitated actions (GCIVL, HIQL, QRL). None means the default of the
+    algorithm. GCBC has none"""
     actor_goal: Literal["future", "geometric"] = "future"
     """how to draw the goals of the policy among those achieved later in the episode.
     "future", as in OGBench: all are equally likely. "geometric": the goal achieved k
@@ -112,7 +111,7 @@ class OfflineAgent(nn.Module, ABC):
 
     Args:
         spaces: Sizes and layout of observations, goals and actions.
-        hp: An instance of the agent's `Hyperparameters`.
+        hp: Hyperparameters.
 
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
@@ -123,10 +122,11 @@ class OfflineAgent(nn.Module, ABC):
             [-1, 1], deterministic.
         optimizer: Optimizer of all networks that learn.
         updates: Number of gradient steps so far.
+        alpha: The option, or its default for the algorithm.
         value_goal: Strategy that draws the goals of the value functions.
     """
 
-    Hyperparameters: ClassVar[type[OfflineHyperparameters]]
+    default_alpha: ClassVar[float] = 0.0
     value_goal: ClassVar[StrategyOption] = VALUE_GOALS
     policy: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
@@ -137,6 +137,7 @@ class OfflineAgent(nn.Module, ABC):
         # Offsets need a `Geometry`, which some tasks do not have.
         relative_inputs = hp.relative_inputs if spaces.geometry else "none"
         self.normalizer = Normalizer(spaces, relative_inputs)
+        self.alpha = self.default_alpha if hp.alpha is None else hp.alpha
         self.updates = 0
 
     @property
@@ -155,7 +156,7 @@ class OfflineAgent(nn.Module, ABC):
             module, ["observation", "desired_goal"], ["action"]
         )
         trained = [p for p in self.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.Adam(trained, lr=self.hp.learning_rate, fused=True)
+        self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
         """Add further entries of the data to a sampled batch; by default none."""
@@ -210,15 +211,12 @@ class Actor(nn.Module):
     Args:
         normalizer: Standardises observations and goals.
         action_size: Size of an action.
-        hidden_size: Units of each hidden layer.
     """
 
-    def __init__(
-        self, normalizer: Normalizer, action_size: int, hidden_size: int
-    ) -> None:
+    def __init__(self, normalizer: Normalizer, action_size: int) -> None:
         super().__init__()
         self.normalizer = normalizer
-        self.net = make_gelu_mlp(len(normalizer.mean), action_size, hidden_size)
+        self.net = make_gelu_mlp(len(normalizer.mean), action_size)
 
     def forward(self, s: Tensor, g: Tensor) -> Tensor:
         """The mean action, (..., action size)."""
@@ -230,26 +228,25 @@ class Ensemble(nn.ModuleList):
 
     Args:
         inputs: Total size of the inputs, which are concatenated.
-        hidden_size: Units of each hidden layer.
     """
 
-    def __init__(self, inputs: int, hidden_size: int) -> None:
-        super().__init__(make_gelu_mlp(inputs, 1, hidden_size) for _ in range(2))
+    def __init__(self, inputs: int) -> None:
+        super().__init__(make_gelu_mlp(inputs, 1) for _ in range(2))
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """The two values, (2, n)."""
         return torch.stack([net(*inputs).squeeze(-1) for net in self])
 
 
-def make_gelu_mlp(inputs: int, outputs: int, hidden_size: int) -> MLP:
+def make_gelu_mlp(inputs: int, outputs: int) -> MLP:
     """Make a network with three hidden layers that concatenates its inputs."""
     return MLP(
         in_features=inputs,
         out_features=outputs,
-        num_cells=[hidden_size] * 3,
+        num_cells=[HIDDEN_SIZE] * 3,
         activation_class=nn.GELU,
         norm_class=nn.LayerNorm,
-        norm_kwargs=[{"normalized_shape": hidden_size}] * 3,
+        norm_kwargs=[{"normalized_shape": HIDDEN_SIZE}] * 3,
     )
 
 
@@ -324,8 +321,8 @@ def ascend_and_imitate(q: Tensor, log_probs: Tensor, alpha: float) -> Tensor:
 
 
 @torch.no_grad()
-def move_towards(target: nn.Module, online: nn.Module, tau: float) -> None:
+def move_towards(target: nn.Module, online: nn.Module) -> None:
     """Move the parameters of a target network towards those of its network."""
     targets: list[Tensor] = [*target.parameters()]
     sources: list[Tensor] = [*online.parameters()]
-    torch._foreach_lerp_(targets, sources, tau)
+    torch._foreach_lerp_(targets, sources, TAU)

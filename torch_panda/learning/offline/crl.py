@@ -9,9 +9,8 @@ of reaching g after (s, a), and p(g) is the frequency of g among all rows. So f 
 actions as Q does. The policy ascends f and imitates the data.
 """
 
-from dataclasses import dataclass
 from math import sqrt
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -19,7 +18,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.objectives import hold_out_net
 
-from torch_panda.learning.limits import Positive, Weight
 from torch_panda.learning.offline.base import (
     Actor,
     Batch,
@@ -31,40 +29,25 @@ from torch_panda.learning.offline.base import (
 )
 from torch_panda.learning.spaces import Spaces
 
-
-@dataclass
-class CRLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of CRL, by default OGBench's, but with smaller phi and psi.
-
-    For its cube tasks, OGBench takes an alpha of 0.1 (noisy) or 3 (play).
-    """
-
-    algo: Literal["crl"] = "crl"
-    """algorithm"""
-    alpha: Weight = 0.1
-    """weight of the imitation in the policy's loss"""
-    latent_size: Positive = 128
-    """size of phi and psi"""
+LATENT_SIZE = 128  # size of phi and psi, smaller than OGBench's
 
 
 class CRL(OfflineAgent):
     """A contrastive critic f(s, a, g), and a policy pi(a | s, g) that ascends it."""
 
-    Hyperparameters: ClassVar = CRLHyperparameters
+    # For its cube tasks, OGBench takes an alpha of 0.1 (noisy) or 3 (play).
+    default_alpha: ClassVar = 0.1
     value_goal: ClassVar = "geometric"
-    hp: CRLHyperparameters
 
-    def __init__(self, spaces: Spaces, hp: CRLHyperparameters) -> None:
+    def __init__(self, spaces: Spaces, hp: OfflineHyperparameters) -> None:
         super().__init__(spaces, hp)
         state_size, goal_size = len(self.normalizer.state_columns), spaces.goal_size
         inputs = state_size + spaces.action_size
         self.phi, self.psi = (
-            nn.ModuleList(
-                make_gelu_mlp(size, hp.latent_size, hp.hidden_size) for _ in range(2)
-            )
+            nn.ModuleList(make_gelu_mlp(size, LATENT_SIZE) for _ in range(2))
             for size in (inputs, goal_size)
         )
-        self.actor = Actor(self.normalizer, spaces.action_size, hp.hidden_size)
+        self.actor = Actor(self.normalizer, spaces.action_size)
         self.assemble(self.actor)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -72,14 +55,14 @@ class CRL(OfflineAgent):
         b = Batch.from_tensordict(batch)
         phi, psi = self.encode(b.s, b.a, b.g)
         # Row i of the logits has (s, a) of row i, column j the goal of row j.
-        logits = phi @ psi.mT / sqrt(self.hp.latent_size)  # (2, n, n)
+        logits = phi @ psi.mT / sqrt(LATENT_SIZE)  # (2, n, n)
         return {
             "critic_loss": contrastive_loss(logits),
             "actor_loss": self.actor_loss(b),
         }
 
     def encode(self, s: Tensor, a: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
-        """phi(s, a) and psi(g) of both critics, (2, n, latent_size) each."""
+        """phi(s, a) and psi(g) of both critics, (2, n, LATENT_SIZE) each."""
         x, y = self.normalizer.state(s), self.normalizer.goal(g)
         phi = torch.stack([net(x, a) for net in self.phi])
         psi = torch.stack([net(y) for net in self.psi])
@@ -90,8 +73,8 @@ class CRL(OfflineAgent):
         mean = self.actor(b.s, b.g_actor)
         with hold_out_net(self.phi), hold_out_net(self.psi):
             phi, psi = self.encode(b.s, mean.clamp(-1.0, 1.0), b.g_actor)
-            f = (phi * psi).sum(-1).amin(0) / sqrt(self.hp.latent_size)
-        return ascend_and_imitate(f, log_prob(mean, b.a), self.hp.alpha)
+            f = (phi * psi).sum(-1).amin(0) / sqrt(LATENT_SIZE)
+        return ascend_and_imitate(f, log_prob(mean, b.a), self.alpha)
 
 
 def contrastive_loss(logits: Tensor) -> Tensor:

@@ -6,9 +6,6 @@ The policy imitates every action of the data, given a goal that its episode achi
 later.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar, Literal
-
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -22,22 +19,12 @@ from torch_panda.learning.offline.base import (
 from torch_panda.learning.spaces import Spaces
 
 
-@dataclass
-class GCBCHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of GCBC."""
-
-    algo: Literal["gcbc"] = "gcbc"
-    """algorithm"""
-
-
 class GCBC(OfflineAgent):
     """A policy pi(a | s, g) that imitates."""
 
-    Hyperparameters: ClassVar = GCBCHyperparameters
-
-    def __init__(self, spaces: Spaces, hp: GCBCHyperparameters) -> None:
+    def __init__(self, spaces: Spaces, hp: OfflineHyperparameters) -> None:
         super().__init__(spaces, hp)
-        self.actor = Actor(self.normalizer, spaces.action_size, hp.hidden_size)
+        self.actor = Actor(self.normalizer, spaces.action_size)
         self.assemble(self.actor)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:

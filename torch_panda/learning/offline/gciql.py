@@ -6,15 +6,13 @@ OGBench (arXiv 2410.20092) the policy ascends Q and imitates the data, DDPG+BC.
 """
 
 import copy
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import hold_out_net
 
-from torch_panda.learning.limits import Ratio, Weight
 from torch_panda.learning.offline.base import (
     Actor,
     Batch,
@@ -30,34 +28,29 @@ from torch_panda.learning.offline.base import (
 from torch_panda.learning.spaces import Spaces
 
 
-@dataclass
-class GCIQLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of GCIQL, by default those of OGBench's code.
+class GCIQL(OfflineAgent):
+    """Values V(s, g) and Q(s, a, g), and a policy pi(a | s, g) that ascends Q.
 
-    In its commands for cube tasks, OGBench sets alpha to 0.03 (noisy) or 1 (play).
+    Args:
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
+        expectile: Expectile of the values, tau in the paper.
     """
 
-    algo: Literal["gciql"] = "gciql"
-    """algorithm"""
-    expectile: Ratio = 0.9
-    """expectile of the values, tau in the paper"""
-    alpha: Weight = 0.3
-    """weight of the imitation in the policy's loss"""
+    # Expectile and alpha are those of OGBench's code. In its commands for cube tasks,
+    # OGBench sets alpha to 0.03 (noisy) or 1 (play).
+    default_alpha: ClassVar = 0.3
 
-
-class GCIQL(OfflineAgent):
-    """Values V(s, g) and Q(s, a, g), and a policy pi(a | s, g) that ascends Q."""
-
-    Hyperparameters: ClassVar = GCIQLHyperparameters
-    hp: GCIQLHyperparameters
-
-    def __init__(self, spaces: Spaces, hp: GCIQLHyperparameters) -> None:
+    def __init__(
+        self, spaces: Spaces, hp: OfflineHyperparameters, *, expectile: float = 0.9
+    ) -> None:
         super().__init__(spaces, hp)
+        self.expectile = expectile
         inputs, action_size = len(self.normalizer.mean), spaces.action_size
-        self.value = make_gelu_mlp(inputs, 1, hp.hidden_size)
-        self.critic = Ensemble(inputs + action_size, hp.hidden_size)
+        self.value = make_gelu_mlp(inputs, 1)
+        self.critic = Ensemble(inputs + action_size)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
-        self.actor = Actor(self.normalizer, action_size, hp.hidden_size)
+        self.actor = Actor(self.normalizer, action_size)
         self.assemble(self.actor)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -75,7 +68,7 @@ class GCIQL(OfflineAgent):
         with torch.no_grad():
             q = self.target_critic(x, b.a).amin(0)
         diff = q - self.value(x).squeeze(-1)
-        return expectile_loss(diff, diff, self.hp.expectile).mean()
+        return expectile_loss(diff, diff, self.expectile).mean()
 
     def critic_loss(self, b: Batch) -> Tensor:
         """Squared error of Q with respect to r + discount * V(s', g) (eq. 6)."""
@@ -91,8 +84,8 @@ class GCIQL(OfflineAgent):
         with hold_out_net(self.critic):
             x = self.normalizer(b.s, b.g_actor)
             q = self.critic(x, mean.clamp(-1.0, 1.0)).amin(0)
-        return ascend_and_imitate(q, log_prob(mean, b.a), self.hp.alpha)
+        return ascend_and_imitate(q, log_prob(mean, b.a), self.alpha)
 
     def move_targets(self) -> None:
         """Move the target critics towards the critics."""
-        move_towards(self.target_critic, self.critic, self.hp.tau)
+        move_towards(self.target_critic, self.critic)

@@ -10,14 +10,12 @@ exp(alpha * advantage).
 """
 
 import copy
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_panda.learning.limits import Ratio, Weight
 from torch_panda.learning.offline.base import (
     Actor,
     Batch,
@@ -32,29 +30,25 @@ from torch_panda.learning.offline.base import (
 from torch_panda.learning.spaces import Spaces
 
 
-@dataclass
-class GCIVLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of GCIVL, by default OGBench's."""
-
-    algo: Literal["gcivl"] = "gcivl"
-    """algorithm"""
-    expectile: Ratio = 0.9
-    """expectile of the values, tau in the paper"""
-    alpha: Weight = 10.0
-    """inverse temperature of the weights of imitated actions"""
-
-
 class GCIVL(OfflineAgent):
-    """Values V(s, g), and a policy pi(a | s, g) that imitates good actions."""
+    """Values V(s, g), and a policy pi(a | s, g) that imitates good actions.
 
-    Hyperparameters: ClassVar = GCIVLHyperparameters
-    hp: GCIVLHyperparameters
+    Args:
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
+        expectile: Expectile of the values, tau in the paper.
+    """
 
-    def __init__(self, spaces: Spaces, hp: GCIVLHyperparameters) -> None:
+    default_alpha: ClassVar = 10.0  # OGBench's, as the expectile
+
+    def __init__(
+        self, spaces: Spaces, hp: OfflineHyperparameters, *, expectile: float = 0.9
+    ) -> None:
         super().__init__(spaces, hp)
-        self.value = Ensemble(len(self.normalizer.mean), hp.hidden_size)
+        self.expectile = expectile
+        self.value = Ensemble(len(self.normalizer.mean))
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
-        self.actor = Actor(self.normalizer, spaces.action_size, hp.hidden_size)
+        self.actor = Actor(self.normalizer, spaces.action_size)
         self.assemble(self.actor)
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -68,7 +62,7 @@ class GCIVL(OfflineAgent):
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * self.target_value(x_next)  # (2, n)
             v_target = self.target_value(x)
-        return ensemble_loss(q, self.value(x), v_target, self.hp.expectile)
+        return ensemble_loss(q, self.value(x), v_target, self.expectile)
 
     def actor_loss(self, b: Batch) -> Tensor:
         """Weighted imitation with A = V(s', g) - V(s, g) (2307.11949, eq. 5)."""
@@ -76,8 +70,8 @@ class GCIVL(OfflineAgent):
             v = self.value(self.normalizer(b.s, b.g_actor)).mean(0)
             v_next = self.value(self.normalizer(b.s_next, b.g_actor)).mean(0)
         log_probs = log_prob(self.actor(b.s, b.g_actor), b.a)
-        return weighted_regression(log_probs, v_next - v, self.hp.alpha)
+        return weighted_regression(log_probs, v_next - v, self.alpha)
 
     def move_targets(self) -> None:
         """Move the target values towards the values."""
-        move_towards(self.target_value, self.value, self.hp.tau)
+        move_towards(self.target_value, self.value)

@@ -13,15 +13,13 @@ phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
 """
 
 import copy
-from dataclasses import dataclass
 from math import sqrt
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torch_panda.learning.limits import Positive, Ratio, Weight
 from torch_panda.learning.normalizer import Normalizer
 from torch_panda.learning.offline.base import (
     VALUE_GOALS,
@@ -40,39 +38,40 @@ from torch_panda.learning.offline.data import OfflineData
 from torch_panda.learning.spaces import Spaces
 from torch_panda.transforms.strategies import choose_steps
 
-
-@dataclass
-class HIQLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of HIQL, by default OGBench's for its cube tasks."""
-
-    algo: Literal["hiql"] = "hiql"
-    """algorithm"""
-    expectile: Ratio = 0.7
-    """expectile of the values, tau in the paper"""
-    high_alpha: Weight = 3.0
-    """inverse temperature of the weights of imitated waypoints"""
-    low_alpha: Weight = 3.0
-    """inverse temperature of the weights of imitated actions"""
-    subgoal_steps: Positive = 10
-    """number k of steps from a state to its waypoint, OGBench's subgoal"""
-    rep_dim: Positive = 10
-    """size of the representation of a waypoint"""
+REP_SIZE = 10  # size of the representation of a waypoint
 
 
 class HIQL(OfflineAgent):
-    """Values of waypoints and goals, and a policy of each level."""
+    """Values of waypoints and goals, and a policy of each level.
 
-    Hyperparameters: ClassVar = HIQLHyperparameters
-    hp: HIQLHyperparameters
+    The defaults are OGBench's for its cube tasks. Both levels have the same alpha.
 
-    def __init__(self, spaces: Spaces, hp: HIQLHyperparameters) -> None:
+    Args:
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
+        expectile: Expectile of the values, tau in the paper.
+        subgoal_steps: Number k of steps from a state to its waypoint, OGBench's
+            subgoal.
+    """
+
+    default_alpha: ClassVar = 3.0
+
+    def __init__(
+        self,
+        spaces: Spaces,
+        hp: OfflineHyperparameters,
+        *,
+        expectile: float = 0.7,
+        subgoal_steps: int = 10,
+    ) -> None:
         super().__init__(spaces, hp)
-        inputs, hidden_size = len(self.normalizer.mean), hp.hidden_size
+        self.expectile, self.subgoal_steps = expectile, subgoal_steps
+        inputs = len(self.normalizer.mean)
         state_size = len(self.normalizer.state_columns)
         # phi(s, w), the values of waypoints and of goals, and targets of all three.
-        self.phi = make_gelu_mlp(2 * state_size, hp.rep_dim, hidden_size)
-        self.waypoint_value = Ensemble(state_size + hp.rep_dim, hidden_size)
-        self.goal_value = Ensemble(inputs, hidden_size)
+        self.phi = make_gelu_mlp(2 * state_size, REP_SIZE)
+        self.waypoint_value = Ensemble(state_size + REP_SIZE)
+        self.goal_value = Ensemble(inputs)
         self.online = nn.ModuleDict(
             {
                 "phi": self.phi,
@@ -82,10 +81,8 @@ class HIQL(OfflineAgent):
         )
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         # pi^h(z | s, g) and pi^l(a | s, z).
-        self.high_actor = Actor(self.normalizer, hp.rep_dim, hidden_size)
-        self.low_actor = make_gelu_mlp(
-            state_size + hp.rep_dim, spaces.action_size, hidden_size
-        )
+        self.high_actor = Actor(self.normalizer, REP_SIZE)
+        self.low_actor = make_gelu_mlp(state_size + REP_SIZE, spaces.action_size)
         self.assemble(
             HierarchicalActor(self.normalizer, self.high_actor, self.low_actor)
         )
@@ -104,7 +101,7 @@ class HIQL(OfflineAgent):
         goal_row = draw_rows(self.hp.actor_goal, t, last, self.hp.discount)
         # Row t holds a state s and the next state s', so the state k steps after s is
         # s' of row t + k - 1.
-        waypoint_row = t + self.hp.subgoal_steps - 1
+        waypoint_row = t + self.subgoal_steps - 1
         # The waypoint for the loss of V(s, phi(s, w)) is s' of a row that is drawn like
         # the goals of V(s, g).
         rows = {
@@ -138,7 +135,7 @@ class HIQL(OfflineAgent):
         }
 
     def represent(self, phi: nn.Module, s: Tensor, w: Tensor) -> Tensor:
-        """phi(s, w), scaled to the Euclidean norm sqrt(rep_dim), (n, rep_dim)."""
+        """phi(s, w), scaled to the Euclidean norm sqrt(REP_SIZE), (n, REP_SIZE)."""
         return normalize_length(phi(s, self.normalizer.state(w)))
 
     def goal_value_loss(self, b: Batch) -> Tensor:
@@ -148,7 +145,7 @@ class HIQL(OfflineAgent):
         with torch.no_grad():
             q = b.r + self.hp.discount * b.mask * target(x_next)  # (2, n)
             v_target = target(x)
-        return ensemble_loss(q, value(x), v_target, self.hp.expectile)
+        return ensemble_loss(q, value(x), v_target, self.expectile)
 
     def waypoint_value_loss(
         self, s: Tensor, s_next: Tensor, w: Tensor, reaches_w: Tensor
@@ -161,7 +158,7 @@ class HIQL(OfflineAgent):
             q = ~reaches_w * (self.hp.discount * v_next - 1)
             v_target = value(s, self.represent(phi, s, w))
         v = self.waypoint_value(s, self.represent(self.phi, s, w))
-        return ensemble_loss(q, v, v_target, self.hp.expectile)
+        return ensemble_loss(q, v, v_target, self.expectile)
 
     def high_actor_loss(self, b: Batch, s: Tensor, w: Tensor) -> Tensor:
         """Weighted imitation of waypoints, A = V(w, g) - V(s, g) (eq. 6)."""
@@ -170,7 +167,7 @@ class HIQL(OfflineAgent):
             v_later = self.goal_value(self.normalizer(w, b.g_actor)).mean(0)
             z = self.represent(self.phi, s, w)
         log_probs = log_prob(self.high_actor(b.s, b.g_actor), z)
-        return weighted_regression(log_probs, v_later - v, self.hp.high_alpha)
+        return weighted_regression(log_probs, v_later - v, self.alpha)
 
     def low_actor_loss(self, a: Tensor, s: Tensor, s_next: Tensor, w: Tensor) -> Tensor:
         """Weighted imitation of actions, A = V(s', w) - V(s, w) (eq. 7)."""
@@ -180,11 +177,11 @@ class HIQL(OfflineAgent):
             z_next = self.represent(self.phi, s_next, w)
             v_next = self.waypoint_value(s_next, z_next).mean(0)
         log_probs = log_prob(self.low_actor(s, z), a)
-        return weighted_regression(log_probs, v_next - v, self.hp.low_alpha)
+        return weighted_regression(log_probs, v_next - v, self.alpha)
 
     def move_targets(self) -> None:
         """Move the target networks of phi and of both values towards the networks."""
-        move_towards(self.target, self.online, self.hp.tau)
+        move_towards(self.target, self.online)
 
 
 class HierarchicalActor(nn.Module):

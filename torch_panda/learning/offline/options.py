@@ -1,7 +1,6 @@
 """Options of ``train --offline``, and checks of their values."""
 
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,6 @@ KINDS = ("noisy", "play", "random")  # kinds of `torch_panda.datasets.generate`
 class OfflineArgs(OfflineHyperparameters):
     """Options of offline training: algorithm, data, duration and folder."""
 
-    algo: str = "gcivl"
-    """algorithm: "gcbc", "gcivl", "gciql", "hiql", "qrl" or "crl". Each has options of
-    its own: `train --offline --algo hiql --help`"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     task_options: dict[str, Finite] = field(default_factory=dict)
@@ -67,30 +63,21 @@ class OfflineArgs(OfflineHyperparameters):
         return {"task_options": self.task_options, "physics": self.physics}
 
 
-@cache
-def make_args_class(algo: str) -> type[OfflineArgs]:
-    """Make the class of the options of an algorithm, with its hyperparameters.
-
-    Raises:
-        ValueError: There is no such algorithm.
-    """
-    if algo not in OFFLINE_AGENTS:
-        raise ValueError(
-            f"--offline learns by {', '.join(OFFLINE_AGENTS)}, got --algo {algo}: "
-            "choose one of them, or leave out --offline"
-        )
-    cls = OFFLINE_AGENTS[algo].Hyperparameters
-    # The algorithm's class comes first, so that its defaults take precedence.
-    return dataclass(type("OfflineArgs", (cls, OfflineArgs), {}))
-
-
 def check_offline(args: OfflineArgs) -> None:
     """Check options before data are generated.
 
     Raises:
-        ValueError: An option is out of its limits, or the data do not exist.
+        ValueError: An option is out of its limits, the data do not exist, or the
+            algorithm does not learn offline or does not have the option.
     """
     check_limits(args)
+    if args.algo not in OFFLINE_AGENTS:
+        raise ValueError(
+            f"--offline learns by {', '.join(OFFLINE_AGENTS)}, got --algo {args.algo}: "
+            "choose one of them, or leave out --offline"
+        )
+    if args.algo == "gcbc" and args.alpha is not None:
+        raise ValueError("algo gcbc has no alpha: drop --alpha")
     check_device(args.device)
     check_logger(args.logger)
     if args.data not in KINDS and not Path(args.data).exists():
