@@ -16,7 +16,7 @@ from tests.learning.gradient_steps import SPACES, fill_normalizer
 from torch_panda.bullet import FAST
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
-from torch_panda.learning.offline import OFFLINE_AGENTS
+from torch_panda.learning.agents import OFFLINE_AGENTS
 from torch_panda.learning.offline.options import OfflineArgs
 from torch_panda.learning.policy_files import save_policy
 
@@ -94,7 +94,8 @@ def test_a_resumed_offline_run_equals_an_uninterrupted_run(tmp_path, device):
 def test_the_saved_policy_acts_as_the_agent(tmp_path, algo, device):
     torch.manual_seed(0)
     with torch.device(device):
-        agent = OFFLINE_AGENTS[algo](SPACES, make_args(tmp_path, algo))
+        args = make_args(tmp_path, algo, relative_inputs="none")
+        agent = OFFLINE_AGENTS[algo](SPACES, args)
         fill_normalizer(agent)
     save_policy(tmp_path / "checkpoint.pt", agent, "PandaReach-v1")
     random_state = torch.get_rng_state()

@@ -9,7 +9,7 @@ from tests.learning.gradient_steps import SPACES
 from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.learning.normalizer import Normalizer
-from torch_panda.learning.offline import OFFLINE_AGENTS
+from torch_panda.learning.offline.options import OfflineArgs
 from torch_panda.learning.options import Args
 from torch_panda.learning.spaces import read_spaces
 from torch_panda.learning.training import Run
@@ -37,11 +37,10 @@ def test_relative_inputs_append_differences():
 
 def test_agents_see_the_offsets_that_their_options_name():
     """Reach has one offset, from the hand to the goal. It is an input twice, "fine"."""
-    cls = OFFLINE_AGENTS["gcbc"]
     with torch_panda.make("PandaReach-v1", num_envs=3, seed=0) as env:
         td = env.reset()
         online = make_agent(env, Hyperparameters(relative_inputs="fine"))
-        offline = cls(read_spaces(env), cls.Hyperparameters())
+        offline = make_agent(env, OfflineArgs())
     offset = td["desired_goal"] - td["observation"][:, :3]
     expected = torch.cat((offset, offset.clamp(-0.03, 0.03)), -1)
     for agent in (online, offline):

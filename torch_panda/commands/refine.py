@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 import torch_panda
 from torch_panda.datasets.recording import play
-from torch_panda.learning.agents import AGENTS, Agent
+from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
 from torch_panda.learning.checkpoint import (
     SAVE_INTERVAL,
@@ -88,13 +88,12 @@ class Refinement:
         saved = SavedPolicy.read(args.policy)
         args.env_id = args.env_id or saved.env_id
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
-        agent = saved.make_agent(self.env)
-        if not isinstance(agent, Agent):
+        self.agent = saved.make_agent(self.env)
+        if saved.hp.offline:
             raise ValueError(
                 f"{args.policy} was learned offline by {saved.hp.algo}, but refine "
                 f"improves policies of {', '.join(AGENTS)}: choose one of these"
             )
-        self.agent = agent
         rng = np.random.default_rng(0)
         goals = [self.env.task.sample_start(rng).goal for _ in range(100)]
         self.varies = torch.from_numpy(np.ptp(goals, axis=0) > 0)

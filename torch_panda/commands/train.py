@@ -8,7 +8,7 @@ the hyperparameters of the panda-gym paper (arXiv 2106.13687). Where the paper g
 none, it takes those of the HER of OpenAI Baselines. The other presets are tuned for
 each shipped task, see `torch_panda.learning.recipes`.
 
-With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
+With ``--offline`` the agent learns from a data set, see `torch_panda.learning.agents.OFFLINE_AGENTS`.
 
 `torch_panda.testing.check_task` checks the task before the training begins.
 """
@@ -24,7 +24,6 @@ from tqdm import tqdm
 import torch_panda
 from torch_panda.datasets import generate, read_demos, sha256
 from torch_panda.learning import files
-from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.checkpoint import (
     StopSignal,
@@ -34,7 +33,6 @@ from torch_panda.learning.checkpoint import (
 )
 from torch_panda.learning.environments import is_from_gymnasium, make_env
 from torch_panda.learning.geometry import declares_layout
-from torch_panda.learning.offline import OFFLINE_AGENTS
 from torch_panda.learning.offline.options import (
     KINDS,
     OfflineArgs,
@@ -79,8 +77,6 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
         offline_args = tyro.cli(OfflineArgs, prog=f"{PROG} --offline", args=arguments)
         import_modules(read_modules(offline_args.imports))
         return offline_args
-    if mode.algo in OFFLINE_AGENTS and mode.algo not in AGENTS:
-        raise ValueError(f"{mode.algo} learns offline: add --offline")
     recipe = Args(preset="recipe")
     first = tyro.cli(Args, prog=PROG, args=without_help, default=recipe)
     import_modules(read_modules(first.imports))

@@ -16,7 +16,8 @@ from torchrl.data import ReplayBuffer
 from tqdm import tqdm
 
 from torch_panda.learning import files
-from torch_panda.learning.policy_files import AnyAgent, save_policy
+from torch_panda.learning.agents import Agent
+from torch_panda.learning.policy_files import save_policy
 from torch_panda.learning.recipes import find_changes
 
 LOCK = "run.lock"  # file that the process of a run keeps locked
@@ -71,7 +72,7 @@ class Checkpoint:
 
     out: Path
     args: Any  # options of the run, a dataclass
-    agent: AnyAgent
+    agent: Agent
     buffer: ReplayBuffer | None  # None in offline learning
     progress: Progress
     data_hash: str = ""  # of demonstrations or offline data; empty without both

@@ -10,6 +10,7 @@ from torchrl.record.loggers import Logger
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning import files
+from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import Checkpoint, Progress
 from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.evaluation import (
@@ -19,7 +20,7 @@ from torch_panda.learning.evaluation import (
 from torch_panda.learning.evaluation_tasks import evaluation_tasks
 from torch_panda.learning.logger import close_logger
 from torch_panda.learning.plots import plot_curve
-from torch_panda.learning.policy_files import AnyAgent, save_policy
+from torch_panda.learning.policy_files import save_policy
 
 EPISODES = 80  # episodes of each evaluation
 NUM_ENVS = 16  # environments that run these episodes in parallel
@@ -43,7 +44,7 @@ class Curve:
     def __init__(
         self,
         env_id: str,
-        agent: AnyAgent,
+        agent: Agent,
         out: Path,
         *,
         device: str,

@@ -5,7 +5,6 @@ import time
 from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
-from torch_panda.learning.agents import Agent
 from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint
 
 
@@ -31,7 +30,6 @@ def pretrain(
         stop: Object that becomes true to end the imitation early, such as `StopSignal`.
     """
     agent, progress = checkpoint.agent, checkpoint.progress
-    assert isinstance(agent, Agent)  # offline agents have no pretraining
     bar = tqdm(
         desc="imitation", initial=progress.pretrained, total=updates, unit="update"
     )

@@ -6,18 +6,36 @@ from typing import Any
 
 from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
-from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
+from torch_panda.learning.agents import find_agent
+from torch_panda.learning.hyperparameters import (
+    Algo,
+    Hyperparameters,
+    Network,
+    RelativeInputs,
+)
+from torch_panda.learning.limits import Discount, Finite, Positive, Seed, check_limits
 from torch_panda.learning.logger import LoggerName, check_logger
-from torch_panda.learning.offline import OFFLINE_AGENTS, OfflineHyperparameters
 from torch_panda.learning.user_modules import Imports
 
 KINDS = ("noisy", "play", "random")  # kinds of `torch_panda.datasets.generate`
 
 
 @dataclass
-class OfflineArgs(OfflineHyperparameters):
+class OfflineArgs(Hyperparameters):
     """Options of offline training: algorithm, data, duration and folder."""
 
+    algo: Algo = "gcivl"
+    """algorithm: "gcbc", "gcivl", "gciql", "hiql", "qrl" or "crl\""""
+    offline: bool = True
+    """learn from a data set instead of an environment"""
+    gamma: Discount | None = 0.99
+    """discount factor of the values, also of the goal strategy "geometric" """
+    network: Network = "gelu"
+    """hidden layers"""
+    relative_inputs: RelativeInputs = "fine"
+    """additional inputs of the networks"""
+    batch_size: Positive = 256
+    """transitions per gradient step"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     task_options: dict[str, Finite] = field(default_factory=dict)
@@ -71,11 +89,7 @@ def check_offline(args: OfflineArgs) -> None:
             algorithm does not learn offline or does not have the option.
     """
     check_limits(args)
-    if args.algo not in OFFLINE_AGENTS:
-        raise ValueError(
-            f"--offline learns by {', '.join(OFFLINE_AGENTS)}, got --algo {args.algo}: "
-            "choose one of them, or leave out --offline"
-        )
+    find_agent(args)
     if args.algo == "gcbc" and args.alpha is not None:
         raise ValueError("algo gcbc has no alpha: drop --alpha")
     check_device(args.device)

@@ -8,19 +8,19 @@ bit.
 import os
 import time
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from torch_panda.learning.agents import find_agent
 from torch_panda.learning.checkpoint import SAVE_INTERVAL, Checkpoint, Progress
 from torch_panda.learning.curve import Curve
 from torch_panda.learning.logger import make_logger
-from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.data import OfflineData
 from torch_panda.learning.offline.options import OfflineArgs
+from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.spaces import read_spaces
 from torch_panda.registry import make
 
@@ -48,9 +48,9 @@ class OfflineRun:
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         torch.set_float32_matmul_precision("medium")  # as in `training.Run`
         torch.manual_seed(args.seed)
-        cls = OFFLINE_AGENTS[args.algo]
+        cls = find_agent(args)
         self.env = make(args.env_id, device=args.device, **args.env_options)
-        spaces = read_spaces(self.env)
+        spaces, hp = read_spaces(self.env), args
         if spaces.geometry is None and args.relative_inputs != "none":
             warnings.warn(
                 f"learning without relative inputs ({args.relative_inputs!r}), because "
@@ -59,11 +59,12 @@ class OfflineRun:
                 "--relative-inputs none",
                 stacklevel=2,
             )
+            hp = replace(args, relative_inputs="none")
         with torch.device(args.device):
-            self.agent = cls(spaces, args)
+            self.agent = cls(spaces, hp)
         data = data.to(args.device)
         self.data = OfflineData(
-            data, self.env, self.agent.goal_strategies, args.discount
+            data, self.env, self.agent.goal_strategies, self.agent.gamma
         )
         sample = self.sample(min(FIT_ROWS, len(self.data)))
         self.agent.normalizer.update(sample["observation"], sample["actor_goal"])

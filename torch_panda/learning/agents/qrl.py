@@ -19,19 +19,19 @@ of their own, and a step from each state to the goal that it achieves costs 0.
 from typing import ClassVar
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional
 
-from torch_panda.learning.offline.base import (
-    Actor,
-    Batch,
-    OfflineAgent,
-    OfflineHyperparameters,
+from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.offline_losses import (
+    OGBENCH_RATES,
     log_prob,
-    make_gelu_mlp,
+    make_mean_policy,
     weighted_regression,
 )
+from torch_panda.learning.batch import Batch
+from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
 
 INTERVALS = 8  # intervals in each component of the quasimetric
@@ -45,7 +45,7 @@ LAMBDA_LEARNING_RATE = 0.01
 OFFSET, BETA = 50.0, 0.1
 
 
-class QRL(OfflineAgent):
+class QRL(Agent):
     """A quasimetric d(s, g), and a policy pi(a | s, g) that follows it.
 
     Args:
@@ -55,20 +55,21 @@ class QRL(OfflineAgent):
             OGBench's.
     """
 
+    learning_rate, tau = OGBENCH_RATES
     default_alpha: ClassVar = 10.0  # OGBench's for cube tasks and play data
     value_goal: ClassVar = "random"
 
     def __init__(
-        self, spaces: Spaces, hp: OfflineHyperparameters, *, num_components: int = 32
+        self, spaces: Spaces, hp: Hyperparameters, *, num_components: int = 32
     ) -> None:
         super().__init__(spaces, hp)
         state_size = len(self.normalizer.state_columns)
         latent_size = INTERVALS * num_components
-        self.state_encoder = make_gelu_mlp(state_size, latent_size)
-        self.goal_encoder = make_gelu_mlp(spaces.goal_size, latent_size)
+        self.state_encoder = make_mlp(state_size, latent_size, hp.network)
+        self.goal_encoder = make_mlp(spaces.goal_size, latent_size, hp.network)
         self.quasimetric = IQE()
-        self.actor = Actor(self.normalizer, spaces.action_size)
-        self.assemble(self.actor)
+        self.actor = make_mlp(self.state_size, spaces.action_size, hp.network)
+        self.assemble(make_mean_policy(self.actor))
         self.log_lambda = nn.Parameter(torch.zeros(()))
         self.optimizer.add_param_group(
             {"params": [self.log_lambda], "lr": LAMBDA_LEARNING_RATE}
@@ -82,16 +83,16 @@ class QRL(OfflineAgent):
         """Latent of goals, (n, latent size)."""
         return self.goal_encoder(self.normalizer.goal(g))
 
-    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def losses(self, b: Batch) -> dict[str, Tensor]:
         """The losses of quasimetric, multiplier and policy."""
-        b = Batch.from_tensordict(batch)
         z, z_next = self.encode_state(b.s), self.encode_state(b.s_next)
         far = self.quasimetric(z, self.encode_goal(b.g))
         # Section 3.2: push states and random goals apart, far pairs less.
         push = functional.softplus(OFFSET - far, beta=BETA).mean()
         # Eq. 10: steps cost at most 1. Reaching the achieved goal costs 0.
         too_far = (self.quasimetric(z, z_next) - 1).relu().square().mean()
-        achieved = self.quasimetric(z_next, self.encode_goal(b.achieved))
+        goal = self.encode_goal(b.source["next", "achieved_goal"])
+        achieved = self.quasimetric(z_next, goal)
         violation = too_far + achieved.square().mean()
         multiplier = self.log_lambda.exp()
         return {
@@ -106,7 +107,7 @@ class QRL(OfflineAgent):
             goal = self.encode_goal(b.g_actor)
             before = self.quasimetric(self.encode_state(b.s), goal)
             after = self.quasimetric(self.encode_state(b.s_next), goal)
-        log_probs = log_prob(self.actor(b.s, b.g_actor), b.a)
+        log_probs = log_prob(self.actor(self.normalizer(b.s, b.g_actor)), b.a)
         return weighted_regression(log_probs, before - after, self.alpha)
 
 
