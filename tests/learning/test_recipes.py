@@ -93,7 +93,7 @@ def test_tasks_of_users_have_no_recipe_unless_they_are_shipped_tasks(
     torch_panda.register("PushBall-v0", robot=blocked, task=PushBall)
     assert find_recipe("PushBall-v0") == {}
     assert find_recipe("PushBall-v0", "sample-efficient") == SAMPLE_EFFICIENT
-    default = Args(preset="tuned", env_id="PushBall-v0")
+    default = Args(preset="tuned", env_id="PushBall-v0", keep_unmoved=0.1)
     assert default_args("tuned", "PushBall-v0") == default
     near = partial(torch_panda.Push, goal_xy_range=0.1)
     torch_panda.register("PushNear-v0", robot=blocked, task=near)
@@ -111,7 +111,7 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
     args = default_args("tuned", "PandaStack-v1")
     args.num_envs = 2
     run = Run(args, tmp_path)
-    data = next(iter(run.collector))
+    data = next(iter(run.source.collector))
     run.close()
     assert data.shape == (2, 50)
 
@@ -121,7 +121,7 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
 def test_training_episodes_can_go_on_after_success(continues, tmp_path):
     args = Args(env_id="PandaReach-v3", num_envs=16, continue_after_success=continues)
     run = Run(args, tmp_path)
-    after = next(iter(run.collector))["next"]
+    after = next(iter(run.source.collector))["next"]
     run.close()
     assert after["success"].any()
     assert after["terminated"].any() != continues

@@ -13,6 +13,7 @@ from torch_panda.commands.train import parse
 from torch_panda.learning.checkpoint import fixed_options
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.options import Args
+from torch_panda.learning.recipes import KEEP_UNMOVED
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "examples" / "results"
@@ -88,6 +89,8 @@ def runs():
             continue
         if name[:-2] not in WITHOUT_COMMAND and "refined" not in name:
             args = default | json.loads(path.read_text())
+            if args["preset"] != "paper":  # an option since, with this default
+                args["keep_unmoved"] = KEEP_UNMOVED
             if args.get("layer_norm"):
                 args["network"] = "layer-norm"
             runs[name] = args

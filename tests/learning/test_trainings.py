@@ -10,9 +10,8 @@ from torch_panda import datasets
 from torch_panda.learning.agents import make_agent
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.evaluation import evaluate_episodes
-from torch_panda.learning.offline.options import OfflineArgs
 from torch_panda.learning.offline_data import OfflineData
-from torch_panda.learning.options import Args
+from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.slow
@@ -36,7 +35,7 @@ def transitions():
 @pytest.mark.parametrize("algo", ["gcbc", "gcivl", "gciql", "hiql", "qrl"])
 def test_offline_agents_learn_to_reach(env, transitions, algo):
     torch.manual_seed(0)
-    agent = make_agent(env, OfflineArgs(algo=algo))
+    agent = make_agent(env, default_args("offline", "PandaReach-v1", algo))
     data = OfflineData(transitions.clone(), env, agent.goal_strategies, agent.gamma)
     batch = agent.extend(data.sample(2_000), data)
     agent.normalizer.update(batch["observation"], batch["actor_goal"])

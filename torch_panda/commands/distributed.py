@@ -270,6 +270,8 @@ def main(args: Args) -> None:
         check_limits(args)
         import_modules(read_modules(args.imports))
         check_exploration(args, args.num_envs)
+        if args.offline:
+            raise ValueError("distributed learns in environments: drop --offline")
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)

@@ -10,6 +10,7 @@ needs no rewards, no demonstrations and no exploration noise.
 """
 
 import os
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
@@ -40,7 +42,6 @@ from torch_panda.learning.checkpoint import (
 from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.limits import Positive, Seed, check_limits
 from torch_panda.learning.policy_files import SavedPolicy
-from torch_panda.learning.pretraining import pretrain
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 LEARNING_RATE = 0.3  # first learning rate, as a fraction of the rate of training
@@ -195,6 +196,45 @@ def relabel(
     for key in ("desired_goal", ("next", "desired_goal")):
         episode[key] = goal.expand_as(episode[key])
     return episode
+
+
+def pretrain(
+    checkpoint: Checkpoint,
+    demos: TensorDictReplayBuffer,
+    *,
+    updates: int,
+    batch_size: int,
+    learning_rate: float = 1.0,
+    stop: object,
+) -> None:
+    """Take the remaining gradient steps of imitation, and save the run.
+
+    The learning rate falls linearly to 0.
+
+    Args:
+        checkpoint: State of the run.
+        demos: Demonstrations.
+        updates: Total number of gradient steps, including the steps before a resume.
+        batch_size: Transitions per gradient step.
+        learning_rate: Learning rate of the first step, divided by `LEARNING_RATE`.
+        stop: Object that becomes true to end the imitation early, such as `StopSignal`.
+    """
+    agent, progress = checkpoint.agent, checkpoint.progress
+    bar = tqdm(
+        desc="imitation", initial=progress.pretrained, total=updates, unit="update"
+    )
+    while progress.pretrained < updates and not stop:
+        started = time.perf_counter()
+        agent.set_learning_rate(learning_rate * (1 - progress.pretrained / updates))
+        agent.imitate(demos.sample(batch_size))
+        progress.pretrained += 1
+        progress.seconds += time.perf_counter() - started
+        bar.update()
+        if progress.pretrained % SAVE_INTERVAL == 0:
+            checkpoint.save()
+    bar.close()
+    agent.set_learning_rate(1.0)
+    checkpoint.save()
 
 
 def main(args: Args) -> None:

@@ -43,8 +43,8 @@ class Progress:
         seconds: Time spent on stepping and learning, without evaluations. In ``refine``
             only the time of the imitation.
         curve: One row for each evaluation.
-        loss_sums: In offline learning, the sum of each loss since the last evaluation.
-            Empty in other runs.
+        loss_sums: Each loss of the last iteration. In offline learning, the sum of the
+            losses since the last evaluation.
     """
 
     steps: int = 0
@@ -52,6 +52,11 @@ class Progress:
     seconds: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
     loss_sums: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def iterated(self) -> int:
+        """Steps and gradient steps of imitation so far."""
+        return self.pretrained + self.steps
 
     @property
     def success(self) -> str:
@@ -116,9 +121,9 @@ class Checkpoint:
         state = files.read(
             path, "the state of a run", keys, finite=finite, map_location="cpu"
         )
-        # Runs of earlier versions had no such options.
-        saved = {"task_options": {}, "physics": "exact", **state["args"]}
         options = fixed_options(self.args)
+        # The run may be older than an option.
+        saved = {**options, **state["args"]}
         steps = options.get("total_steps", 0)
         if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps

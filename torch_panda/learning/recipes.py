@@ -47,6 +47,23 @@ RECIPE: dict[str, Any] = {
     "total_steps": 40_000,
     "stop_when_solved": True,
 }
+# All presets but "paper" store this fraction of the rollouts in which the achieved goal
+# does not change (see `buffers.has_moved`).
+KEEP_UNMOVED = 0.1
+RECIPE["keep_unmoved"] = KEEP_UNMOVED
+# The preset "offline", for all algorithms that learn from a data set. As in OGBench,
+# but with smaller networks and batches.
+OFFLINE: dict[str, Any] = {
+    "offline": True,
+    "algo": "gcivl",
+    "gamma": 0.99,
+    "network": "gelu",
+    "relative_inputs": "fine",
+    "num_envs": 16,
+    "updates_per_step": 1.0,  # an iteration is one gradient step
+    "total_steps": 100_000,
+    "eval_interval": 10_000,
+}
 # The policy looks ahead over this part of an episode: 20 of 50 steps (gamma 0.95).
 HORIZON = 0.4
 

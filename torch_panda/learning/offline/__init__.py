@@ -1,1 +1,0 @@
-"""Options and loop of offline learning."""
