@@ -29,19 +29,17 @@ import torch_panda
 from torch_panda.datasets.recording import play
 from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
-from torch_panda.learning.checkpoint import (
-    SAVE_INTERVAL,
-    Checkpoint,
-    Progress,
-    StopSignal,
-    check_folder,
-    crossed,
-    lock_folder,
-    write_options,
-)
 from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.limits import Positive, Seed, check_limits
 from torch_panda.learning.policy_files import SavedPolicy
+from torch_panda.learning.run_files import (
+    Checkpoint,
+    Progress,
+    check_folder,
+    lock_folder,
+    write_options,
+)
+from torch_panda.learning.training import SAVE_INTERVAL, StopSignal, crossed
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 LEARNING_RATE = 0.3  # first learning rate, as a fraction of the rate of training

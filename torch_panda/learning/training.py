@@ -10,6 +10,7 @@ by default one.
 """
 
 import os
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -24,18 +25,15 @@ from tqdm import tqdm
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.randomization import Randomization
 from torch_panda.learning.agents import make_agent
-from torch_panda.learning.checkpoint import (
-    SAVE_INTERVAL,
-    Checkpoint,
-    Progress,
-    crossed,
-)
 from torch_panda.learning.curve import NUM_ENVS, Curve
 from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.logger import make_logger
 from torch_panda.learning.options import Args
+from torch_panda.learning.run_files import Checkpoint, Progress
 from torch_panda.learning.sources import DataSet, Experience
 
+# Steps between two saves, including gradient steps of imitation.
+SAVE_INTERVAL = 20_000
 # A task is solved after this many evaluations in a row in which all episodes succeed.
 SOLVED_EVALUATIONS = 3
 
@@ -245,3 +243,30 @@ class Run:
         """Close the environments."""
         self.source.close()
         self.curve.close()
+
+
+def crossed(interval: int, before: int, after: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
+class StopSignal:
+    """Becomes true on Ctrl-C or SIGTERM. A second signal ends the program at once."""
+
+    def __init__(self) -> None:
+        self.received = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._receive)
+
+    def _receive(self, number: int, frame: object) -> None:
+        self.received = True
+        self.release()
+        tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
+
+    def release(self) -> None:
+        """Give the signals their usual effect again."""
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def __bool__(self) -> bool:
+        return self.received
