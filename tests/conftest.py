@@ -62,10 +62,10 @@ def quick(monkeypatch):
 
     Signal handlers and numbers of threads are restored afterwards.
     """
-    from torch_panda.learning import curve, starts, training, video
+    from torch_panda.learning import curve, sources, starts, video
 
     few_states = partial(starts.states_at_objects, number=8)
-    monkeypatch.setattr(training, "states_at_objects", few_states)
+    monkeypatch.setattr(sources, "states_at_objects", few_states)
     monkeypatch.setattr(curve, "EPISODES", 2)
     monkeypatch.setattr(curve, "NUM_ENVS", 2)
     monkeypatch.setattr(video, "CELL", (64, 80))

@@ -1,7 +1,6 @@
 """``train --offline`` writes its files, stops, resumes and explains errors."""
 
 import json
-import warnings
 from dataclasses import replace
 from functools import partial
 
@@ -16,18 +15,19 @@ from tests.learning.gradient_steps import SPACES, fill_normalizer
 from torch_panda.bullet import FAST
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
-from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.options import make_args_class
+from torch_panda.learning.agents import OFFLINE_AGENTS
+from torch_panda.learning.options import default_args
 from torch_panda.learning.policy_files import save_policy
 
 pytestmark = pytest.mark.usefixtures("quick")
 
-SMALL = {"hidden_size": 32, "batch_size": 64, "num_envs": 4, "video": False}
+SMALL = {"batch_size": 64, "num_envs": 4, "video": False}
 
 
 def make_args(out, algo="gcbc", **options):
     options = {**SMALL, "transitions": 200, "total_steps": 6, **options}
-    return make_args_class(algo)(out=out, eval_interval=4, **options)
+    args = default_args("offline", "PandaReach-v1", algo)
+    return replace(args, out=out, eval_interval=4, **options)
 
 
 def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
@@ -55,7 +55,7 @@ def test_the_normaliser_knows_the_data_before_the_first_step(tmp_path):
     args = make_args(tmp_path)
     run = train.make_run(args, args.out)
     run.close()
-    rows, normalizer = run.data.rows, run.agent.normalizer
+    rows, normalizer = run.source.data.rows, run.agent.normalizer
     assert normalizer.count == len(rows) == 200
     for columns, values in (
         (slice(0, 6), rows["observation"]),
@@ -77,7 +77,7 @@ def test_a_resumed_offline_run_equals_an_uninterrupted_run(tmp_path, device):
 
     args = make_args(tmp_path / "stopped", "hiql", device=device)
     stopped = train.make_run(args, args.out)
-    assert not stopped.train(After(3))
+    assert not stopped.train(After(2))
     stopped.close()
     assert stopped.progress.steps == 3
     resumed = train.make_run(replace(args, resume=True), args.out)
@@ -94,7 +94,8 @@ def test_a_resumed_offline_run_equals_an_uninterrupted_run(tmp_path, device):
 def test_the_saved_policy_acts_as_the_agent(tmp_path, algo, device):
     torch.manual_seed(0)
     with torch.device(device):
-        agent = OFFLINE_AGENTS[algo](SPACES, make_args(tmp_path, algo))
+        args = make_args(tmp_path, algo, relative_inputs="none")
+        agent = OFFLINE_AGENTS[algo](SPACES, args)
         fill_normalizer(agent)
     save_policy(tmp_path / "checkpoint.pt", agent, "PandaReach-v1")
     random_state = torch.get_rng_state()
@@ -146,25 +147,22 @@ class Bare(torch_panda.Reach):
     observation_layout = None
 
 
-@pytest.mark.parametrize("relative_inputs", ["coarse", "fine"])
-def test_dropped_relative_inputs_are_warned_of(tmp_path, make_demos, relative_inputs):
+def test_the_layout_of_a_task_that_declares_none_is_found(tmp_path, make_demos):
     robot = partial(torch_panda.Panda, block_gripper=True)
     torch_panda.register("Bare-v0", robot=robot, task=Bare)
-    options = {"env_id": "Bare-v0", "data": str(make_demos("Bare-v0"))}
-    args = make_args(tmp_path, relative_inputs=relative_inputs, **options)
-    message = f"without relative inputs .'{relative_inputs}'.* pass --relative-inputs"
-    with pytest.warns(UserWarning, match=message):
-        train.make_run(args, tmp_path).close()
-    args.relative_inputs = "none"
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", "learning without")
-        train.make_run(args, tmp_path).close()
+    args = make_args(tmp_path, env_id="Bare-v0", data=str(make_demos("Bare-v0")))
+    run = train.make_run(args, tmp_path)
+    run.close()
+    assert run.agent.spaces.geometry.points == (6, 7, 8)  # the goal
+    assert run.agent.normalizer.relative_inputs == "fine"
 
 
-def test_the_options_are_those_of_the_algorithm():
-    options = ["--algo", "hiql", "--subgoal-steps", "7", "--data", "play"]
+def test_the_command_line_sets_the_options():
+    options = ["--algo", "hiql", "--alpha", "7", "--data", "play"]
     args = parse(["--offline", *options])
-    assert args == make_args_class("hiql")(subgoal_steps=7, data="play")
+    default = default_args("offline", "PandaReach-v1", "hiql")
+    assert args == replace(default, alpha=7.0, data="play")
+    assert parse(["--offline"]).algo == "gcivl"
 
 
 @pytest.mark.parametrize(
@@ -173,7 +171,10 @@ def test_the_options_are_those_of_the_algorithm():
         ("--offline --algo ddpg", "--offline learns by gcbc, .* got --algo ddpg"),
         ("--algo hiql", "^hiql learns offline: add --offline$"),
         ("--offline --data nofile.pt", "data must be one of noisy, play, random"),
-        ("--offline --expectile 1.5", "expectile must be from 0 to 1"),
+        ("--offline --alpha -1", "alpha must be at least 0 and finite"),
+        ("--offline --algo gcbc --alpha 1", "algo gcbc has no alpha: drop --alpha"),
+        ("--offline --noise-eps 0", "noise_eps has no effect with --offline: drop --n"),
+        ("--alpha 1", "alpha has no effect without --offline: drop --alpha"),
         ("--offline --env-id PandaFly-v1", "unknown environment id"),
         ("--offline --resume", "there is no run to resume"),
     ],

@@ -11,7 +11,7 @@ import torch_panda
 from tests.commands.runs import After, Kill, weights
 from torch_panda.commands.train import make_run
 from torch_panda.datasets.demonstrations import read_demos
-from torch_panda.learning import pretraining
+from torch_panda.learning import training
 from torch_panda.learning.options import Args
 from torch_panda.learning.policy_files import SavedPolicy
 
@@ -28,7 +28,7 @@ def test_demonstrations_keep_their_goals(env, make_demos, tmp_path):
     path = make_demos()
     demos = read_demos(path, env)
     run = make_run(small(path), tmp_path)
-    batch = run.demos.sample(500)
+    batch = run.source.demos.sample(500)
     run.close()
     goal = demos["desired_goal"].unflatten(0, (4, 50))[:, 0]
     assert (batch["desired_goal"] == goal[batch["collector", "traj_ids"]]).all()
@@ -138,11 +138,11 @@ def test_a_ratio_of_each_batch_is_demonstrations(make_demos, tmp_path):
     run.close()
     assert sizes == [(24, 8)] * 5
     assert run.agent.normalizer.count == 200 + 100
-    assert len(run.buffer) == 100
+    assert len(run.source) == 100
 
 
 def test_imitation_saves_at_intervals_and_at_its_end(make_demos, tmp_path, monkeypatch):
-    monkeypatch.setattr(pretraining, "SAVE_INTERVAL", 12)
+    monkeypatch.setattr(training, "SAVE_INTERVAL", 12)
     args = small(make_demos(), total_steps=0, pretrain_updates=40)
     run = make_run(args, tmp_path)
     saved = []
@@ -169,7 +169,7 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path):
     assert [row["step"] for row in whole.progress.curve] == [0, 0]
 
     stopped = make_run(args, tmp_path)
-    assert not stopped.train(After(7))
+    assert not stopped.train(After(6))
     stopped.close()
     assert len(stopped.progress.curve) == 1
     kept, policy = SavedPolicy.read(tmp_path).weights, stopped.agent.policy

@@ -11,9 +11,9 @@ import torch
 
 from tests.commands.runs import Kill, kill, points, weights
 from torch_panda.commands import train
-from torch_panda.learning import curve
-from torch_panda.learning.checkpoint import check_folder, lock_folder
+from torch_panda.learning import run_files
 from torch_panda.learning.options import Args
+from torch_panda.learning.run_files import check_folder, lock_folder
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -36,7 +36,7 @@ def test_a_run_killed_in_its_first_evaluation_can_be_resumed(tmp_path, monkeypat
     out.mkdir()
     run = Run(args, out)
     with monkeypatch.context() as patch, pytest.raises(Kill):
-        patch.setattr(curve, "save_policy", kill)
+        patch.setattr(run_files, "plot_curve", kill)
         run.train()
     run.close()
     assert (out / "curve.csv").exists()

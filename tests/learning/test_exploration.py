@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
-from torch_panda.learning.exploration import RandomPointModule
+from torch_panda.learning.exploration import RandomPointModule, make_random_points
 
 NUM_ENVS = 64
 
@@ -158,7 +158,7 @@ def test_half_of_the_points_are_near_one_of_the_objects():
 def test_agents_know_where_observations_have_objects(env_id, objects):
     with torch_panda.make(env_id, num_envs=2) as env:
         agent = make_agent(env, Hyperparameters(exploration="points"))
-        columns = agent.random_points().position_columns
+        columns = make_random_points(agent.spaces, agent.hp).position_columns
         assert columns[:, 0].tolist() == objects
         td = env.reset()
     for start in objects:

@@ -9,8 +9,7 @@ from tests.learning.gradient_steps import SPACES
 from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.geometry import read_geometry
 from torch_panda.learning.normalizer import Normalizer
-from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.options import Args
+from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.spaces import read_spaces
 from torch_panda.learning.training import Run
 
@@ -37,11 +36,10 @@ def test_relative_inputs_append_differences():
 
 def test_agents_see_the_offsets_that_their_options_name():
     """Reach has one offset, from the hand to the goal. It is an input twice, "fine"."""
-    cls = OFFLINE_AGENTS["gcbc"]
     with torch_panda.make("PandaReach-v1", num_envs=3, seed=0) as env:
         td = env.reset()
         online = make_agent(env, Hyperparameters(relative_inputs="fine"))
-        offline = cls(read_spaces(env), cls.Hyperparameters())
+        offline = make_agent(env, default_args("offline", "PandaReach-v1"))
     offset = td["desired_goal"] - td["observation"][:, :3]
     expected = torch.cat((offset, offset.clamp(-0.03, 0.03)), -1)
     for agent in (online, offline):
@@ -127,7 +125,7 @@ def test_the_statistics_of_a_training_include_hindsight_goals(tmp_path):
     for part in (data, data["next"]):
         part["desired_goal"] = torch.full_like(part["desired_goal"], 10.0)
     achieved = data["next", "achieved_goal"].mean((0, 1))
-    run.store(data)
+    run.source.store(data)
     run.close()
     normalizer = run.agent.normalizer
     assert normalizer.count == 4 * 50

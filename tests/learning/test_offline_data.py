@@ -7,10 +7,11 @@ from tensordict import TensorDict
 import torch_panda
 from tests.learning.episodes import play_randomly
 from tests.learning.gradient_steps import SPACES
+from torch_panda.learning.agents import Hyperparameters, find_agent
+from torch_panda.learning.agents.hiql import HIQL
+from torch_panda.learning.batch import Batch
 from torch_panda.learning.buffers import STORED_KEYS
-from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.base import Batch
-from torch_panda.learning.offline.data import OfflineData
+from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.spaces import read_spaces
 
 MIXTURE = {"current": 0.2, "geometric": 0.5, "random": 0.3}  # OGBench's
@@ -41,10 +42,10 @@ def test_rewards_are_those_of_the_value_goal(env, transitions):
     data = OfflineData(transitions.clone(), env, GOALS, discount=0.99)
     batch = data.sample(1_000)
     b = Batch.from_tensordict(batch)
-    reached = (b.achieved - b.g).norm(dim=-1) < 0.05
+    reached = (batch["next", "achieved_goal"] - b.g).norm(dim=-1) < 0.05
     assert 0.2 < reached.float().mean() < 0.9
     assert torch.equal(b.r, reached.float() - 1)
-    assert torch.equal(b.mask, 1 - reached.float())
+    assert torch.equal(b.ends, reached)
     for key in ("observation", "action"):
         assert torch.equal(batch[key], transitions[key][batch["index"]])
 
@@ -61,8 +62,8 @@ def test_rewards_are_those_of_the_value_goal(env, transitions):
     ],
 )
 def test_each_agent_draws_its_goals(algo, value_goal):
-    cls = OFFLINE_AGENTS[algo]
-    agent = cls(SPACES, cls.Hyperparameters(hidden_size=8))
+    hp = Hyperparameters(algo=algo, offline=True)
+    agent = find_agent(hp)(SPACES, hp)
     expected = {"value_goal": value_goal, "actor_goal": "future"}
     assert agent.goal_strategies == expected
 
@@ -87,9 +88,8 @@ def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, acto
     step = torch.cat([torch.arange(n) for n in lengths])
     names = torch.stack([episode, step], -1).float()
     rows = torch.zeros(50, 1)
-    cls = OFFLINE_AGENTS["hiql"]
-    hp = cls.Hyperparameters(subgoal_steps=5, actor_goal=actor_goal, hidden_size=8)
-    agent = cls(read_spaces(env), hp)
+    hp = Hyperparameters(algo="hiql", offline=True, gamma=0.99, actor_goal=actor_goal)
+    agent = HIQL(read_spaces(env), hp, subgoal_steps=5)
     named = named_transitions(env, episode, names, rows)
     data = OfflineData(named, env, agent.goal_strategies, discount=0.9)
     batch = agent.extend(data.sample(5_000), data)

@@ -81,7 +81,7 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
     args = replace(default_args("recipe", "PandaStack-v1"), start_at_object=0.75)
     args.num_envs = 2
     run = Run(args, tmp_path)
-    data = next(iter(run.collector))
+    data = next(iter(run.source.collector))
     run.close()
     assert data.shape == (2, 50)
 
@@ -91,7 +91,7 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
 def test_training_episodes_can_go_on_after_success(continues, tmp_path):
     args = Args(env_id="PandaReach-v3", num_envs=16, continue_after_success=continues)
     run = Run(args, tmp_path)
-    after = next(iter(run.collector))["next"]
+    after = next(iter(run.source.collector))["next"]
     run.close()
     assert after["success"].any()
     assert after["terminated"].any() != continues

@@ -10,9 +10,10 @@ import pytest
 
 from torch_panda.commands import refine
 from torch_panda.commands.train import parse
-from torch_panda.learning.checkpoint import fixed_options
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.options import Args
+from torch_panda.learning.recipes import RECIPE
+from torch_panda.learning.run_files import fixed_options
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "examples" / "results"
@@ -72,6 +73,8 @@ def runs():
         is_ablation = ABLATION.search(name)
         if args["preset"] not in ("recipe", "paper") or is_ablation:
             continue
+        if args["preset"] == "recipe":  # an option since, with this default
+            args.setdefault("keep_unmoved", RECIPE["keep_unmoved"])
         if HAS_FETCH or not name.startswith("Fetch"):
             runs[name] = args
     return runs

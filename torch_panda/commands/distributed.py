@@ -32,17 +32,16 @@ from tqdm import tqdm
 import torch_panda
 from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
-from torch_panda.learning.checkpoint import (
-    Progress,
-    StopSignal,
-    check_folder,
-    crossed,
-    lock_folder,
-    write_options,
-)
 from torch_panda.learning.curve import Curve, draw_seed
 from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
 from torch_panda.learning.options import CRL_OPTIONS, check_exploration
+from torch_panda.learning.run_files import (
+    Progress,
+    check_folder,
+    lock_folder,
+    write_options,
+)
+from torch_panda.learning.training import StopSignal, crossed
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
@@ -257,6 +256,8 @@ def main(args: Args) -> None:
         check_limits(args)
         import_modules(read_modules(args.imports))
         check_exploration(args, args.num_envs)
+        if args.offline:
+            raise ValueError("distributed learns in environments: drop --offline")
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)

@@ -10,6 +10,7 @@ needs no rewards, no demonstrations and no exploration noise.
 """
 
 import os
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,27 +21,25 @@ import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
 import torch_panda
 from torch_panda.datasets.recording import play
-from torch_panda.learning.agents import AGENTS, Agent
+from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
-from torch_panda.learning.checkpoint import (
-    SAVE_INTERVAL,
-    Checkpoint,
-    Progress,
-    StopSignal,
-    check_folder,
-    crossed,
-    lock_folder,
-    write_options,
-)
 from torch_panda.learning.curve import Curve, reseed
 from torch_panda.learning.limits import Positive, Seed, check_limits
 from torch_panda.learning.policy_files import SavedPolicy
-from torch_panda.learning.pretraining import pretrain
+from torch_panda.learning.run_files import (
+    Checkpoint,
+    Progress,
+    check_folder,
+    lock_folder,
+    write_options,
+)
+from torch_panda.learning.training import SAVE_INTERVAL, StopSignal, crossed
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 LEARNING_RATE = 0.3  # first learning rate, as a fraction of the rate of training
@@ -88,13 +87,12 @@ class Refinement:
         saved = SavedPolicy.read(args.policy)
         args.env_id = args.env_id or saved.env_id
         self.env = torch_panda.make(args.env_id, num_envs=args.num_envs)
-        agent = saved.make_agent(self.env)
-        if not isinstance(agent, Agent):
+        self.agent = saved.make_agent(self.env)
+        if saved.hp.offline:
             raise ValueError(
                 f"{args.policy} was learned offline by {saved.hp.algo}, but refine "
                 f"improves policies of {', '.join(AGENTS)}: choose one of these"
             )
-        self.agent = agent
         rng = np.random.default_rng(0)
         goals = [self.env.task.sample_start(rng).goal for _ in range(100)]
         self.varies = torch.from_numpy(np.ptp(goals, axis=0) > 0)
@@ -196,6 +194,45 @@ def relabel(
     for key in ("desired_goal", ("next", "desired_goal")):
         episode[key] = goal.expand_as(episode[key])
     return episode
+
+
+def pretrain(
+    checkpoint: Checkpoint,
+    demos: TensorDictReplayBuffer,
+    *,
+    updates: int,
+    batch_size: int,
+    learning_rate: float = 1.0,
+    stop: object,
+) -> None:
+    """Take the remaining gradient steps of imitation, and save the run.
+
+    The learning rate falls linearly to 0.
+
+    Args:
+        checkpoint: State of the run.
+        demos: Demonstrations.
+        updates: Total number of gradient steps, including the steps before a resume.
+        batch_size: Transitions per gradient step.
+        learning_rate: Learning rate of the first step, divided by `LEARNING_RATE`.
+        stop: Object that becomes true to end the imitation early, such as `StopSignal`.
+    """
+    agent, progress = checkpoint.agent, checkpoint.progress
+    bar = tqdm(
+        desc="imitation", initial=progress.pretrained, total=updates, unit="update"
+    )
+    while progress.pretrained < updates and not stop:
+        started = time.perf_counter()
+        agent.set_learning_rate(learning_rate * (1 - progress.pretrained / updates))
+        agent.imitate(demos.sample(batch_size))
+        progress.pretrained += 1
+        progress.seconds += time.perf_counter() - started
+        bar.update()
+        if progress.pretrained % SAVE_INTERVAL == 0:
+            checkpoint.save()
+    bar.close()
+    agent.set_learning_rate(1.0)
+    checkpoint.save()
 
 
 def main(args: Args) -> None:

@@ -1,4 +1,4 @@
-"""Train DDPG, TD3, SAC, TQC or CRL with hindsight experience replay on any task.
+"""Train DDPG, TD3, SAC or CRL with hindsight experience replay on any task.
 
     python -m torch_panda train --env-id PandaPush-v1 --algo td3 --total-steps 300000
     python -m torch_panda train --offline --env-id PandaPush-v1 --algo hiql --data noisy
@@ -7,13 +7,12 @@ One recipe has the hyperparameters for every task, see `torch_panda.learning.rec
 `--preset paper` takes those of the panda-gym paper (arXiv 2106.13687). Where the paper
 gives none, it takes those of the HER of OpenAI Baselines.
 
-With ``--offline`` the agent learns from a data set, see `torch_panda.learning.offline`.
+With ``--offline`` the agent learns from a data set.
 
 `torch_panda.testing.check_task` checks the task before the training begins.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
@@ -23,27 +22,23 @@ from tqdm import tqdm
 import torch_panda
 from torch_panda.datasets import generate, read_demos, sha256
 from torch_panda.learning import files
-from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS
-from torch_panda.learning.checkpoint import (
-    StopSignal,
+from torch_panda.learning.environments import is_from_gymnasium, make_env
+from torch_panda.learning.geometry import declares_layout
+from torch_panda.learning.options import (
+    KINDS,
+    ArgGroups,
+    Args,
+    check,
+    default_args,
+)
+from torch_panda.learning.run_files import (
     check_folder,
     lock_folder,
     write_options,
 )
-from torch_panda.learning.environments import is_from_gymnasium, make_env
-from torch_panda.learning.geometry import declares_layout
-from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.options import (
-    KINDS,
-    OfflineArgs,
-    check_offline,
-    make_args_class,
-)
-from torch_panda.learning.offline.training import OfflineRun
-from torch_panda.learning.options import ArgGroups, Args, check, default_args
 from torch_panda.learning.spaces import Spaces
-from torch_panda.learning.training import Run
+from torch_panda.learning.training import Run, StopSignal
 from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.learning.video import record
 from torch_panda.registry import find_registration
@@ -53,41 +48,24 @@ PROG = "python -m torch_panda train"
 DATA_FILE = "data.pt"  # file of a run's folder with the data that it generated
 
 
-@dataclass
-class Mode:
-    """The options that decide which other options exist; see `parse`."""
-
-    offline: bool = False
-    algo: str = ""
-
-
-def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
+def parse(arguments: Sequence[str]) -> Args:
     """Read the command line.
 
-    With ``--offline``, the algorithm determines the other options and their defaults.
-    Otherwise preset, task and algorithm determine the defaults. So these options are
-    read first.
+    Preset, task and algorithm determine the defaults, so these options are read first.
 
     Raises:
-        ValueError: A module of ``--import`` does not exist, or ``--offline`` and the
-            algorithm do not fit together.
+        ValueError: A module of ``--import`` does not exist.
     """
     # The help is printed at the end, with the defaults of this preset and algorithm.
     without_help = [x for x in arguments if x not in ("-h", "--help")]
-    mode, _ = tyro.cli(Mode, args=without_help, return_unknown_args=True)
-    if mode.offline:
-        cls = make_args_class(mode.algo or OfflineArgs.algo)
-        arguments = [x for x in arguments if x != "--offline"]
-        offline_args = tyro.cli(cls, prog=f"{PROG} --offline", args=arguments)
-        import_modules(read_modules(offline_args.imports))
-        return offline_args
-    if mode.algo in OFFLINE_AGENTS and mode.algo not in AGENTS:
-        raise ValueError(f"{mode.algo} learns offline: add --offline")
     recipe = Args(preset="recipe")
     first = tyro.cli(Args, prog=PROG, args=without_help, default=recipe)
     import_modules(read_modules(first.imports))
-    default = default_args(first.preset, first.env_id, first.algo)
     names = [x.split("=")[0].replace("_", "-") for x in arguments]
+    if first.offline and "--preset" not in names:
+        first.preset = "offline"
+    algo = first.algo if "--algo" in names else None
+    default = default_args(first.preset, first.env_id, algo)
     if "--total-steps" in names:
         default.stop_when_solved = False
     groups = tyro.cli(
@@ -100,7 +78,7 @@ def parse(arguments: Sequence[str]) -> Args | OfflineArgs:
     return groups.to_args()
 
 
-def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
+def make_run(args: Args, out: Path) -> Run:
     """Prepare a training, and read its demonstrations or data if the options name any.
 
     Raises:
@@ -109,9 +87,9 @@ def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
         TypeError: The task does not have one of the ``task_options``.
         OSError: Generated data cannot be written.
     """
-    if isinstance(args, OfflineArgs):
+    if args.offline:
         data = read_data(args, out)
-        return OfflineRun(args, out, data, sha256(data))
+        return Run(args, out, data, sha256(data))
     if args.demos is None:
         return Run(args, out)
     with torch_panda.make(args.env_id, **args.env_options) as env:
@@ -119,7 +97,7 @@ def make_run(args: Args | OfflineArgs, out: Path) -> Run | OfflineRun:
     return Run(args, out, demos, sha256(demos))
 
 
-def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
+def read_data(args: Args, out: Path) -> TensorDictBase:
     """Read the transitions (n,) to learn from, or generate them into the run's folder.
 
     Raises:
@@ -142,7 +120,7 @@ def read_data(args: OfflineArgs, out: Path) -> TensorDictBase:
         return read_demos(path, env).select(*STORED_KEYS)
 
 
-def generate_data(args: OfflineArgs) -> TensorDictBase:
+def generate_data(args: Args) -> TensorDictBase:
     """Generate a data set, with a progress bar: transitions (n,)."""
     with tqdm(total=args.transitions, unit="transition", unit_scale=True) as bar:
         bar.set_description(f"{args.env_id} {args.data}")
@@ -158,36 +136,31 @@ def generate_data(args: OfflineArgs) -> TensorDictBase:
     return data.select(*STORED_KEYS).reshape(-1)
 
 
-def default_folder(args: Args | OfflineArgs) -> Path:
+def default_folder(args: Args) -> Path:
     """Folder of the results if the options name none."""
-    variant = args.her if isinstance(args, Args) else Path(args.data).stem
+    variant = Path(args.data).stem if args.offline else args.her
     return Path("runs") / f"{args.env_id}-{args.algo}-{variant}-{args.seed}"
 
 
-def main(args: Args | OfflineArgs) -> None:
+def main(args: Args) -> None:
     """Train, and print where the results are."""
     out = args.out or default_folder(args)
-    default: Args | OfflineArgs
     try:
-        if isinstance(args, OfflineArgs):
-            check_offline(args)
-            preset, default = {"preset": "offline"}, type(args)(env_id=args.env_id)
-        else:
-            check(args)
-            preset, default = {}, default_args(args.preset, args.env_id, args.algo)
+        check(args)
+        default = default_args(args.preset, args.env_id, args.algo)
         check_folder(out, resume=args.resume)
         is_declared = False
-        if isinstance(args, OfflineArgs) or not is_from_gymnasium(args.env_id):
+        if args.offline or not is_from_gymnasium(args.env_id):
             registration = find_registration(args.env_id)
             task = registration.make_task(args.task_options)
             check_task(task, robot=registration.make_robot())
             is_declared = declares_layout(task)
         run = make_run(args, out)
-        if isinstance(args, Args) and args.preset == "recipe":
+        if args.preset == "recipe":
             print(describe_recipe(args, run.agent.spaces, is_declared=is_declared))
         stop = StopSignal()
         with lock_folder(out):
-            write_options(out, args, default, resume=args.resume, **preset)
+            write_options(out, args, default, resume=args.resume)
             finished = run.train(stop)
     except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None

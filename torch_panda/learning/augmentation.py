@@ -8,16 +8,14 @@ Invariant Transform Experience Replay (arXiv 1909.10707).
 import torch
 from torch import Tensor
 
+from torch_panda.learning.batch import Batch
 from torch_panda.learning.geometry import Geometry
 from torch_panda.learning.hyperparameters import AugmentationKind
-from torch_panda.learning.transitions import Transitions
 
 SHIFT = 0.15  # largest shift along x and y [m]
 
 
-def augment(
-    rows: Transitions, geometry: Geometry | None, mode: AugmentationKind
-) -> Transitions:
+def augment(rows: Batch, geometry: Geometry | None, mode: AugmentationKind) -> Batch:
     """Return an augmented copy of a batch.
 
     Args:
@@ -33,7 +31,7 @@ def augment(
     return shift(rows, geometry, SHIFT) if mode == "mirror-shift" else rows
 
 
-def mirror(rows: Transitions, geometry: Geometry) -> Transitions:
+def mirror(rows: Batch, geometry: Geometry) -> Batch:
     """Mirror every second row."""
     assert geometry.action is not None
 
@@ -43,20 +41,20 @@ def mirror(rows: Transitions, geometry: Geometry) -> Transitions:
         return values
 
     return rows._replace(
-        observation=mirrored(rows.observation, geometry.observation),
-        goal=mirrored(rows.goal, geometry.goal),
-        action=mirrored(rows.action, geometry.action),
-        next_observation=mirrored(rows.next_observation, geometry.observation),
+        s=mirrored(rows.s, geometry.observation),
+        a=mirrored(rows.a, geometry.action),
+        s_next=mirrored(rows.s_next, geometry.observation),
+        g=mirrored(rows.g, geometry.goal),
     )
 
 
-def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions:
+def shift(rows: Batch, geometry: Geometry, distance: float) -> Batch:
     """Shift about half of the rows by up to ``distance`` along x and y [m].
 
     All positions in a row move by the same offset, as if the robot's base stood
     elsewhere.
     """
-    offset = torch.empty_like(rows.goal[:, :2]).uniform_(-distance, distance)
+    offset = torch.empty_like(rows.g[:, :2]).uniform_(-distance, distance)
     offset *= torch.rand_like(offset[:, :1]) < 0.5
 
     def shifted(values: Tensor, starts: tuple[int, ...]) -> Tensor:
@@ -66,7 +64,7 @@ def shift(rows: Transitions, geometry: Geometry, distance: float) -> Transitions
         return values
 
     return rows._replace(
-        observation=shifted(rows.observation, geometry.positions),
-        goal=shifted(rows.goal, geometry.goal_positions),
-        next_observation=shifted(rows.next_observation, geometry.positions),
+        s=shifted(rows.s, geometry.positions),
+        s_next=shifted(rows.s_next, geometry.positions),
+        g=shifted(rows.g, geometry.goal_positions),
     )

@@ -1,7 +1,5 @@
-"""Success curve of a run: evaluates the agent, and writes the curve and its picture."""
+"""Success curve of a run: the evaluations of its agent."""
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +7,7 @@ import torch
 from torchrl.record.loggers import Logger
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.learning import files
-from torch_panda.learning.checkpoint import Checkpoint, Progress
+from torch_panda.learning.agents import Agent
 from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.evaluation import (
     evaluate_episodes,
@@ -18,8 +15,7 @@ from torch_panda.learning.evaluation import (
 )
 from torch_panda.learning.evaluation_tasks import evaluation_tasks
 from torch_panda.learning.logger import close_logger
-from torch_panda.learning.plots import plot_curve
-from torch_panda.learning.policy_files import AnyAgent, save_policy
+from torch_panda.learning.run_files import Checkpoint, Progress, write_results
 
 EPISODES = 80  # episodes of each evaluation
 NUM_ENVS = 16  # environments that run these episodes in parallel
@@ -31,7 +27,7 @@ class Curve:
     Args:
         env_id: Id of the environment.
         agent: Agent whose policy is evaluated.
-        out: Folder of curve.csv, curve.png and checkpoint.pt.
+        out: Folder of the run.
         device: Device of the environments' outputs.
         logger: Also gets each row, under the names of the columns.
         env: Environments for the evaluations; None makes `NUM_ENVS` of the id.
@@ -43,7 +39,7 @@ class Curve:
     def __init__(
         self,
         env_id: str,
-        agent: AnyAgent,
+        agent: Agent,
         out: Path,
         *,
         device: str,
@@ -75,8 +71,6 @@ class Curve:
     def add(self, progress: Progress, losses: dict[str, float] | None = None) -> None:
         """Evaluate the policy, and add a row with the result to the curve.
 
-        This writes curve.csv, curve.png and checkpoint.pt.
-
         Args:
             progress: Progress of the run. The row is added to its attribute ``curve``.
             losses: Mean losses, which are further columns.
@@ -106,15 +100,9 @@ class Curve:
             for key, value in progress.curve[-1].items():
                 if key != "step":
                     self.logger.log_scalar(key, value, step=progress.steps)
-        fields = {key: None for row in progress.curve for key in row}
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, fieldnames=list(fields))
-        writer.writeheader()
-        writer.writerows(progress.curve)
-        files.save_text(self.out / "curve.csv", text.getvalue())
-        path = self.out / "curve.png"
-        plot_curve(progress.curve, self.env_id, path, xlabel=self.xlabel)
-        save_policy(self.out / "checkpoint.pt", self.agent, self.env_id)
+        write_results(
+            self.out, progress.curve, self.agent, self.env_id, xlabel=self.xlabel
+        )
 
     def close(self) -> None:
         """Close the environments and the logger."""

@@ -15,6 +15,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import AdditiveGaussianModule, EGreedyModule
+
+from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.spaces import Spaces
 
 # Two corners of the box from which points are drawn, in the world frame [m]. The box is
 # around the origin, where the objects start.
@@ -31,6 +35,36 @@ WARM_UP = 250
 JOINT_RANGE = 0.5  # largest displacement of each joint under joint control [rad]
 DURATION = (4, 12)  # fewest and most steps towards one point
 NOISE = 0.2  # standard deviation of the Gaussian noise on actions towards a point
+
+
+def make_noise(spaces: Spaces, hp: Hyperparameters) -> list[TensorDictModuleBase]:
+    """Make the exploration of a deterministic actor: noise and random actions."""
+    action_spec = spaces.action_spec(spaces.num_envs)
+    noise = AdditiveGaussianModule(
+        action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
+    )
+    if hp.exploration == "points":
+        return [noise, make_random_points(spaces, hp)]
+    random_action = EGreedyModule(action_spec)
+    # A probability for each environment, (num_envs,).
+    random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
+    return [noise, random_action]
+
+
+def make_random_points(spaces: Spaces, hp: Hyperparameters) -> "RandomPointModule":
+    """Make the module of the exploration "points"."""
+    geometry = spaces.geometry
+    return RandomPointModule(
+        torch.linspace(*hp.random_eps, spaces.num_envs),
+        action_size=spaces.action_size,
+        action_scale=spaces.action_scale,
+        moves_joints=spaces.moves_joints,
+        num_arm_actions=spaces.num_arm_actions,
+        # The first position of an observation is the hand's.
+        object_columns=() if geometry is None else geometry.positions[1:],
+        hand_column=0 if geometry is None else geometry.positions[0],
+        box=BOX if geometry is None or geometry.box is None else geometry.box,
+    )
 
 
 class RandomPointModule(TensorDictModuleBase):

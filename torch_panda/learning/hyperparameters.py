@@ -8,10 +8,10 @@ from typing import Literal
 
 from torch_panda.learning.limits import Discount, Positive, Ratio, Weight
 
-Algo = Literal["ddpg", "td3", "sac", "tqc", "crl"]
+Algo = Literal["ddpg", "td3", "sac", "crl", "gcbc", "gcivl", "gciql", "hiql", "qrl"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 Exploration = Literal["actions", "points"]
-Network = Literal["paper", "layer-norm", "wide"]
+Network = Literal["paper", "layer-norm", "wide", "gelu"]
 AugmentationKind = Literal["none", "mirror", "mirror-shift"]
 
 
@@ -20,16 +20,20 @@ class Hyperparameters:
     """Hyperparameters, by default those of the panda-gym paper (arXiv 2106.13687)."""
 
     algo: Algo = "ddpg"
-    """algorithm"""
+    """algorithm: DDPG, TD3, SAC or CRL; with --offline GCBC, GCIVL, GCIQL, HIQL, QRL or
+    CRL"""
+    offline: bool = False
+    """learn from a data set instead of an environment"""
     double_q: bool = True
-    """learn two critics, and use the smaller value (TD3, SAC) or the lower quantiles
-    (TQC) as target. DDPG and CRL always have one critic"""
+    """TD3, SAC: learn two critics, and use the smaller value as target. DDPG and CRL
+    always have one critic"""
     gamma: Discount | None = None
     """discount factor; None means 1 - 1 / (steps of an episode), as in OpenAI
     Baselines"""
     network: Network = "paper"
     """hidden layers of actors and critics: three of 256 units ("paper"), the same with
-    LayerNorm ("layer-norm"), or three of 448 units with LayerNorm ("wide")"""
+    LayerNorm ("layer-norm"), three of 448 units with LayerNorm ("wide"), or three of
+    256 units with LayerNorm and GELU instead of ReLU ("gelu")"""
     target_interval: Positive = 1
     """gradient steps between two updates of the target networks (CRL has no target
     networks)"""
@@ -45,12 +49,11 @@ class Hyperparameters:
     random_eps: tuple[Ratio, Ratio] = (0.3, 0.3)
     """fraction of exploring steps in the first and in the last of the parallel
     environments. The fractions of the other environments are evenly spaced between
-    them. SAC and TQC use this option only with exploration "points" """
+    them. SAC uses this option only with exploration "points" """
     exploration: Exploration = "actions"
     """how to explore. "actions" takes random actions with DDPG, TD3 and CRL. With SAC
-    and TQC it has no effect, because their policies are random. "points" moves the hand
-    towards random points, or under joint control the joints towards random
-    positions"""
+    it has no effect, because its policy is random. "points" moves the hand towards
+    random points, or under joint control the joints towards random positions"""
     relative_inputs: RelativeInputs = "none"
     """additional inputs of the networks. "coarse" adds the offsets from the hand to
     objects and from objects to goals. "fine" also adds these offsets clipped at 3 cm,
@@ -61,3 +64,11 @@ class Hyperparameters:
     augmentation: AugmentationKind = "none"
     """mirror half of each batch in the robot's plane of symmetry ("mirror"), and also
     shift half of each batch over the table ("mirror-shift")"""
+    actor_goal: Literal["future", "geometric"] = "future"
+    """with --offline, how to draw the goals of the policy among those achieved later in
+    the episode. "future", as in OGBench: all are equally likely. "geometric": the goal
+    achieved k steps later has probability proportional to gamma**k"""
+    alpha: Weight | None = None
+    """with --offline, weight of the imitation in the policy's loss (GCIQL, CRL), or
+    inverse temperature of the weights of imitated actions (GCIVL, HIQL, QRL). None
+    means the default of the algorithm. GCBC has none"""

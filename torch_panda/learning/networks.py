@@ -1,6 +1,7 @@
-"""Multilayer perceptrons of actors and critics."""
+"""Multilayer perceptrons of actors, critics and value functions."""
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torch_panda.learning.hyperparameters import Network
@@ -16,8 +17,7 @@ def make_mlp(inputs: int, outputs: int, network: Network) -> MLP:
     Args:
         inputs: Number of inputs, over all arguments of the network.
         outputs: Number of outputs.
-        network: Size of the hidden layers, and whether they have LayerNorm; see
-            `Hyperparameters.network`.
+        network: Hidden layers; see `Hyperparameters.network`.
     """
     size = WIDE_SIZE if network == "wide" else HIDDEN_SIZE
     is_normalized = network != "paper"
@@ -26,7 +26,24 @@ def make_mlp(inputs: int, outputs: int, network: Network) -> MLP:
         in_features=inputs,
         out_features=outputs,
         num_cells=[size] * 3,
-        activation_class=nn.ReLU,
+        activation_class=nn.GELU if network == "gelu" else nn.ReLU,
         norm_class=nn.LayerNorm if is_normalized else None,
         norm_kwargs=[norm] * 3 if is_normalized else None,
     )
+
+
+class Ensemble(nn.ModuleList):
+    """Value functions V(x) or Q(x) of the same inputs.
+
+    Args:
+        inputs: Number of inputs, over all arguments.
+        network: Hidden layers; see `Hyperparameters.network`.
+        number: Number of value functions.
+    """
+
+    def __init__(self, inputs: int, network: Network, number: int = 2) -> None:
+        super().__init__(make_mlp(inputs, 1, network) for _ in range(number))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The values, (number, n)."""
+        return torch.stack([net(*inputs).squeeze(-1) for net in self])

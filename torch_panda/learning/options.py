@@ -8,10 +8,10 @@ from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
-from torch_panda.learning.agents import Hyperparameters
+from torch_panda.learning.agents import find_agent
 from torch_panda.learning.buffers import Hindsight
 from torch_panda.learning.environments import is_from_gymnasium, refusal
-from torch_panda.learning.hyperparameters import Algo
+from torch_panda.learning.hyperparameters import Algo, Hyperparameters
 from torch_panda.learning.limits import (
     Count,
     Factor,
@@ -23,12 +23,14 @@ from torch_panda.learning.limits import (
     check_limits,
 )
 from torch_panda.learning.logger import LoggerName, check_logger
-from torch_panda.learning.recipes import find_recipe
+from torch_panda.learning.recipes import OFFLINE, find_recipe
 from torch_panda.learning.user_modules import Imports
 
 DEMO_RATIO = 0.25  # fraction of each batch that comes from the demonstrations
 
-Preset = Literal["recipe", "paper"]
+KINDS = ("noisy", "play", "random")  # kinds of `torch_panda.datasets.generate`
+
+Preset = Literal["recipe", "paper", "offline"]
 
 
 @dataclass
@@ -44,8 +46,13 @@ class ResearchOptions(Hyperparameters):
     desired_ratio: Ratio = 0.0
     """fraction of the hindsight goals that are desired goals of random transitions. The
     rest are goals achieved later in the same episode"""
+    keep_unmoved: Ratio = 1.0
+    """fraction of the rollouts in which the achieved goal does not change that the
+    replay buffer stores. It stores all others. A rollout is the steps of one
+    environment in one iteration"""
     num_envs: Positive = 4
-    """number of environments stepped in parallel"""
+    """number of environments stepped in parallel; with --offline, while data are
+    generated"""
     updates_per_step: Weight = 0.5
     """gradient steps per environment step"""
     batch_size: Positive = 256
@@ -70,28 +77,28 @@ class RunOptions:
 
     preset: Preset = "paper"
     """defaults of the other options: one recipe for all tasks, also for your own
-    ("recipe"), or those of the panda-gym paper ("paper"). With "recipe", the replay
-    buffer drops a random 90 % of the rollouts whose achieved goal does not change"""
+    ("recipe"), those of the panda-gym paper ("paper"), or those of --offline
+    ("offline")"""
     env_id: str = "PandaReach-v1"
     """id of the environment, shipped or registered by --import"""
     imports: Imports = ()
     """module or .py file to import first, which registers ids of your own"""
     task_options: dict[str, Finite] = field(default_factory=dict)
     """arguments of the task to change, such as `clearance 0.0005`, also in
-    evaluations"""
+    evaluations and generated data"""
     physics: PhysicsName = "exact"
-    """how Bullet integrates, also in evaluations: "exact" as in panda-gym, or "fast"
-    and coarser"""
+    """how Bullet integrates, also in evaluations and generated data: "exact" as in
+    panda-gym, or "fast" and coarser"""
     seed: Seed = 0
-    """seed of the environments, the networks and the sampling"""
+    """seed of the environments, the generated data, the networks and the sampling"""
     total_steps: Count = 4_000
     """environment steps, summed over all environments; 0 stops after the
-    `pretrain_updates`"""
+    `pretrain_updates`. With --offline, gradient steps"""
     stop_when_solved: bool = False
     """end the training when three evaluations in a row are successful in all episodes.
     A --total-steps on the command line turns this off"""
     eval_interval: Positive = 400
-    """environment steps between evaluations"""
+    """steps between evaluations"""
     start_at_object: Ratio = 0.0
     """fraction of training episodes that start in the middle of the task: the hand is
     at an object or holds it, or the first cube of Stack is at its goal. If it is above
@@ -99,14 +106,22 @@ class RunOptions:
     demos: Path | None = None
     """demonstrations to learn from, in addition to the transitions of the run: a file
     of `record`, or the folder of a data set"""
+    data: str = "noisy"
+    """with --offline, data to learn from: "noisy", "play" or "random" generates a data
+    set, see `torch_panda.datasets.generate`, and keeps it in data.pt of the run's
+    folder. Any other value is the path of a file of `record`, of the data.pt of another
+    run, or of the folder of a data set"""
+    transitions: Positive = 1_000_000
+    """with --offline, transitions to generate, rounded up to whole episodes"""
     out: Path | None = None
-    """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>"""
+    """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>, with
+    --offline the data instead of <her>"""
     resume: bool = False
     """continue the run in the folder. Only --out, --video, --import, --logger, --device
     and --workers may differ from the options with which it was started, and
     --total-steps may be larger if the learning rate does not fall"""
     device: str = "cpu"
-    """device of the networks and the replay buffer"""
+    """device of the networks and the data"""
     workers: Positive = 1
     """processes for environments of Gymnasium: 1 steps them in this process, and a
     larger number gives each of them a process of its own"""
@@ -156,6 +171,17 @@ OWN_OPTIONS = (
 )
 
 
+# Options that have an effect only with an environment, or only with --offline.
+ONLINE_OPTIONS = (
+    *("double_q", "target_interval", "action_l2", "ema_rate", "noise_eps"),
+    *("random_eps", "exploration", "fine_fingers", "augmentation", "her"),
+    *("desired_ratio", "keep_unmoved", "updates_per_step", "anneal_lr"),
+    *("continue_after_success", "randomize", "pretrain_updates", "start_at_object"),
+    *("demos", "workers"),
+)
+OFFLINE_OPTIONS = ("alpha", "actor_goal", "data", "transitions")
+
+
 # CRL needs these goals: the critic's positive goals are achieved k steps later in the
 # same episode, with probability proportional to gamma**k.
 CRL_OPTIONS: dict[str, Any] = {"her": "geometric", "desired_ratio": 0.0}
@@ -193,6 +219,21 @@ def check_crl(args: Args) -> None:
         )
 
 
+def check_offline(args: Args) -> None:
+    """Check the options of an offline training.
+
+    Raises:
+        ValueError: The data do not exist, or the algorithm does not have an option.
+    """
+    if args.data not in KINDS and not Path(args.data).exists():
+        raise ValueError(
+            f"data must be one of {', '.join(KINDS)}, or a file or folder, got "
+            f"{args.data!r}"
+        )
+    if args.algo == "gcbc" and args.alpha is not None:
+        raise ValueError("algo gcbc has no alpha: drop --alpha")
+
+
 def check(args: Args) -> None:
     """Check options before the training starts.
 
@@ -200,9 +241,21 @@ def check(args: Args) -> None:
         ValueError: An option is outside its limits, or two options are incompatible.
     """
     check_limits(args)
-    check_exploration(args, args.num_envs)
-    if args.algo == "crl":
-        check_crl(args)
+    find_agent(args)
+    default = Args(**OFFLINE) if args.offline else Args()
+    without_effect = ONLINE_OPTIONS if args.offline else OFFLINE_OPTIONS
+    for name in without_effect:
+        if getattr(args, name) != getattr(default, name):
+            raise ValueError(
+                f"{name} has no effect {'with' if args.offline else 'without'} "
+                f"--offline: drop --{name.replace('_', '-')}"
+            )
+    if args.offline:
+        check_offline(args)
+    else:
+        check_exploration(args, args.num_envs)
+        if args.algo == "crl":
+            check_crl(args)
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demonstrations: pass --demos")
     has_demos = args.demos is not None and args.total_steps > 0
@@ -213,8 +266,7 @@ def check(args: Args) -> None:
         )
     if not args.total_steps and not args.pretrain_updates:
         raise ValueError("total_steps must be positive without pretrain_updates, got 0")
-    if is_from_gymnasium(args.env_id):
-        default = Args()
+    if not args.offline and is_from_gymnasium(args.env_id):
         refused = [x for x in OWN_OPTIONS if getattr(args, x) != getattr(default, x)]
         if refused:
             raise refusal(args.env_id, *refused)
@@ -222,9 +274,18 @@ def check(args: Args) -> None:
     check_logger(args.logger)
 
 
-def default_args(preset: Preset, env_id: str, algo: Algo = "ddpg") -> Args:
-    """Return the default options of a preset for the task of an id and an algorithm."""
-    recipe = {} if preset == "paper" else find_recipe(env_id)
-    if algo == "crl":
-        recipe = {**recipe, **CRL_OPTIONS}
-    return Args(preset=preset, env_id=env_id, algo=algo, **recipe)
+def default_args(preset: Preset, env_id: str, algo: Algo | None = None) -> Args:
+    """Return the default options of a preset for the task of an id and an algorithm.
+
+    None as the algorithm means the default of the preset.
+    """
+    options: dict[str, Any] = {}
+    if preset == "offline":
+        options = dict(OFFLINE)
+    elif preset == "recipe":
+        options = find_recipe(env_id)
+    if algo is not None:
+        options["algo"] = algo
+    if algo == "crl" and preset != "offline":
+        options |= CRL_OPTIONS
+    return Args(preset=preset, env_id=env_id, **options)

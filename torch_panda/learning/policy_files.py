@@ -13,15 +13,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from typing_extensions import Self
 
 from torch_panda.learning import files
-from torch_panda.learning.agents import AGENTS, Agent, Hyperparameters
+from torch_panda.learning.agents import Agent, Hyperparameters, find_agent
 from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.offline import OFFLINE_AGENTS
-from torch_panda.learning.offline.base import OfflineAgent, OfflineHyperparameters
 from torch_panda.learning.spaces import Spaces, read_spaces
 from torch_panda.policies import shipped_policies
-
-AnyAgent = Agent | OfflineAgent
-AnyHyperparameters = Hyperparameters | OfflineHyperparameters
 
 
 class Policy(TensorDictModuleBase):
@@ -81,7 +76,7 @@ class SavedPolicy:
 
     path: Path
     env_id: str
-    hp: AnyHyperparameters
+    hp: Hyperparameters
     spaces: Spaces
     weights: Mapping[str, Tensor]
 
@@ -111,7 +106,7 @@ class SavedPolicy:
             ) from None
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
-    def make_agent(self, env: GoalEnv | None = None) -> AnyAgent:
+    def make_agent(self, env: GoalEnv | None = None) -> Agent:
         """Make an agent with this policy, and with untrained critics.
 
         Args:
@@ -132,12 +127,8 @@ class SavedPolicy:
                     "choose a task with the same spaces"
                 )
             spaces = replace(spaces, num_envs=env.batch_size.numel())
-        agent: AnyAgent
         with torch.device("cpu"):
-            if isinstance(self.hp, Hyperparameters):
-                agent = AGENTS[self.hp.algo](spaces, self.hp)
-            else:
-                agent = OFFLINE_AGENTS[self.hp.algo](spaces, self.hp)
+            agent = find_agent(self.hp)(spaces, self.hp)
         try:
             agent.policy.load_state_dict(self.weights)
         except RuntimeError:
@@ -148,42 +139,35 @@ class SavedPolicy:
         return agent
 
 
-def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> AnyHyperparameters:
+def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparameters:
     """Make the hyperparameters that a file holds.
 
     Raises:
         ValueError: This version of torch_panda does not know one of their names or
             values.
     """
-    offline_agent = OFFLINE_AGENTS.get(values.get("algo", ""))
-    cls: type[AnyHyperparameters] = Hyperparameters
-    # CRL learns online and offline. Only online agents have an option `gamma`.
-    if offline_agent is not None and "gamma" not in values:
-        cls = offline_agent.Hyperparameters
-    accepted = {field.name for field in fields(cls)}
+    accepted = {field.name for field in fields(Hyperparameters)}
     if unknown := values.keys() - accepted:
         raise ValueError(
             f"{path} was saved by another version of torch_panda, with options that "
             f"this version does not have: {', '.join(sorted(unknown))}"
         )
-    for name, hint in get_type_hints(cls).items():
+    for name, hint in get_type_hints(Hyperparameters).items():
         choices = get_args(hint) if get_origin(hint) is Literal else ()
         if choices and name in values and values[name] not in choices:
             raise ValueError(
                 f"{path} was saved by another version of torch_panda: {name} must be "
                 f"one of {choices}, got {values[name]!r}"
             )
-    return cls(**values)
+    return Hyperparameters(**values)
 
 
-def save_policy(path: Path, agent: AnyAgent, env_id: str) -> None:
+def save_policy(path: Path, agent: Agent, env_id: str) -> None:
     """Write the policy of an agent into a file that `load_policy` reads."""
-    cls: type[AnyHyperparameters] = Hyperparameters
-    if isinstance(agent, OfflineAgent):
-        cls = agent.Hyperparameters
     # `agent.hp` may be the options of a run. Leave out the fields that are not
     # hyperparameters.
-    hp = {field.name: getattr(agent.hp, field.name) for field in fields(cls)}
+    names = [field.name for field in fields(Hyperparameters)]
+    hp = {name: getattr(agent.hp, name) for name in names}
     # The file holds the averaged weights alone, so a loaded agent has no average.
     hp.pop("ema_rate", None)
     content = {

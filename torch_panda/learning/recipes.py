@@ -27,10 +27,25 @@ RECIPE: dict[str, Any] = {
     # Goals that the policy is asked for, but rarely achieves, are learned sooner if
     # some of the hindsight goals are such goals.
     "desired_ratio": 0.3,
+    # Most rollouts in which the achieved goal does not change teach nothing.
+    "keep_unmoved": 0.1,
     "action_l2": 0.1,
     "ema_rate": 0.003,
     "total_steps": 40_000,
     "stop_when_solved": True,
+}
+# The preset "offline", for all algorithms that learn from a data set. As in OGBench,
+# but with smaller networks and batches.
+OFFLINE: dict[str, Any] = {
+    "offline": True,
+    "algo": "gcivl",
+    "gamma": 0.99,
+    "network": "gelu",
+    "relative_inputs": "fine",
+    "num_envs": 16,
+    "updates_per_step": 1.0,  # an iteration is one gradient step
+    "total_steps": 100_000,
+    "eval_interval": 10_000,
 }
 # The policy looks ahead over this part of an episode: 20 of 50 steps (gamma 0.95).
 HORIZON = 0.4

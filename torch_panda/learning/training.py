@@ -1,16 +1,16 @@
-"""The training loop: steps of parallel environments, then gradient steps.
+"""The training loop: get steps from a source of batches, then take gradient steps.
 
-Each iteration resets all environments, steps each of them for the length of an episode
-(with ``--start-at-object`` at most `MAX_STEPS_FROM_MIDDLE` steps), and then takes
-``updates_per_step`` gradient steps per environment step. If success ends episodes, an
-environment may play several of them in one iteration.
+The source is a set of environments or a data set; see `sources`. With demonstrations, a
+training may begin with iterations that imitate them.
 
-A run is saved between two iterations only. The next iteration begins with a reset, so
-the state of the environments need not be saved, and ``--resume`` continues the run bit
-for bit. Gradient steps use OMP_NUM_THREADS threads, by default one.
+A run is saved between two iterations only. With environments, the next iteration begins
+with a reset. So neither their state nor that of a data set need be saved, and
+``--resume`` continues the run bit for bit. Gradient steps use OMP_NUM_THREADS threads,
+by default one.
 """
 
 import os
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -20,65 +20,49 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.collectors import Collector
-from torchrl.data import TensorDictReplayBuffer, TensorStorage
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
 
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.randomization import Randomization
 from torch_panda.learning.agents import make_agent
-from torch_panda.learning.buffers import make_buffer, select_sequences
-from torch_panda.learning.checkpoint import (
-    SAVE_INTERVAL,
-    Checkpoint,
-    Progress,
-    crossed,
-)
-from torch_panda.learning.curve import NUM_ENVS, Curve, reseed
+from torch_panda.learning.curve import NUM_ENVS, Curve
 from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.logger import make_logger
-from torch_panda.learning.options import DEMO_RATIO, Args
-from torch_panda.learning.pretraining import pretrain
-from torch_panda.learning.starts import StartFrom, states_at_objects
+from torch_panda.learning.options import Args
+from torch_panda.learning.run_files import Checkpoint, Progress
+from torch_panda.learning.sources import DataSet, Experience
 
-# With ``--start-at-object``, each environment takes at most this number of steps in an
-# iteration. Episodes that start in the middle of the task need no more. The limit also
-# cuts the other episodes, because all environments take the same number of steps.
-MAX_STEPS_FROM_MIDDLE = 50
-# Of the sequences in which the achieved goal does not change (see `buffers.has_moved`),
-# the replay buffer stores this fraction. A sequence is the steps of one environment in
-# one iteration. The preset "paper" stores all of them.
-KEEP_UNMOVED = 0.1
+# Steps between two saves, including gradient steps of imitation.
+SAVE_INTERVAL = 20_000
 # A task is solved after this many evaluations in a row in which all episodes succeed.
 SOLVED_EVALUATIONS = 3
 
 
 class Run:
-    """A training with its environments, agent and replay buffer.
+    """A training with its environments, its agent and the source of its batches.
 
     Args:
         args: Options of the training.
         out: Folder of the results.
-        demos: Demonstrated transitions (n,), as `torch_panda.datasets.read_demos`
-            returns them. They are a part of each batch.
-        demos_hash: Hash of the demonstrations, which must be the same when the run is
-            resumed.
+        data: Transitions (n,), as `torch_panda.datasets.read_demos` returns them. With
+            the option ``offline``, they are the data set to learn from. Otherwise they
+            are demonstrations, which are a part of each batch.
+        data_hash: Hash of the data, which must be the same when the run is resumed.
         make_own_env: Makes environments of your own, from their number; see `GoalEnv`.
             The id of the options is then only a name. None makes those of the id.
 
     Raises:
         TypeError: The task does not have one of the ``task_options``.
-        ValueError: An option does not fit the task or another option, or the run to
-            resume cannot be read.
+        ValueError: An option does not fit the task, the data or another option, or the
+            run to resume cannot be read.
     """
 
     def __init__(
         self,
         args: Args,
         out: Path,
-        demos: TensorDictBase | None = None,
-        demos_hash: str = "",
+        data: TensorDictBase | None = None,
+        data_hash: str = "",
         *,
         make_own_env: Callable[[int], GoalEnv] | None = None,
     ) -> None:
@@ -98,45 +82,12 @@ class Run:
             self.env = make_own_env(args.num_envs)
             self.env.set_seed(args.seed)
         self.agent = make_agent(self.env, args)
-        steps = self.env.max_episode_steps
-        if args.start_at_object:
-            steps = min(steps, MAX_STEPS_FROM_MIDDLE)
-        steps_per_iteration = args.num_envs * steps
-        self.buffer = make_buffer(
-            self.env,
-            # The last iteration may go past `total_steps`.
-            args.total_steps + steps_per_iteration,
-            her=args.her,
-            desired_ratio=args.desired_ratio,
-            discount=self.agent.gamma,
-            seed=args.seed,
-        )
-        self.num_demos = 0  # demonstrated transitions in each batch
-        if demos is not None:
-            demos = demos.to(self.env.device)
-            self.agent.normalizer.update(demos["observation"], demos["desired_goal"])
-            storage = TensorStorage(demos, device=self.env.device)
-            self.demos = TensorDictReplayBuffer(storage=storage)
-            self.num_demos = int(DEMO_RATIO * args.batch_size)
-        env: EnvBase = self.env
-        if args.start_at_object:
-            states = states_at_objects(args.env_id, seed=args.seed, **args.env_options)
-            env = TransformedEnv(env, StartFrom(states, args.start_at_object))
-        # A batch [num_envs, steps] begins with a reset of all environments. Episodes
-        # that are still running at its end are cut.
-        self.collector = Collector(
-            env,
-            self.agent.explore,
-            frames_per_batch=steps_per_iteration,
-            total_frames=-1,
-            reset_at_each_iter=True,
-            # mypy takes the members of this enum for strings.
-            exploration_type=ExplorationType.RANDOM,  # type: ignore[arg-type]
-            auto_register_policy_transforms=True,
-            # Without this, ids of trajectories stay on the CPU, and a resumed buffer on
-            # a GPU cannot store them.
-            storing_device=args.device,
-        )
+        self.source: Experience | DataSet
+        if args.offline:
+            assert data is not None and isinstance(self.env, RobotTaskEnv)
+            self.source = DataSet(self.env, self.agent, data)
+        else:
+            self.source = Experience(args, self.env, self.agent, data)
         self.curve = Curve(
             args.env_id,
             self.agent,
@@ -144,12 +95,13 @@ class Run:
             device=args.device,
             logger=make_logger(args.logger, out, asdict(args)),
             env=None if make_own_env is None else make_own_env(NUM_ENVS),
+            offline=args.offline,
             workers=args.workers,
             **args.env_options,
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
-            out, args, self.agent, self.buffer, self.progress, demos_hash
+            out, args, self.agent, self.source.buffer, self.progress, data_hash
         )
         if args.resume:
             self.checkpoint.load()
@@ -166,7 +118,8 @@ class Run:
             options["terminate_on_success"] = False
         return make_env(
             args.env_id,
-            num_envs=args.num_envs,
+            # With a data set, `num_envs` is the number that generated it.
+            num_envs=1 if args.offline else args.num_envs,
             workers=args.workers,
             seed=args.seed,
             device=args.device,
@@ -186,45 +139,31 @@ class Run:
         Raises:
             OSError: A file cannot be written.
         """
-        args, progress, checkpoint = self.args, self.progress, self.checkpoint
-        self.curve.begin(checkpoint)
-        if progress.pretrained < args.pretrain_updates:
-            pretrain(
-                checkpoint,
-                self.demos,
-                updates=args.pretrain_updates,
-                batch_size=args.batch_size,
-                stop=stop,
-            )
-            if progress.pretrained < args.pretrain_updates:
-                return False
-        if args.pretrain_updates and len(progress.curve) == 1:
-            self.curve.add(progress)  # the policy after imitation
-            checkpoint.save()
-
-        bar = tqdm(initial=progress.steps, total=args.total_steps, unit="step")
-        bar.set_description(f"{args.env_id} {args.algo}")
+        args, progress = self.args, self.progress
+        self.curve.begin(self.checkpoint)
+        bar = tqdm(
+            desc=f"{args.env_id} {args.algo}",
+            initial=progress.iterated,
+            total=args.pretrain_updates + args.total_steps,
+            unit="step",
+        )
         finished = stopped = self.is_finished()
-        batches = iter(self.collector)
         while not stopped:
-            started, before = time.perf_counter(), progress.steps
-            # From torch's generator, so that a resumed run has the same episodes.
-            reseed(self.env)
-            data = next(batches)
-            progress.steps += data.numel()
-            self.store(data)
-            losses = self.learn()
+            started, before = time.perf_counter(), progress.iterated
+            if progress.pretrained < args.pretrain_updates:
+                is_row = self.imitate()
+            else:
+                is_row = self.iterate()
             progress.seconds += time.perf_counter() - started
-
-            bar.update(data.numel())
-            is_last = progress.steps >= args.total_steps
-            if is_last or crossed(args.eval_interval, before, progress.steps):
-                self.curve.add(progress, losses)
+            bar.update(progress.iterated - before)
+            if is_row:
+                self.curve.add(progress, self.mean_losses())
+                progress.loss_sums = {}
             finished = self.is_finished()
             bar.set_postfix(success=progress.success)
             stopped = finished or bool(stop)
-            if stopped or crossed(SAVE_INTERVAL, before, progress.steps):
-                checkpoint.save()
+            if stopped or crossed(SAVE_INTERVAL, before, progress.iterated):
+                self.checkpoint.save()
         bar.close()
         return finished
 
@@ -233,23 +172,48 @@ class Run:
         args, progress = self.args, self.progress
         last = [row["success"] for row in progress.curve[-SOLVED_EVALUATIONS:]]
         is_solved = len(last) == SOLVED_EVALUATIONS and min(last) == 1.0
-        is_last = progress.steps >= args.total_steps
+        is_last = (
+            progress.pretrained >= args.pretrain_updates
+            and progress.steps >= args.total_steps
+        )
         return is_last or (args.stop_when_solved and is_solved)
 
-    def store(self, data: TensorDictBase) -> None:
-        """Add a batch [num_envs, steps] to the buffer and to the normaliser."""
-        keep_unmoved = 1.0 if self.args.preset == "paper" else KEEP_UNMOVED
-        data = select_sequences(data, keep_unmoved)
-        if len(data):
-            indices = self.buffer.extend(data.reshape(-1))
-            # Reading rows back relabels them. As in Baselines, the normaliser's
-            # statistics include hindsight goals.
-            stored = self.buffer[indices]
-            normalizer = self.agent.normalizer
-            normalizer.update(stored["observation"], stored["desired_goal"])
+    def imitate(self) -> bool:
+        """Take one gradient step of imitation. The learning rate falls linearly to 0.
+
+        Returns:
+            Whether it was the last one, so that the policy is to be evaluated.
+        """
+        args, progress = self.args, self.progress
+        self.agent.set_learning_rate(1 - progress.pretrained / args.pretrain_updates)
+        assert isinstance(self.source, Experience)  # a data set has no demonstrations
+        self.agent.imitate(self.source.demos.sample(args.batch_size))
+        progress.pretrained += 1
+        is_last = progress.pretrained == args.pretrain_updates
+        if is_last:
+            self.agent.set_learning_rate(1.0)
+        return is_last
+
+    def iterate(self) -> bool:
+        """Get steps from the source, and take the gradient steps that are then due.
+
+        Returns:
+            Whether the policy is to be evaluated.
+        """
+        args, progress = self.args, self.progress
+        before = progress.steps
+        progress.steps += self.source.collect()
+        losses = self.learn()
+        # With a data set, an iteration is one gradient step, and a row of the curve has
+        # the mean over all steps since the last row. Otherwise it has the mean over the
+        # gradient steps of one iteration.
+        sums = progress.loss_sums if args.offline else {}
+        progress.loss_sums = {key: sums.get(key, 0.0) + x for key, x in losses.items()}
+        is_last = progress.steps >= args.total_steps
+        return is_last or crossed(args.eval_interval, before, progress.steps)
 
     def learn(self) -> dict[str, float]:
-        """Take the gradient steps that are due after the environment steps so far.
+        """Take the gradient steps that are due after the steps so far.
 
         Returns:
             The mean of each loss over these steps.
@@ -257,18 +221,52 @@ class Run:
         args, agent = self.args, self.agent
         losses: dict[str, list[Tensor]] = defaultdict(list)
         due = int(self.progress.steps * args.updates_per_step) - agent.updates
-        for _ in range(due if len(self.buffer) else 0):
+        for _ in range(due if len(self.source) else 0):
             if args.anneal_lr:
                 total = args.updates_per_step * args.total_steps
                 # The last iteration may exceed the total number of updates.
                 agent.set_learning_rate(max(0.0, 1 - agent.updates / total))
-            batch = self.buffer.sample(args.batch_size - self.num_demos)
-            demos = self.demos.sample(self.num_demos) if self.num_demos else None
+            batch, demos = self.source.sample(args.batch_size)
             for key, loss in agent.update(batch, demos).items():
                 losses[key].append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
 
+    def mean_losses(self) -> dict[str, float]:
+        """The losses for the next row of the curve."""
+        progress = self.progress
+        count = 1
+        if self.args.offline:
+            count = progress.steps - int(progress.curve[-1]["step"])
+        return {key: total / count for key, total in progress.loss_sums.items()}
+
     def close(self) -> None:
         """Close the environments."""
-        self.collector.shutdown()
+        self.source.close()
         self.curve.close()
+
+
+def crossed(interval: int, before: int, after: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
+class StopSignal:
+    """Becomes true on Ctrl-C or SIGTERM. A second signal ends the program at once."""
+
+    def __init__(self) -> None:
+        self.received = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._receive)
+
+    def _receive(self, number: int, frame: object) -> None:
+        self.received = True
+        self.release()
+        tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
+
+    def release(self) -> None:
+        """Give the signals their usual effect again."""
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def __bool__(self) -> bool:
+        return self.received

@@ -1,26 +1,51 @@
-"""Agents for goal-conditioned tasks: DDPG, TD3, SAC, TQC and CRL."""
+"""Agents for goal-conditioned tasks, one file per algorithm."""
 
 import torch
 
 from torch_panda.learning.agents.base import Agent
-from torch_panda.learning.agents.crl import CRL
+from torch_panda.learning.agents.crl import CRL, OfflineCRL
 from torch_panda.learning.agents.ddpg import DDPG
+from torch_panda.learning.agents.gcbc import GCBC
+from torch_panda.learning.agents.gciql import GCIQL
+from torch_panda.learning.agents.gcivl import GCIVL
+from torch_panda.learning.agents.hiql import HIQL
+from torch_panda.learning.agents.qrl import QRL
 from torch_panda.learning.agents.sac import SAC
 from torch_panda.learning.agents.td3 import TD3
-from torch_panda.learning.agents.tqc import TQC
 from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.spaces import read_spaces
 
-AGENTS: dict[str, type[Agent]] = {
-    "ddpg": DDPG,
-    "td3": TD3,
-    "sac": SAC,
-    "tqc": TQC,
-    "crl": CRL,
+AGENTS: dict[str, type[Agent]] = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "crl": CRL}
+"""Agents that explore, by name."""
+OFFLINE_AGENTS: dict[str, type[Agent]] = {
+    "gcbc": GCBC,
+    "gcivl": GCIVL,
+    "gciql": GCIQL,
+    "hiql": HIQL,
+    "qrl": QRL,
+    "crl": OfflineCRL,
 }
+"""Agents that learn from a data set, by name."""
 
-__all__ = ["AGENTS", "CRL", "DDPG", "SAC", "TD3", "TQC", "Agent", "Hyperparameters"]
+__all__ = ["AGENTS", "OFFLINE_AGENTS", "Agent", "Hyperparameters"]
+
+
+def find_agent(hp: Hyperparameters) -> type[Agent]:
+    """Find the class of an algorithm.
+
+    Raises:
+        ValueError: The algorithm does not learn offline, or only offline.
+    """
+    agents = OFFLINE_AGENTS if hp.offline else AGENTS
+    if hp.algo in agents:
+        return agents[hp.algo]
+    if hp.offline:
+        raise ValueError(
+            f"--offline learns by {', '.join(OFFLINE_AGENTS)}, got --algo {hp.algo}: "
+            "choose one of them, or leave out --offline"
+        )
+    raise ValueError(f"{hp.algo} learns offline: add --offline")
 
 
 def make_agent(env: GoalEnv, hp: Hyperparameters) -> Agent:
@@ -34,4 +59,4 @@ def make_agent(env: GoalEnv, hp: Hyperparameters) -> Agent:
     """
     with torch.device(env.device or "cpu"):
         finds_layout = hp.relative_inputs != "none" or hp.exploration == "points"
-        return AGENTS[hp.algo](read_spaces(env, finds_layout=finds_layout), hp)
+        return find_agent(hp)(read_spaces(env, finds_layout=finds_layout), hp)

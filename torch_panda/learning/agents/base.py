@@ -1,36 +1,41 @@
-"""Base class of the agents: the parts that all of them share."""
+"""Base class of the agents: the gradient step and the policy that all of them share."""
 
 import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import ClassVar, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
 from torch_panda.learning.augmentation import augment
-from torch_panda.learning.exploration import BOX, RandomPointModule
+from torch_panda.learning.batch import Batch
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.spaces import Spaces
-from torch_panda.learning.transitions import Transitions
+from torch_panda.transforms.strategies import StrategyOption
 
 POLICY_INPUTS: list[NestedKey] = ["observation", "desired_goal"]
 LEARNING_RATE = 1e-3  # of actor and critic, from the panda-gym paper
 TAU = 0.05  # weight of the online networks when the target networks are updated
+# OGBench's mixture of strategies that draw the goals of value functions (arXiv
+# 2410.20092, appendix D).
+VALUE_GOALS = {"current": 0.2, "geometric": 0.5, "random": 0.3}
+
+_Network = TypeVar("_Network", bound=nn.Module)
 
 
 class Agent(nn.Module, ABC):
-    """A policy with its exploration and its learning algorithm.
+    """A policy with its learning algorithm.
 
     The constructor of a subclass makes the networks and then calls `assemble`. A
-    subclass also defines `backward`, and `move_targets` if it has target networks. The
-    input of the networks is the "state": the tensor that the normaliser computes from
-    observations and goals.
+    subclass also defines `losses`. The input of the networks is the "state": the tensor
+    that the normaliser computes from observations and goals.
 
     Attributes:
         spaces: Sizes and layout of observations, goals and actions.
@@ -38,6 +43,7 @@ class Agent(nn.Module, ABC):
         normalizer: Computes states from observations and goals.
         state_size: Size of a state.
         gamma: Discount factor.
+        alpha: The option of offline agents, or its default for the algorithm.
         min_return: Lower bound of the discounted return; None for dense rewards.
         policy: Module from ``observation`` and ``desired_goal`` to ``action``, which is
             deterministic under ``ExplorationType.DETERMINISTIC``. With `ema_rate`, it
@@ -50,6 +56,11 @@ class Agent(nn.Module, ABC):
         ValueError: The hyperparameters do not fit the spaces.
     """
 
+    learning_rate: ClassVar[float] = LEARNING_RATE
+    tau: ClassVar[float] = TAU
+    default_alpha: ClassVar[float] = 0.0
+    value_goal: ClassVar[StrategyOption] = VALUE_GOALS
+    """Strategy with which a data set draws the goals of critics and value functions."""
     policy: TensorDictModuleBase
     explore: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
@@ -61,22 +72,39 @@ class Agent(nn.Module, ABC):
         self.normalizer = Normalizer(spaces, hp.relative_inputs)
         self.state_size = len(self.normalizer.mean)
         self.gamma = hp.gamma or 1 - 1 / spaces.max_episode_steps
+        self.alpha = self.default_alpha if hp.alpha is None else hp.alpha
         self.min_return = min_return(self.gamma) if spaces.has_sparse_reward else None
         self.updates = 0
+        self._online: list[Tensor] = []
+        self._targets: list[Tensor] = []
+
+    @property
+    def goal_strategies(self) -> dict[str, StrategyOption]:
+        """The strategies with which `OfflineData` draws the goals of each key."""
+        return {"value_goal": self.value_goal, "actor_goal": self.hp.actor_goal}
+
+    def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
+        """Add further entries of a data set to a sampled batch; by default none."""
+        return batch
+
+    def make_target(self, network: _Network) -> _Network:
+        """Make a target network: a copy that follows the network slowly."""
+        target = copy.deepcopy(network).requires_grad_(False)
+        self._online += network.parameters()
+        self._targets += target.parameters()
+        return target
 
     def assemble(
-        self,
-        actor: TensorDictModuleBase,
-        noise: Sequence[TensorDictModuleBase],
-        trained: Sequence[Tensor],
+        self, actor: TensorDictModuleBase, noise: Sequence[TensorDictModuleBase] = ()
     ) -> None:
         """Make policy, exploration and optimizer, at the end of a constructor.
 
         Args:
             actor: Module from ``normalized``, which is the state, to ``action``.
             noise: Modules that change ``action`` for exploration.
-            trained: Parameters that the optimizer trains.
         """
+        trained = [p for p in self.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(trained, lr=self.learning_rate, fused=True)
         normalize = TensorDictModule(self.normalizer, POLICY_INPUTS, ["normalized"])
         to_env_action: list[TensorDictModuleBase] = []
         if self.hp.fine_fingers:
@@ -93,37 +121,6 @@ class Agent(nn.Module, ABC):
         self.explore = TensorDictSequential(  # type: ignore[call-overload]
             normalize, actor, *noise, *to_env_action
         )
-        self.optimizer = torch.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
-
-    def action_noise(self) -> list[TensorDictModuleBase]:
-        """Make the exploration of a deterministic actor: noise and random actions."""
-        hp, num_envs = self.hp, self.spaces.num_envs
-        action_spec = self.spaces.action_spec(num_envs)
-        noise = AdditiveGaussianModule(
-            action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
-        )
-        if hp.exploration == "points":
-            return [noise, self.random_points()]
-        random_action = EGreedyModule(action_spec)
-        # A probability for each environment, (num_envs,).
-        random_action.eps = torch.linspace(*hp.random_eps, num_envs)
-        return [noise, random_action]
-
-    def random_points(self) -> RandomPointModule:
-        """Make the module of the exploration "points"."""
-        spaces = self.spaces
-        geometry = spaces.geometry
-        return RandomPointModule(
-            torch.linspace(*self.hp.random_eps, spaces.num_envs),
-            action_size=spaces.action_size,
-            action_scale=spaces.action_scale,
-            moves_joints=spaces.moves_joints,
-            num_arm_actions=spaces.num_arm_actions,
-            # The first position of an observation is the hand's.
-            object_columns=() if geometry is None else geometry.positions[1:],
-            hand_column=0 if geometry is None else geometry.positions[0],
-            box=BOX if geometry is None or geometry.box is None else geometry.box,
-        )
 
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None
@@ -131,22 +128,16 @@ class Agent(nn.Module, ABC):
         """Take one gradient step on a batch of transitions.
 
         Args:
-            batch: Transitions from the replay buffer, (n,).
+            batch: Transitions from the replay buffer or the data set, (n,).
             demos: Demonstrated transitions, (m,), which are appended to the batch.
 
         Returns:
             The losses by name, scalars without gradients.
         """
-        rows = Transitions.from_tensordict(batch)
-        num_demos = 0
-        if demos is not None:
-            num_demos = len(demos)
-            pairs = zip(rows, Transitions.from_tensordict(demos), strict=True)
-            rows = Transitions(*map(torch.cat, pairs))
-        rows = self._prepare(rows)
-        state = self.normalizer(rows.observation, rows.goal)
+        b = self._prepare(Batch.from_tensordict(batch, demos))
         self.optimizer.zero_grad()
-        losses = self.backward(state, rows, num_demos)
+        losses = self.losses(b)
+        torch.stack([*losses.values()]).sum().backward()
         self.optimizer.step()
         self._move_average()
         self.updates += 1
@@ -155,22 +146,25 @@ class Agent(nn.Module, ABC):
         return {key: loss.detach() for key, loss in losses.items()}
 
     @abstractmethod
-    def backward(
-        self, state: Tensor, rows: Transitions, num_demos: int
-    ) -> dict[str, Tensor]:
-        """Compute the losses and their gradients.
+    def losses(self, b: Batch) -> dict[str, Tensor]:
+        """The losses of all networks, scalars, which are summed and differentiated.
 
-        Args:
-            state: States before the environment's step, (n, state size).
-            rows: The transitions. The last ones are demonstrations.
-            num_demos: Number of demonstrations.
-
-        Returns:
-            The losses by name, scalars.
+        A loss detaches or freezes the networks that it must not train, such as the
+        critic in the policy's loss.
         """
 
+    @torch.no_grad()
     def move_targets(self) -> None:
         """Move the target networks, if there are any, towards their networks."""
+        if self._targets:
+            torch._foreach_lerp_(self._targets, self._online, self.tau)
+
+    @torch.no_grad()
+    def _move_average(self) -> None:
+        """Move the averaged weights, if there are any, towards the actor's weights."""
+        rate = self.hp.ema_rate
+        if rate:
+            torch._foreach_lerp_(self._averaged_weights, self._actor_weights, rate)
 
     def imitate(self, demos: TensorDictBase) -> Tensor:
         """Take one gradient step of the policy towards demonstrated actions.
@@ -185,15 +179,15 @@ class Agent(nn.Module, ABC):
         Returns:
             The loss, a scalar without gradients.
         """
-        rows = self._prepare(Transitions.from_tensordict(demos))
-        inputs = dict(zip(POLICY_INPUTS, (rows.observation, rows.goal), strict=True))
+        b = self._prepare(Batch.from_tensordict(demos))
+        inputs = dict(zip(POLICY_INPUTS, (b.s, b.g), strict=True))
         # `_prepare` has converted the demonstrated actions to those of the networks. So
         # compare them with the output of the actor, before it is converted for the
         # environment.
         normalize, actor = self.explore.module[:2]  # type: ignore[index]  # a ModuleList
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = normalize(demos.empty().update(inputs))
-            loss = nn.functional.l1_loss(actor(td)["action"], rows.action)
+            loss = nn.functional.l1_loss(actor(td)["action"], b.a)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
@@ -201,31 +195,23 @@ class Agent(nn.Module, ABC):
         self.move_targets()
         return loss.detach()
 
-    @torch.no_grad()
-    def _move_average(self) -> None:
-        """Move the averaged weights, if there are any, towards the actor's weights."""
-        rate = self.hp.ema_rate
-        if rate:
-            torch._foreach_lerp_(self._averaged_weights, self._actor_weights, rate)
-
-    def _prepare(self, rows: Transitions) -> Transitions:
+    def _prepare(self, b: Batch) -> Batch:
         """Augment a batch, penalise failures, and convert actions for the networks."""
-        rows = augment(rows, self.spaces.geometry, self.hp.augmentation)
+        b = augment(b, self.spaces.geometry, self.hp.augmentation)
         if self.min_return is not None and self.min_return > -math.inf:
             # A failure that ends an episode gets the return of never reaching the goal.
             # With its reward of -1, an agent would fail on purpose, to avoid the
             # rewards of -1 in the steps that follow.
-            failed = rows.terminated & (rows.reward < 0)
-            reward = torch.where(failed, self.min_return, rows.reward)
-            rows = rows._replace(reward=reward)
+            failed = b.ends & (b.r < 0)
+            b = b._replace(r=torch.where(failed, self.min_return, b.r))
         if self.hp.fine_fingers:
-            rows = rows._replace(action=to_fine(rows.action))
-        return rows
+            b = b._replace(a=to_fine(b.a))
+        return b
 
     def set_learning_rate(self, factor: float) -> None:
-        """Use factor * LEARNING_RATE as learning rate of the next gradient steps."""
+        """Use factor * `learning_rate` in the next gradient steps."""
         for group in self.optimizer.param_groups:
-            group["lr"] = factor * LEARNING_RATE
+            group["lr"] = factor * self.learning_rate
 
 
 # How firmly the fingers hold a cube depends on tenths of a millimetre. An action of 1

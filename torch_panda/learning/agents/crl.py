@@ -1,36 +1,52 @@
-"""Contrastive reinforcement learning (CRL), which needs no rewards.
+"""Contrastive reinforcement learning, CRL (arXiv 2206.07568), which needs no rewards.
 
-The critic f(s, a, g) = -|phi(s, a) - psi(g)| learns which goals g an episode achieves
-after an action a in a state s (arXiv 2206.07568). Every sampled transition gets a goal
-that its episode achieved k steps later, where k is drawn with a probability in
-proportion to gamma**k (see `make_buffer` with her="geometric"). At its optimum, f is
-log(p(g | s, a) / p(g)) plus a constant. Here p(g | s, a) is the discounted probability
-of reaching g after (s, a), and p(g) is the frequency of g in the batches. So f ranks
-actions as Q does, and the actor ascends f.
+The critic f(s, a, g) learns which goals g an episode achieves after an action a in a
+state s. Its positive goals are achieved k steps after (s, a), where k is drawn with a
+probability in proportion to gamma**k. Its negative goals are those of other rows. At
+its optimum, f is log(p(g | s, a) / p(g)) plus a constant. Here p(g | s, a) is the
+discounted probability of reaching g after (s, a), and p(g) is the frequency of g in the
+batches. So f ranks actions as Q does, and the actor ascends f.
 
-The distance in f and the loss of the critic are those of JaxGCRL (arXiv 2408.11052).
-arXiv 2206.07568 and `torch_panda.learning.offline.crl` use an inner product and a
-binary loss. With these, Reach had 39 % success after 3,200 steps instead of 100 % (one
-seed each).
+`CRL` explores. Its f and the loss of its critic are those of JaxGCRL (arXiv
+2408.11052). `OfflineCRL` learns from a data set, like OGBench's CRL. With its f and its
+loss in `CRL`, Reach had 39 % success after 3,200 steps instead of 100 % (one seed
+each).
 """
+
+from math import sqrt
+from typing import ClassVar
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.nn import functional
+from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.ddpg import action_penalty
+from torch_panda.learning.agents.offline_losses import (
+    OGBENCH_RATES,
+    ascend_and_imitate,
+    log_prob,
+    make_mean_policy,
+)
+from torch_panda.learning.batch import Batch
+from torch_panda.learning.exploration import make_noise
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
-from torch_panda.learning.transitions import Transitions
 
 LATENT_SIZE = 64  # size of phi and psi
 LOGSUMEXP_WEIGHT = 0.1  # JaxGCRL's weight of the penalty in the critic's loss
+OFFLINE_LATENT_SIZE = 128  # size of phi and psi in `OfflineCRL`, smaller than OGBench's
 
 
 class CRL(Agent):
-    """A contrastive critic f(s, a, g), and a deterministic actor that ascends it."""
+    """A critic f(s, a, g) = -|phi(s, a) - psi(g)|, and an actor that ascends it.
+
+    The replay buffer gives every sampled transition a positive goal; see `make_buffer`
+    with her="geometric".
+    """
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
@@ -40,47 +56,31 @@ class CRL(Agent):
         inputs = len(self.normalizer.state_columns) + action_size
         self.phi = make_mlp(inputs, LATENT_SIZE, hp.network)
         self.psi = make_mlp(spaces.goal_size, LATENT_SIZE, hp.network)
-        self.actor_parameters = list(self.actor.parameters())
         self.assemble(
             TensorDictModule(self.actor, ["normalized"], ["action"]),
-            self.action_noise(),
-            trained=[
-                *self.actor_parameters,
-                *self.phi.parameters(),
-                *self.psi.parameters(),
-            ],
+            make_noise(spaces, hp),
         )
 
-    def backward(
-        self, state: Tensor, rows: Transitions, num_demos: int
-    ) -> dict[str, Tensor]:
-        """Compute the losses of critic and actor, and their gradients.
-
-        See `Agent.backward`. Rewards and next states are not used.
-        """
+    def losses(self, b: Batch) -> dict[str, Tensor]:
+        """The losses of critic and actor. Rewards and next states are not used."""
         # The augmentation "mirror-shift" shifts half of the rows, each by an offset of
         # its own. The critic can tell a shifted goal from the others by its place. This
         # changes p(g), but for all actions alike, so the best action stays the same.
-        s = state[:, self.normalizer.state_columns]
-        phi, psi = self.phi(s, rows.action), self.psi(self.normalizer.goal(rows.goal))
-        critic_loss = contrastive_loss(-distances(phi, psi))
-        critic_loss.backward()
+        s = self.normalizer(b.s, b.g)[:, self.normalizer.state_columns]
+        phi, psi = self.phi(s, b.a), self.psi(self.normalizer.goal(b.g))
+        critic_loss = symmetric_loss(-distances(phi, psi))
 
         # Half of the actor's goals belong to other rows, as in the published code of
         # arXiv 2206.07568. The cube rarely moves, so most rows' own goals are achieved
         # before the step.
         other = torch.arange(len(s), device=s.device)
         other[::2] = other[::2].roll(1)
-        state = self.normalizer(rows.observation, rows.goal[other])
-        before_tanh = self.actor[0](state)
+        before_tanh = self.actor[0](self.normalizer(b.s, b.g[other]))
         action = before_tanh.tanh()
-        f = -(self.phi(s, action) - psi.detach()[other]).norm(dim=-1)
+        with hold_out_net(self.phi):
+            f = -(self.phi(s, action) - psi.detach()[other]).norm(dim=-1)
         penalty = action_penalty(before_tanh, action, self.hp.action_l2)
-        actor_loss = penalty - f.mean()
-        # Compute gradients for the actor only. The critic keeps the gradients of its
-        # own loss.
-        actor_loss.backward(inputs=self.actor_parameters)
-        return {"critic_loss": critic_loss, "actor_loss": actor_loss}
+        return {"critic_loss": critic_loss, "actor_loss": penalty - f.mean()}
 
 
 def distances(x: Tensor, y: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ def distances(x: Tensor, y: Tensor) -> Tensor:
     return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
 
 
-def contrastive_loss(logits: Tensor) -> Tensor:
+def symmetric_loss(logits: Tensor) -> Tensor:
     """Symmetric InfoNCE loss with JaxGCRL's penalty on log-sum-exp, a scalar.
 
     Args:
@@ -101,3 +101,63 @@ def contrastive_loss(logits: Tensor) -> Tensor:
     by_row, by_column = logits.logsumexp(1), logits.logsumexp(0)
     loss = by_row + by_column - 2 * logits.diagonal()
     return (loss + LOGSUMEXP_WEIGHT * by_row.square()).mean()
+
+
+class OfflineCRL(Agent):
+    """Two critics f(s, a, g) = phi(s, a)^T psi(g) / sqrt(size of phi), and a policy.
+
+    The policy pi(a | s, g) ascends the smaller f and imitates the data.
+    """
+
+    learning_rate, tau = OGBENCH_RATES
+    # For its cube tasks, OGBench takes an alpha of 0.1 (noisy) or 3 (play).
+    default_alpha: ClassVar = 0.1
+    value_goal: ClassVar = "geometric"
+
+    def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
+        super().__init__(spaces, hp)
+        state_size, goal_size = len(self.normalizer.state_columns), spaces.goal_size
+        inputs = state_size + spaces.action_size
+        self.phi, self.psi = (
+            nn.ModuleList(
+                make_mlp(size, OFFLINE_LATENT_SIZE, hp.network) for _ in range(2)
+            )
+            for size in (inputs, goal_size)
+        )
+        self.actor = make_mlp(self.state_size, spaces.action_size, hp.network)
+        self.assemble(make_mean_policy(self.actor))
+
+    def losses(self, b: Batch) -> dict[str, Tensor]:
+        """The losses of critics and policy."""
+        phi, psi = self.encode(b.s, b.a, b.g)
+        # Row i of the logits has (s, a) of row i, column j the goal of row j.
+        logits = phi @ psi.mT / sqrt(OFFLINE_LATENT_SIZE)  # (2, n, n)
+        return {
+            "critic_loss": binary_loss(logits),
+            "actor_loss": self.actor_loss(b),
+        }
+
+    def encode(self, s: Tensor, a: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+        """phi(s, a) and psi(g) of both critics, (2, n, size of phi) each."""
+        x, y = self.normalizer.state(s), self.normalizer.goal(g)
+        phi = torch.stack([net(x, a) for net in self.phi])
+        psi = torch.stack([net(y) for net in self.psi])
+        return phi, psi
+
+    def actor_loss(self, b: Batch) -> Tensor:
+        """Ascend f(s, pi(s, g), g) (section 4.3), and imitate as OGBench does."""
+        mean = self.actor(self.normalizer(b.s, b.g_actor))
+        with hold_out_net(self.phi), hold_out_net(self.psi):
+            phi, psi = self.encode(b.s, mean.clamp(-1.0, 1.0), b.g_actor)
+            f = (phi * psi).sum(-1).amin(0) / sqrt(OFFLINE_LATENT_SIZE)
+        return ascend_and_imitate(f, log_prob(mean, b.a), self.alpha)
+
+
+def binary_loss(logits: Tensor) -> Tensor:
+    """NCE loss of section 4.2: tell the pairs on the diagonal from the others.
+
+    Args:
+        logits: f of every (s, a) with every goal of a batch, (..., n, n).
+    """
+    labels = torch.eye(logits.shape[-1], device=logits.device).expand_as(logits)
+    return functional.binary_cross_entropy_with_logits(logits, labels)

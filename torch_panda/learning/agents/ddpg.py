@@ -4,17 +4,17 @@ The losses are written in plain torch. With torchrl's DDPGLoss, a gradient step 
 sixth longer.
 """
 
-import copy
-
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.objectives import hold_out_net
 
-from torch_panda.learning.agents.base import TAU, Agent
+from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.batch import Batch
+from torch_panda.learning.exploration import make_noise
 from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import make_mlp
+from torch_panda.learning.networks import Ensemble, make_mlp
 from torch_panda.learning.spaces import Spaces
-from torch_panda.learning.transitions import Transitions
 
 # Weight of the squared inputs of the actor's tanh in its loss. Without this penalty the
 # inputs can grow until the gradient of the tanh vanishes, which ruined policies of
@@ -37,24 +37,11 @@ class DDPG(Agent):
         super().__init__(spaces, hp)
         inputs, action_size = self.state_size, spaces.action_size
         self.actor = nn.Sequential(make_mlp(inputs, action_size, hp.network), nn.Tanh())
-        self.critics = nn.ModuleList(
-            make_mlp(inputs + action_size, 1, hp.network)
-            for _ in range(self.num_critics)
-        )
-        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
-        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_parameters = list(self.actor.parameters())
-        # Parameters of the trained networks and, in the same order, of their targets.
-        self.online: list[Tensor] = [*self.actor_parameters, *self.critics.parameters()]
-        self.target: list[Tensor] = [
-            *self.target_actor.parameters(),
-            *self.target_critics.parameters(),
-        ]
-        self.assemble(
-            TensorDictModule(self.actor, ["normalized"], ["action"]),
-            self.action_noise(),
-            trained=self.online,
-        )
+        self.critics = Ensemble(inputs + action_size, hp.network, self.num_critics)
+        self.target_actor = self.make_target(self.actor)
+        self.target_critics = self.make_target(self.critics)
+        actor = TensorDictModule(self.actor, ["normalized"], ["action"])
+        self.assemble(actor, make_noise(spaces, hp))
 
     def target_action(self, next_state: Tensor) -> Tensor:
         """Choose the actions whose values are the target of the critics.
@@ -67,50 +54,44 @@ class DDPG(Agent):
         """
         return self.target_actor(next_state)
 
-    def backward(
-        self, state: Tensor, rows: Transitions, num_demos: int
-    ) -> dict[str, Tensor]:
-        """Compute the losses of critics and actor, and their gradients.
-
-        See `Agent.backward`.
-        """
+    def losses(self, b: Batch) -> dict[str, Tensor]:
+        """The losses of critics and actor."""
+        state = self.normalizer(b.s, b.g)
         with torch.no_grad():
-            next_state = self.normalizer(rows.next_observation, rows.goal)
+            next_state = self.normalizer(b.s_next, b.g)
             next_action = self.target_action(next_state)
-            next_values = [
-                critic(next_state, next_action) for critic in self.target_critics
-            ]
-            next_value = torch.stack(next_values).amin(0)
-            target = rows.reward + self.gamma * next_value * ~rows.terminated
+            next_value = self.target_critics(next_state, next_action).amin(0)
+            target = b.r + self.gamma * next_value * ~b.ends
             if self.min_return is not None:
                 target.clamp_(self.min_return, 0.0)
-        values = [critic(state, rows.action) for critic in self.critics]
-        losses = [nn.functional.mse_loss(value, target) for value in values]
-        critic_loss = torch.stack(losses).sum()
-        critic_loss.backward()
-        if self.updates % self.actor_interval:
-            return {"critic_loss": critic_loss}
+        values = self.critics(state, b.a)
+        squared_errors = [nn.functional.mse_loss(value, target) for value in values]
+        losses = {"critic_loss": torch.stack(squared_errors).sum()}
+        if self.updates % self.actor_interval == 0:
+            losses["actor_loss"] = self.actor_loss(b, state, values[0].detach())
+        return losses
 
+    def actor_loss(self, b: Batch, state: Tensor, demo_value: Tensor) -> Tensor:
+        """Maximise the first critic's value, and imitate demonstrations.
+
+        Args:
+            b: The batch.
+            state: States before the environment's step, (n, state size).
+            demo_value: Values of the actions of the batch, (n,).
+        """
         before_tanh = self.actor[0](state)
         action = before_tanh.tanh()
-        value = self.critics[0](state, action)
+        with hold_out_net(self.critics):
+            value = self.critics[0](state, action).squeeze(-1)
         penalty = action_penalty(before_tanh, action, self.hp.action_l2)
-        actor_loss = penalty - value.mean()
-        if num_demos:
+        loss = penalty - value.mean()
+        if b.num_demos:
             # Imitate only demonstrated actions that the critic prefers (the Q filter).
-            is_preferred = (values[0] > value)[-num_demos:].detach()
-            difference = (action - rows.action)[-num_demos:]
+            is_preferred = (demo_value > value)[-b.num_demos :].unsqueeze(-1)
+            difference = (action - b.a)[-b.num_demos :]
             imitation_loss = (difference.square() * is_preferred).mean()
-            actor_loss = actor_loss + BC_WEIGHT * imitation_loss
-        # Compute gradients for the actor only. The critics keep the gradients of their
-        # own loss.
-        actor_loss.backward(inputs=self.actor_parameters)
-        return {"critic_loss": critic_loss, "actor_loss": actor_loss}
-
-    def move_targets(self) -> None:
-        """Move the target networks towards the online networks, by the fraction TAU."""
-        with torch.no_grad():
-            torch._foreach_lerp_(self.target, self.online, TAU)
+            loss = loss + BC_WEIGHT * imitation_loss
+        return loss
 
 
 def action_penalty(before_tanh: Tensor, action: Tensor, action_l2: float) -> Tensor:

@@ -1,29 +1,23 @@
 """Soft actor-critic (arXiv 1801.01290), with torchrl's loss."""
 
-from typing import Any
-
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
-from torchrl.objectives import LossModule, SACLoss, SoftUpdate
+from torchrl.objectives import SACLoss
 
-from torch_panda.learning.agents.base import TAU, Agent
+from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.batch import Batch
+from torch_panda.learning.exploration import make_random_points
 from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.networks import make_mlp
 from torch_panda.learning.spaces import Spaces
-from torch_panda.learning.transitions import Transitions
 
 ALPHA = 0.2  # entropy coefficient, which is not trained
 
 
 class SAC(Agent):
-    """A stochastic policy that maximises the value of critics and its entropy.
-
-    The subclass `TQC` has another loss, and critics with more outputs.
-    """
-
-    critic_outputs = 1
+    """A stochastic policy that maximises the value of critics and its entropy."""
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)
@@ -36,13 +30,14 @@ class SAC(Agent):
             distribution_class=TanhNormal,
         )
         critic = TensorDictModule(
-            make_mlp(inputs + spaces.action_size, self.critic_outputs, hp.network),
+            make_mlp(inputs + spaces.action_size, 1, hp.network),
             ["normalized", "action"],
             ["state_action_value"],
         )
-        self.loss = self.make_loss(
+        self.loss = SACLoss(
             actor,
             critic,
+            loss_function="l2",
             num_qvalue_nets=2 if hp.double_q else 1,
             deactivate_vmap=True,  # faster on CPU
             alpha_init=ALPHA,
@@ -52,38 +47,24 @@ class SAC(Agent):
         self.loss.make_value_estimator(gamma=self.gamma)
         # Reading this attribute registers a buffer, which every saved state must have.
         _ = self.loss.target_entropy
-        self.soft_update = SoftUpdate(self.loss, tau=TAU)
-        noise = [self.random_points()] if hp.exploration == "points" else []
-        self.assemble(actor, noise, trained=list(self.loss.parameters()))
+        online = self.loss.qvalue_network_params
+        targets = self.loss.target_qvalue_network_params
+        for key in online.keys(True, True):
+            self._online.append(online[key])
+            self._targets.append(targets[key])
+        noise = [make_random_points(spaces, hp)] if hp.exploration == "points" else []
+        self.assemble(actor, noise)
 
-    def make_loss(
-        self,
-        actor: ProbabilisticActor,
-        critic: TensorDictModule,
-        **options: Any,  # noqa: ANN401 (options of the loss)
-    ) -> LossModule:
-        """Make torchrl's loss module for actor and critics."""
-        return SACLoss(actor, critic, loss_function="l2", **options)
-
-    def backward(
-        self, state: Tensor, rows: Transitions, num_demos: int
-    ) -> dict[str, Tensor]:
-        """Compute torchrl's losses and their gradients; see `Agent.backward`.
-
-        Demonstrations count as ordinary transitions.
-        """
-        next_state = self.normalizer(rows.next_observation, rows.goal)
-        flags = {"terminated": rows.terminated, "done": rows.terminated}
-        after_step = {"normalized": next_state, "reward": rows.reward, **flags}
-        batch = {"normalized": state, "action": rows.action, "next": after_step}
-        torchrl_losses = self.loss(TensorDict(batch, [len(state)]))
-        losses = {
-            "critic_loss": torchrl_losses["loss_qvalue"],
-            "actor_loss": torchrl_losses["loss_actor"],
+    def losses(self, b: Batch) -> dict[str, Tensor]:
+        """Torchrl's losses. Demonstrations count as ordinary transitions."""
+        state = self.normalizer(b.s, b.g)
+        next_state = self.normalizer(b.s_next, b.g)
+        ends, reward = b.ends.unsqueeze(-1), b.r.unsqueeze(-1)
+        flags = {"terminated": ends, "done": ends}
+        after_step = {"normalized": next_state, "reward": reward, **flags}
+        batch = {"normalized": state, "action": b.a, "next": after_step}
+        losses = self.loss(TensorDict(batch, [len(state)]))
+        return {
+            "critic_loss": losses["loss_qvalue"],
+            "actor_loss": losses["loss_actor"],
         }
-        (losses["critic_loss"] + losses["actor_loss"]).backward()
-        return losses
-
-    def move_targets(self) -> None:
-        """Move the target networks towards the online networks, by the fraction TAU."""
-        self.soft_update.step()

@@ -1,8 +1,20 @@
-"""Locks of run folders, and the saved state from which a run resumes bit for bit."""
+"""The files in the folder of a run, which this module alone writes.
 
+| file | content |
+|---|---|
+| run.lock, process.txt | lock of the process that writes into the folder, its name |
+| args.json | options |
+| curve.csv, curve.png | results of the evaluations |
+| checkpoint.pt | policy at the last evaluation or save, for `load_policy` |
+| resume.pt | state from which a run resumes bit for bit |
+
+Only the generated data of an offline run, its video and its log come from elsewhere.
+"""
+
+import csv
+import io
 import json
 import os
-import signal
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,18 +25,16 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 from torchrl.data import ReplayBuffer
-from tqdm import tqdm
 
 from torch_panda.learning import files
-from torch_panda.learning.policy_files import AnyAgent, save_policy
+from torch_panda.learning.agents import Agent
+from torch_panda.learning.plots import plot_curve
+from torch_panda.learning.policy_files import save_policy
 from torch_panda.learning.recipes import find_changes
 
-LOCK = "run.lock"  # file that the process of a run keeps locked
-# A folder with one of these files holds a run.
-RESULTS = ("resume.pt", "curve.csv", "checkpoint.pt")
-# Steps between two saves: environment steps, or gradient steps of imitation and of
-# offline learning.
-SAVE_INTERVAL = 20_000
+LOCK, PROCESS, OPTIONS = "run.lock", "process.txt", "args.json"
+CURVE, PLOT = "curve.csv", "curve.png"
+POLICY, STATE = "checkpoint.pt", "resume.pt"
 # Options that may change when a run is resumed.
 FREE_OPTIONS = {
     *("resume", "out", "device", "workers", "video", "imports", "logger"),
@@ -42,8 +52,8 @@ class Progress:
         seconds: Time spent on stepping and learning, without evaluations. In ``refine``
             only the time of the imitation.
         curve: One row for each evaluation.
-        loss_sums: In offline learning, the sum of each loss since the last evaluation.
-            Empty in other runs.
+        loss_sums: Each loss of the last iteration. In offline learning, the sum of the
+            losses since the last evaluation.
     """
 
     steps: int = 0
@@ -51,6 +61,11 @@ class Progress:
     seconds: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
     loss_sums: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def iterated(self) -> int:
+        """Steps and gradient steps of imitation so far."""
+        return self.pretrained + self.steps
 
     @property
     def success(self) -> str:
@@ -62,22 +77,19 @@ class Progress:
 class Checkpoint:
     """The complete state of a run between two iterations.
 
-    The file resume.pt in the folder ``out`` holds this state. The file checkpoint.pt
-    beside it holds the policy alone, for `load_policy`.
-
     Demonstrations, and the data of offline learning, are not saved, only their hash. So
     a resumed run can check that they are the same.
     """
 
     out: Path
     args: Any  # options of the run, a dataclass
-    agent: AnyAgent
+    agent: Agent
     buffer: ReplayBuffer | None  # None in offline learning
     progress: Progress
     data_hash: str = ""  # of demonstrations or offline data; empty without both
 
     def save(self) -> None:
-        """Write the state into resume.pt, and the policy into checkpoint.pt.
+        """Write the state and the policy.
 
         Raises:
             OSError: A file cannot be written.
@@ -93,8 +105,8 @@ class Checkpoint:
             "cuda_random": torch.cuda.get_rng_state_all(),
             "progress": asdict(self.progress),
         }
-        files.save(self.out / "resume.pt", state)
-        save_policy(self.out / "checkpoint.pt", self.agent, self.args.env_id)
+        files.save(self.out / STATE, state)
+        save_policy(self.out / POLICY, self.agent, self.args.env_id)
 
     def load(self) -> None:
         """Restore the state that `save` wrote.
@@ -110,14 +122,14 @@ class Checkpoint:
             *("random", "cuda_random", "progress"),
         )
         finite = ("agent", "optimizer")
-        path = self.out / "resume.pt"
+        path = self.out / STATE
         # The run may go on on another device.
         state = files.read(
             path, "the state of a run", keys, finite=finite, map_location="cpu"
         )
-        # Runs of earlier versions had no such options.
-        saved = {"task_options": {}, "physics": "exact", **state["args"]}
         options = fixed_options(self.args)
+        # The run may be older than an option.
+        saved = {**options, **state["args"]}
         steps = options.get("total_steps", 0)
         if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps
@@ -142,9 +154,29 @@ class Checkpoint:
             torch.cuda.set_rng_state_all(state["cuda_random"])
 
 
-def crossed(interval: int, before: int, after: int) -> bool:
-    """Whether a multiple of ``interval`` lies in (before, after]."""
-    return before // interval < after // interval
+def write_results(
+    out: Path, rows: list[dict[str, float]], agent: Agent, env_id: str, *, xlabel: str
+) -> None:
+    """Write the curve, its picture and the evaluated policy.
+
+    Args:
+        out: Folder of the run.
+        rows: Rows of the curve, one for each evaluation.
+        agent: The agent.
+        env_id: Id of the environment, which is also the title of the picture.
+        xlabel: Meaning of the column ``step``.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    fields = {key: None for row in rows for key in row}
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, fieldnames=list(fields))
+    writer.writeheader()
+    writer.writerows(rows)
+    files.save_text(out / CURVE, text.getvalue())
+    plot_curve(rows, env_id, out / PLOT, xlabel=xlabel)
+    save_policy(out / POLICY, agent, env_id)
 
 
 def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
@@ -191,7 +223,7 @@ def write_options(
     Raises:
         OSError: The file cannot be written.
     """
-    path = out / "args.json"
+    path = out / OPTIONS
     if resume and path.exists():
         options = json.loads(path.read_text()) | fixed_options(args)
     else:
@@ -212,11 +244,11 @@ def check_folder(out: Path, *, resume: bool) -> None:
     if (out / LOCK).exists():
         with lock_folder(out):
             pass  # no other process has the lock
-    if resume and not (out / "resume.pt").exists():
+    if resume and not (out / STATE).exists():
         raise ValueError(
             f"there is no run to resume in {out}: start it without --resume"
         )
-    if not resume and any((out / name).exists() for name in RESULTS):
+    if not resume and any((out / name).exists() for name in (STATE, CURVE, POLICY)):
         raise ValueError(
             f"{out} holds a run: continue it with --resume, remove it, or choose "
             "another folder with --out"
@@ -235,7 +267,7 @@ def lock_folder(out: Path) -> Iterator[None]:
         OSError: The folder cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
-    lock, process = FileLock(out / LOCK), out / "process.txt"
+    lock, process = FileLock(out / LOCK), out / PROCESS
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -250,25 +282,3 @@ def lock_folder(out: Path) -> Iterator[None]:
     finally:
         process.unlink(missing_ok=True)
         lock.release()
-
-
-class StopSignal:
-    """Becomes true on Ctrl-C or SIGTERM. A second signal ends the program at once."""
-
-    def __init__(self) -> None:
-        self.received = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._receive)
-
-    def _receive(self, number: int, frame: object) -> None:
-        self.received = True
-        self.release()
-        tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
-
-    def release(self) -> None:
-        """Give the signals their usual effect again."""
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-    def __bool__(self) -> bool:
-        return self.received

@@ -12,67 +12,64 @@ Therefore a waypoint w is a whole observation, and there are two value functions
 phi(s, w)) of waypoints, which trains phi, and V(s, g) of goals.
 """
 
-import copy
-from dataclasses import dataclass
 from math import sqrt
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torch_panda.learning.limits import Positive, Ratio, Weight
-from torch_panda.learning.normalizer import Normalizer
-from torch_panda.learning.offline.base import (
-    VALUE_GOALS,
-    Actor,
-    Batch,
-    Ensemble,
-    OfflineAgent,
-    OfflineHyperparameters,
+from torch_panda.learning.agents.base import VALUE_GOALS, Agent
+from torch_panda.learning.agents.offline_losses import (
+    OGBENCH_RATES,
     ensemble_loss,
     log_prob,
-    make_gelu_mlp,
-    move_towards,
+    make_mean_policy,
     weighted_regression,
 )
-from torch_panda.learning.offline.data import OfflineData
+from torch_panda.learning.batch import Batch
+from torch_panda.learning.hyperparameters import Hyperparameters
+from torch_panda.learning.networks import Ensemble, make_mlp
+from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.spaces import Spaces
 from torch_panda.transforms.strategies import choose_steps
 
-
-@dataclass
-class HIQLHyperparameters(OfflineHyperparameters):
-    """Hyperparameters of HIQL, by default OGBench's for its cube tasks."""
-
-    algo: Literal["hiql"] = "hiql"
-    """algorithm"""
-    expectile: Ratio = 0.7
-    """expectile of the values, tau in the paper"""
-    high_alpha: Weight = 3.0
-    """inverse temperature of the weights of imitated waypoints"""
-    low_alpha: Weight = 3.0
-    """inverse temperature of the weights of imitated actions"""
-    subgoal_steps: Positive = 10
-    """number k of steps from a state to its waypoint, OGBench's subgoal"""
-    rep_dim: Positive = 10
-    """size of the representation of a waypoint"""
+REP_SIZE = 10  # size of the representation of a waypoint
 
 
-class HIQL(OfflineAgent):
-    """Values of waypoints and goals, and a policy of each level."""
+class HIQL(Agent):
+    """Values of waypoints and goals, and a policy of each level.
 
-    Hyperparameters: ClassVar = HIQLHyperparameters
-    hp: HIQLHyperparameters
+    The defaults are OGBench's for its cube tasks. Both levels have the same alpha.
 
-    def __init__(self, spaces: Spaces, hp: HIQLHyperparameters) -> None:
+    Args:
+        spaces: Sizes and layout of observations, goals and actions.
+        hp: Hyperparameters.
+        expectile: Expectile of the values, tau in the paper.
+        subgoal_steps: Number k of steps from a state to its waypoint, OGBench's
+            subgoal.
+    """
+
+    learning_rate, tau = OGBENCH_RATES
+    default_alpha: ClassVar = 3.0
+
+    def __init__(
+        self,
+        spaces: Spaces,
+        hp: Hyperparameters,
+        *,
+        expectile: float = 0.7,
+        subgoal_steps: int = 10,
+    ) -> None:
         super().__init__(spaces, hp)
-        inputs, hidden_size = len(self.normalizer.mean), hp.hidden_size
-        state_size = len(self.normalizer.state_columns)
+        self.expectile, self.subgoal_steps = expectile, subgoal_steps
+        # The state of this class is the part of the network's inputs without the goal.
+        columns = self.normalizer.state_columns
+        state_size = len(columns)
         # phi(s, w), the values of waypoints and of goals, and targets of all three.
-        self.phi = make_gelu_mlp(2 * state_size, hp.rep_dim, hidden_size)
-        self.waypoint_value = Ensemble(state_size + hp.rep_dim, hidden_size)
-        self.goal_value = Ensemble(inputs, hidden_size)
+        self.phi = make_mlp(2 * state_size, REP_SIZE, hp.network)
+        self.waypoint_value = Ensemble(state_size + REP_SIZE, hp.network)
+        self.goal_value = Ensemble(self.state_size, hp.network)
         self.online = nn.ModuleDict(
             {
                 "phi": self.phi,
@@ -80,15 +77,12 @@ class HIQL(OfflineAgent):
                 "goal_value": self.goal_value,
             }
         )
-        self.target = copy.deepcopy(self.online).requires_grad_(False)
+        self.target = self.make_target(self.online)
         # pi^h(z | s, g) and pi^l(a | s, z).
-        self.high_actor = Actor(self.normalizer, hp.rep_dim, hidden_size)
-        self.low_actor = make_gelu_mlp(
-            state_size + hp.rep_dim, spaces.action_size, hidden_size
-        )
-        self.assemble(
-            HierarchicalActor(self.normalizer, self.high_actor, self.low_actor)
-        )
+        self.high_actor = make_mlp(self.state_size, REP_SIZE, hp.network)
+        self.low_actor = make_mlp(state_size + REP_SIZE, spaces.action_size, hp.network)
+        actor = HierarchicalActor(self.high_actor, self.low_actor, columns)
+        self.assemble(make_mean_policy(actor))
 
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
         """Draw a waypoint for each of three losses.
@@ -101,15 +95,15 @@ class HIQL(OfflineAgent):
         """
         t = batch["index"].cpu()
         last = data.last[t].cpu()
-        goal_row = draw_rows(self.hp.actor_goal, t, last, self.hp.discount)
+        goal_row = draw_rows(self.hp.actor_goal, t, last, self.gamma)
         # Row t holds a state s and the next state s', so the state k steps after s is
         # s' of row t + k - 1.
-        waypoint_row = t + self.hp.subgoal_steps - 1
+        waypoint_row = t + self.subgoal_steps - 1
         # The waypoint for the loss of V(s, phi(s, w)) is s' of a row that is drawn like
         # the goals of V(s, g).
         rows = {
             "current": t,
-            "geometric": draw_rows("geometric", t, last, self.hp.discount),
+            "geometric": draw_rows("geometric", t, last, self.gamma),
             "random": torch.randint(len(data), t.shape),
         }
         weights = torch.tensor([VALUE_GOALS[strategy] for strategy in rows])
@@ -124,12 +118,11 @@ class HIQL(OfflineAgent):
         batch["reaches_waypoint"] = value_row == t
         return batch
 
-    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def losses(self, b: Batch) -> dict[str, Tensor]:
         """The losses of both values and both policies."""
-        b = Batch.from_tensordict(batch)
         s, s_next = self.normalizer.state(b.s), self.normalizer.state(b.s_next)
-        w, reaches_w = batch["value_waypoint"], batch["reaches_waypoint"]
-        high_w, low_w = batch["high_waypoint"], batch["low_waypoint"]
+        w, reaches_w = b.source["value_waypoint"], b.source["reaches_waypoint"]
+        high_w, low_w = b.source["high_waypoint"], b.source["low_waypoint"]
         return {
             "goal_value_loss": self.goal_value_loss(b),
             "waypoint_value_loss": self.waypoint_value_loss(s, s_next, w, reaches_w),
@@ -138,7 +131,7 @@ class HIQL(OfflineAgent):
         }
 
     def represent(self, phi: nn.Module, s: Tensor, w: Tensor) -> Tensor:
-        """phi(s, w), scaled to the Euclidean norm sqrt(rep_dim), (n, rep_dim)."""
+        """phi(s, w), scaled to the Euclidean norm sqrt(REP_SIZE), (n, REP_SIZE)."""
         return normalize_length(phi(s, self.normalizer.state(w)))
 
     def goal_value_loss(self, b: Batch) -> Tensor:
@@ -146,9 +139,9 @@ class HIQL(OfflineAgent):
         value, target = self.goal_value, self.target["goal_value"]
         x, x_next = self.normalizer(b.s, b.g), self.normalizer(b.s_next, b.g)
         with torch.no_grad():
-            q = b.r + self.hp.discount * b.mask * target(x_next)  # (2, n)
+            q = b.r + self.gamma * ~b.ends * target(x_next)  # (2, n)
             v_target = target(x)
-        return ensemble_loss(q, value(x), v_target, self.hp.expectile)
+        return ensemble_loss(q, value(x), v_target, self.expectile)
 
     def waypoint_value_loss(
         self, s: Tensor, s_next: Tensor, w: Tensor, reaches_w: Tensor
@@ -158,19 +151,20 @@ class HIQL(OfflineAgent):
         with torch.no_grad():
             v_next = value(s_next, self.represent(phi, s_next, w))
             # -1 per step, until s' is the waypoint: then 0, and the return ends.
-            q = ~reaches_w * (self.hp.discount * v_next - 1)
+            q = ~reaches_w * (self.gamma * v_next - 1)
             v_target = value(s, self.represent(phi, s, w))
         v = self.waypoint_value(s, self.represent(self.phi, s, w))
-        return ensemble_loss(q, v, v_target, self.hp.expectile)
+        return ensemble_loss(q, v, v_target, self.expectile)
 
     def high_actor_loss(self, b: Batch, s: Tensor, w: Tensor) -> Tensor:
         """Weighted imitation of waypoints, A = V(w, g) - V(s, g) (eq. 6)."""
+        x = self.normalizer(b.s, b.g_actor)
         with torch.no_grad():
-            v = self.goal_value(self.normalizer(b.s, b.g_actor)).mean(0)
+            v = self.goal_value(x).mean(0)
             v_later = self.goal_value(self.normalizer(w, b.g_actor)).mean(0)
             z = self.represent(self.phi, s, w)
-        log_probs = log_prob(self.high_actor(b.s, b.g_actor), z)
-        return weighted_regression(log_probs, v_later - v, self.hp.high_alpha)
+        log_probs = log_prob(self.high_actor(x), z)
+        return weighted_regression(log_probs, v_later - v, self.alpha)
 
     def low_actor_loss(self, a: Tensor, s: Tensor, s_next: Tensor, w: Tensor) -> Tensor:
         """Weighted imitation of actions, A = V(s', w) - V(s, w) (eq. 7)."""
@@ -180,33 +174,28 @@ class HIQL(OfflineAgent):
             z_next = self.represent(self.phi, s_next, w)
             v_next = self.waypoint_value(s_next, z_next).mean(0)
         log_probs = log_prob(self.low_actor(s, z), a)
-        return weighted_regression(log_probs, v_next - v, self.hp.low_alpha)
-
-    def move_targets(self) -> None:
-        """Move the target networks of phi and of both values towards the networks."""
-        move_towards(self.target, self.online, self.hp.tau)
+        return weighted_regression(log_probs, v_next - v, self.alpha)
 
 
 class HierarchicalActor(nn.Module):
     """Acts towards the waypoint whose representation the high level outputs.
 
     Args:
-        normalizer: Standardises observations.
-        high_actor: Module from observation and goal to a waypoint's representation.
-        low_actor: Network from standardised observation and representation to action.
+        high_actor: Network from inputs with goals to a waypoint's representation.
+        low_actor: Network from inputs without goals and representation to action.
+        columns: Columns of the inputs that do not depend on the goal.
     """
 
     def __init__(
-        self, normalizer: Normalizer, high_actor: Actor, low_actor: nn.Module
+        self, high_actor: nn.Module, low_actor: nn.Module, columns: list[int]
     ) -> None:
         super().__init__()
-        self.normalizer = normalizer
-        self.high_actor, self.low_actor = high_actor, low_actor
+        self.high_actor, self.low_actor, self.columns = high_actor, low_actor, columns
 
-    def forward(self, s: Tensor, g: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:
         """The mean action, (..., action size)."""
-        z = normalize_length(self.high_actor(s, g))
-        return self.low_actor(self.normalizer.state(s), z)
+        z = normalize_length(self.high_actor(x))
+        return self.low_actor(x[..., self.columns], z)
 
 
 def draw_rows(strategy: str, t: Tensor, last: Tensor, discount: float) -> Tensor:
