@@ -69,12 +69,13 @@ def runs():
     runs = {}
     for path in sorted(RUNS.glob("*/args.json")):
         name = path.parent.name
-        args = default | json.loads(path.read_text())
+        args = json.loads(path.read_text())
+        if args["preset"] == "recipe":  # an option since, with this default
+            args.setdefault("keep_unmoved", RECIPE["keep_unmoved"])
+        args = default | args
         is_ablation = ABLATION.search(name)
         if args["preset"] not in ("recipe", "paper") or is_ablation:
             continue
-        if args["preset"] == "recipe":  # an option since, with this default
-            args.setdefault("keep_unmoved", RECIPE["keep_unmoved"])
         if HAS_FETCH or not name.startswith("Fetch"):
             runs[name] = args
     return runs
