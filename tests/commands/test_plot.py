@@ -105,8 +105,8 @@ def test_a_label_in_the_options_names_the_line(tmp_path, figures):
 
 
 def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
-    way = {"gamma": 0.9, "noise_eps": 0.1, "batch_size": 64, "anneal_lr": True}
-    way |= {"desired_ratio": 0.5, "updates_per_step": 0.2, "target_interval": 10}
+    way = {"gamma": 0.9, "noise_eps": 0.1, "batch_size": 64, "ema_rate": 0.01}
+    way |= {"desired_ratio": 0.5, "updates_per_step": 0.2, "randomize": 3.0}
     args = Args(env_id="PandaPush-v1", num_envs=9, start_at_object=0.5, **way)
     write_run(tmp_path / "way", args)
     for task in ("Reach", "Slide"):
@@ -116,7 +116,7 @@ def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
     assert all(axes.get_position().width > 0.2 for axes in figures[0].axes)
     (label,) = lines_of(figures[0].axes[0])
     assert "gamma 0.9" in label
-    assert "anneal lr" in label
+    assert "randomize 3.0" in label
 
 
 def test_a_band_covers_the_steps_that_all_seeds_have(tmp_path, figures):
@@ -169,10 +169,3 @@ def test_an_unwritable_place_is_refused(runs, tmp_path):
 
 def test_runs_with_another_logger_have_the_same_label():
     assert find_changes(Args(logger="tensorboard"), Args()) == {}
-
-
-def test_total_steps_are_in_the_label_only_with_a_falling_rate():
-    args, default = Args(total_steps=200_000), Args()
-    assert find_changes(args, default) == {}
-    args.anneal_lr = default.anneal_lr = True
-    assert find_changes(args, default) == {"total_steps": 200_000}

@@ -17,7 +17,6 @@ from torch_panda.bullet import FAST
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import curve, sources, training
-from torch_panda.learning.agents.base import LEARNING_RATE
 from torch_panda.learning.evaluation import evaluate_episodes
 from torch_panda.learning.options import Args, check, default_args
 from torch_panda.learning.starts import states_at_objects
@@ -78,9 +77,9 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
     [
         {"algo": "sac", "desired_ratio": 0.5},
         {
-            **{"keep_unmoved": 0.1, "relative_inputs": "fine", "target_interval": 3},
+            **{"keep_unmoved": 0.1, "relative_inputs": "fine"},
             **{"augmentation": "mirror-shift", "start_at_object": 0.5},
-            **{"exploration": "points", "ema_rate": 0.1, "anneal_lr": True},
+            **{"exploration": "points", "ema_rate": 0.1},
         },
         *(
             pytest.param(options, marks=pytest.mark.slow)
@@ -198,15 +197,6 @@ def test_other_options_and_other_runs_are_refused(tmp_path):
         train.main(replace(args, resume=True))
 
 
-def test_a_falling_learning_rate_needs_the_same_total_steps(tmp_path):
-    args = Args(num_envs=1, total_steps=100, anneal_lr=True, video=False, out=tmp_path)
-    run = Run(args, tmp_path)
-    run.checkpoint.save()
-    run.close()
-    with pytest.raises(SystemExit, match="total_steps was 100 and is now 200"):
-        train.main(replace(args, resume=True, total_steps=200))
-
-
 def test_a_resumed_run_keeps_its_label(tmp_path):
     args = Args(num_envs=1, total_steps=50, updates_per_step=0.0, video=False)
     args.out = tmp_path
@@ -216,19 +206,6 @@ def test_a_resumed_run_keeps_its_label(tmp_path):
     file.write_text(json.dumps(options))
     train.main(replace(args, resume=True))
     assert json.loads(file.read_text()) == options
-
-
-def test_the_learning_rate_falls_to_0(tmp_path):
-    """The last iteration exceeds the total number of steps."""
-    options = {"num_envs": 2, "updates_per_step": 0.1}
-    run = Run(Args(total_steps=150, anneal_lr=True, **options), tmp_path)
-    (group,) = run.agent.optimizer.param_groups
-    rates, update = [], run.agent.update
-    run.agent.update = lambda *batch: rates.append(group["lr"]) or update(*batch)
-    run.train()
-    run.close()
-    expected = [LEARNING_RATE * max(0, 1 - k / 15) for k in range(20)]
-    assert rates == pytest.approx(expected)
 
 
 def test_a_tenth_of_the_episodes_in_which_nothing_moves_is_stored(tmp_path):

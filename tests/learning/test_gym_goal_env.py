@@ -475,7 +475,6 @@ def test_the_recipe_derives_its_options_from_random_actions():
         ({"physics": "fast"}, "physics"),
         ({"task_options": {"goal_range": 1.0}}, "task_options"),
         ({"randomize": 2.0}, "randomize"),
-        ({"continue_after_success": True}, "continue_after_success"),
         ({"physics": "fast", "randomize": 2.0}, "physics or randomize"),
     ],
 )

@@ -87,18 +87,6 @@ def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
 
 
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("continues", [False, True])
-def test_training_episodes_can_go_on_after_success(continues, tmp_path):
-    args = Args(env_id="PandaReach-v3", num_envs=16, continue_after_success=continues)
-    run = Run(args, tmp_path)
-    after = next(iter(run.source.collector))["next"]
-    run.close()
-    assert after["success"].any()
-    assert after["terminated"].any() != continues
-    assert run.curve.env.terminate_on_success
-
-
-@pytest.mark.usefixtures("quick")
 def test_three_full_evaluations_in_a_row_end_a_training(tmp_path):
     args = default_args("recipe", "PandaReach-v1")
     args.num_envs = 2

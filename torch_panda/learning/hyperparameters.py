@@ -6,7 +6,7 @@ Numbers that nobody needs to change are constants in the files that use them.
 from dataclasses import dataclass
 from typing import Literal
 
-from torch_panda.learning.limits import Discount, Positive, Ratio, Weight
+from torch_panda.learning.limits import Discount, Ratio, Weight
 
 Algo = Literal["ddpg", "td3", "sac", "crl", "gcbc", "gcivl", "gciql", "hiql", "qrl"]
 RelativeInputs = Literal["none", "coarse", "fine"]
@@ -34,9 +34,6 @@ class Hyperparameters:
     """hidden layers of actors and critics: three of 256 units ("paper"), the same with
     LayerNorm ("layer-norm"), three of 448 units with LayerNorm ("wide"), or three of
     256 units with LayerNorm and GELU instead of ReLU ("gelu")"""
-    target_interval: Positive = 1
-    """gradient steps between two updates of the target networks (CRL has no target
-    networks)"""
     action_l2: Weight = 1.0
     """DDPG, TD3, CRL: weight of the mean squared action in the actor's loss"""
     ema_rate: Ratio = 0.0

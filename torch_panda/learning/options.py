@@ -57,11 +57,6 @@ class ResearchOptions(Hyperparameters):
     """gradient steps per environment step"""
     batch_size: Positive = 256
     """transitions per gradient step"""
-    anneal_lr: bool = False
-    """let the learning rate fall linearly to 0 during the training"""
-    continue_after_success: bool = False
-    """let training episodes last until their time limit, even if the id ends them at
-    success, as -v3 does. Evaluations still follow the id"""
     randomize: Factor = 1.0
     """largest factor f of domain randomization. For every training episode, the mass
     and friction of the objects and the friction of the table are drawn between 1 / f
@@ -119,7 +114,7 @@ class RunOptions:
     resume: bool = False
     """continue the run in the folder. Only --out, --video, --import, --logger, --device
     and --workers may differ from the options with which it was started, and
-    --total-steps may be larger if the learning rate does not fall"""
+    --total-steps may be larger"""
     device: str = "cpu"
     """device of the networks and the data"""
     workers: Positive = 1
@@ -165,19 +160,15 @@ class ArgGroups:
 
 
 # Options that environments of Gymnasium do not have.
-OWN_OPTIONS = (
-    *("task_options", "physics", "start_at_object", "continue_after_success"),
-    *("randomize", "demos"),
-)
+OWN_OPTIONS = (*("task_options", "physics", "start_at_object", "randomize", "demos"),)
 
 
 # Options that have an effect only with an environment, or only with --offline.
 ONLINE_OPTIONS = (
-    *("double_q", "target_interval", "action_l2", "ema_rate", "noise_eps"),
+    *("double_q", "action_l2", "ema_rate", "noise_eps"),
     *("random_eps", "exploration", "fine_fingers", "augmentation", "her"),
-    *("desired_ratio", "keep_unmoved", "updates_per_step", "anneal_lr"),
-    *("continue_after_success", "randomize", "pretrain_updates", "start_at_object"),
-    *("demos", "workers"),
+    *("desired_ratio", "keep_unmoved", "updates_per_step", "randomize"),
+    *("pretrain_updates", "start_at_object", "demos", "workers"),
 )
 OFFLINE_OPTIONS = ("alpha", "actor_goal", "data", "transitions")
 

@@ -118,11 +118,8 @@ def find_changes(args: Any, default: Any) -> dict[str, Any]:  # noqa: ANN401 (da
         default: Default options, of the same dataclass.
     """
     options, defaults = asdict(args), asdict(default)
-    unplotted = UNPLOTTED_OPTIONS
-    if options.get("anneal_lr"):  # the learning rate depends on the total steps
-        unplotted = unplotted - {"total_steps"}
     return {
         name: value
         for name, value in options.items()
-        if value != defaults[name] and name not in unplotted
+        if value != defaults[name] and name not in UNPLOTTED_OPTIONS
     }

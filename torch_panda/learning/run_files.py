@@ -131,7 +131,7 @@ class Checkpoint:
         # The run may be older than an option.
         saved = {**options, **state["args"]}
         steps = options.get("total_steps", 0)
-        if not saved.get("anneal_lr") and steps > saved.get("total_steps", steps):
+        if steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps
         check_same(self.out, saved, options)
         # Runs of earlier versions saved no hash under this key.

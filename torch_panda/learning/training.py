@@ -114,8 +114,6 @@ class Run:
             options["randomize"] = Randomization(
                 object_mass=factors, object_friction=factors, table_friction=factors
             )
-        if args.continue_after_success:
-            options["terminate_on_success"] = False
         return make_env(
             args.env_id,
             # With a data set, `num_envs` is the number that generated it.
@@ -222,10 +220,6 @@ class Run:
         losses: dict[str, list[Tensor]] = defaultdict(list)
         due = int(self.progress.steps * args.updates_per_step) - agent.updates
         for _ in range(due if len(self.source) else 0):
-            if args.anneal_lr:
-                total = args.updates_per_step * args.total_steps
-                # The last iteration may exceed the total number of updates.
-                agent.set_learning_rate(max(0.0, 1 - agent.updates / total))
             batch, demos = self.source.sample(args.batch_size)
             for key, loss in agent.update(batch, demos).items():
                 losses[key].append(loss)

@@ -141,8 +141,7 @@ class Agent(nn.Module, ABC):
         self.optimizer.step()
         self._move_average()
         self.updates += 1
-        if self.updates % self.hp.target_interval == 0:
-            self.move_targets()
+        self.move_targets()
         return {key: loss.detach() for key, loss in losses.items()}
 
     @abstractmethod

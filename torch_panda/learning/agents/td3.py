@@ -15,7 +15,7 @@ class TD3(DDPG):
     """DDPG with two critics, noise on target actions, and fewer steps of the actor.
 
     In the paper, the target networks move only together with the actor. Here they move
-    after every `target_interval` gradient steps, as in DDPG.
+    after every gradient step, as in DDPG.
     """
 
     actor_interval = 2
