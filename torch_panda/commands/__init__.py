@@ -21,7 +21,7 @@ COMMANDS = {
     "plot": "draw the success curves of runs",
     "refine": "let a policy imitate its own episodes with the goals that they achieved",
     "distributed": "train on the machines of a Ray cluster",
-    "bench": "compare steps per second with other environments",
+    "bench": "compare the speed with other environments",
     "info": "print versions, environments, threads and renderers",
 }
 
