@@ -45,9 +45,7 @@ class BufferTransform(envs.Transform):
 
     It remembers the goals of the transitions that the buffer stores. It also checks the
     first batches for entries that were computed from the desired goal, because these
-    would contradict another goal (see `data_checks`). Subclasses decide when they draw
-    goals: when a batch is sampled (`SampleTimeTransform`) or when an episode ends
-    (`HindsightAugment`).
+    would contradict another goal (see `data_checks`).
 
     Args:
         reward_fn: Maps (achieved_goal, desired_goal), (n, *goal) each, to the reward,
@@ -134,13 +132,9 @@ class BufferTransform(envs.Transform):
             accepted.remove("strategy")
         suggestion = None
         is_count = isinstance(value, int) and value > 0
-        is_ratio = isinstance(value, float) and 0 < value < 1
-        # Translate the arguments of Stable-Baselines3 and of the other transforms, for
-        # example k=4 of HindsightAugment to her_ratio=0.8 of HindsightRelabel.
+        # Translate the arguments of the HER paper and of Stable-Baselines3.
         if name in ("k", "n_sampled_goal") and is_count and "her_ratio" in accepted:
             suggestion = f"her_ratio={value / (value + 1):.3g}"
-        elif name == "her_ratio" and is_ratio and "k" in accepted:
-            suggestion = f"k={max(1, round(value / (1 - value)))}"
         elif name == "goal_selection_strategy" and "strategies" in accepted:
             suggestion = "strategies"
         elif name == "goal_selection_strategy":

@@ -225,11 +225,6 @@ class GoalMemory:
         achieved: Goals = self._goals[rows, 0]
         return achieved
 
-    def is_open(self, serials: Integers) -> NDArray[np.bool_]:
-        """Returns whether each transition's trajectory is still open, (n,)."""
-        open_numbers = [number for number, _, _ in self._open.values()]
-        return np.isin(self.find(serials)[0], open_numbers)
-
     def end_trajectories(self) -> None:
         """Ends all trajectories: the next row of each id begins a new trajectory."""
         self._open.clear()

@@ -3,15 +3,11 @@
 import pytest
 
 from tests.transforms.identifiable import reward_fn
-from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
+from torch_panda.transforms import GoalSampler, HindsightRelabel
 
 
 def relabel(**options):
     return HindsightRelabel(**{"reward_fn": reward_fn, **options})
-
-
-def augment(**options):
-    return HindsightAugment(reward_fn, **options)
 
 
 def sample(strategies=(("goal", "future"),), **options):
@@ -37,8 +33,6 @@ BAD_VALUES = [
     (relabel, {"strategy": {"future": 0.0}}, "strategy must have positive, finite"),
     (relabel, {"strategy": {"future": 1e999}}, "strategy must have positive, finite"),
     (relabel, {"discount": -0.1}, "discount must be within"),
-    (augment, {"k": 0}, "k must be an integer"),
-    (augment, {"strategy": "random"}, "one episode at a time"),
     (sample, {"strategies": {}}, "strategies must map keys"),
     (sample, {"strategies": "future"}, "strategies must map keys.*'future'"),
     (sample, {"strategies": {"goal": "past"}}, "strategy must be one of.*'past'"),
@@ -49,7 +43,6 @@ UNKNOWN = [
     (relabel, {"n_sampled_goal": 1}, "use her_ratio=0.5; accepted are reward_fn"),
     (relabel, {"goal_selection_strategy": "final"}, "use strategy='final'"),
     (relabel, {"stategy": "final"}, "use strategy; .*goal_parts"),
-    (augment, {"her_ratio": 0.8}, "use k=4; .*, trajectory_key"),
     (sample, {"strategy": "future"}, "'strategy'; pass strategies, one for each key"),
     (sample, {"her_ratio": 0.8}, "'her_ratio'; accepted are strategies, reward_fn"),
     (sample, {"goal_selection_strategy": "final"}, "use strategies; accepted"),
