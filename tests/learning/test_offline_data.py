@@ -64,6 +64,8 @@ def test_each_agent_draws_its_goals(algo, value_goal):
     cls = OFFLINE_AGENTS[algo]
     agent = cls(SPACES, cls.Hyperparameters(hidden_size=8))
     expected = {"value_goal": value_goal, "actor_goal": "future"}
+    if algo == "hiql":
+        expected["waypoint"] = MIXTURE
     assert agent.goal_strategies == expected
 
 

@@ -128,6 +128,18 @@ def test_the_desired_goal_may_be_a_key():
     assert torch.equal(batch["next", "reward"], reward_fn(achieved, goal))
 
 
+def test_the_rows_of_the_goals_are_returned():
+    """The data have one dimension, and nothing was overwritten."""
+    strategies = {"value": {"random": 1, "future": 1}, ("to", "desired"): "desired"}
+    rb = buffer(GoalSampler(strategies, reward_fn))
+    rb.extend(name_goals(Envs(3, [4, 9]).chunk(20)).transpose(0, 1).reshape(-1))
+    batch, stored = rb.sample(), rb.storage[:]
+    achieved = stored["next", "achieved_goal"][batch["value_row"]]
+    assert torch.equal(batch["value"], achieved)
+    desired = stored["desired_goal"][batch["to", "desired_row"]]
+    assert torch.equal(batch["to", "desired"], desired)
+
+
 def test_keys_draw_independently():
     rb = buffer(GoalSampler({"a": "random", "b": "random"}, reward_fn, seed=0))
     rb.extend(name_goals(Envs(10, [10]).chunk(10)).reshape(-1))

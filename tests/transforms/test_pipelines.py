@@ -146,7 +146,7 @@ def test_rows_of_another_transform_in_an_ensemble_are_refused():
     members[0].extend(mine.prepare(Envs(4, [10]).chunk(20)))
     members[1].extend(other.prepare(Envs(4, [10], first_env=4).chunk(20)))
     both = ReplayBufferEnsemble(*members, batch_size=64, transform=mine)
-    with pytest.raises(RuntimeError, match="through another HindsightRelabel"):
+    with pytest.raises(RuntimeError, match="not the transitions that this transform"):
         for _ in range(20):  # each sample draws from which buffers its rows come
             both.sample()
 
@@ -204,7 +204,7 @@ def test_dropping_rows_before_hindsight_is_refused():
     rb = buffer(Compose(KeepEveryThird(), HindsightRelabel(reward_fn)))
     envs = Envs(2, [4])
     rb.extend(envs.chunk(9).reshape(-1))
-    with pytest.raises(RuntimeError, match=r"18 rows.*only 6: .*after Hindsight"):
+    with pytest.raises(RuntimeError, match=r"18 rows.*only 6: .*drop rows after it"):
         rb.extend(envs.chunk(9).reshape(-1))
     rb = buffer(Compose(HindsightRelabel(reward_fn), KeepEveryThird()))
     for _ in range(20):
@@ -284,17 +284,6 @@ def test_a_second_buffer_is_refused(share):
     assert relabelled(first.sample()).float().mean() > 0.6
 
 
-def test_a_buffer_whose_predecessor_is_gone_starts_empty():
-    transform, envs = HindsightRelabel(reward_fn, strategy="episode"), Envs(2, [7])
-    for number in range(3):
-        rb = buffer(Compose(transform))
-        # Episodes are unfinished, and the ids go on in the next buffer.
-        rb.extend(envs.chunk(10 + number).reshape(-1))
-        stored = rb.storage[:]
-        check_batch(rb.sample(), stored, "episode")
-        del rb
-
-
 def test_a_copied_buffer_goes_on_by_itself():
     first, envs = buffer(HindsightRelabel(reward_fn)), Envs(2, [4, 9])
     first.extend(envs.chunk(10).reshape(-1))
@@ -318,8 +307,7 @@ SELECTED = ["desired_goal", "achieved_goal", "next", "collector"]
 def test_selecting_before_hindsight_is_named(before):
     rb = buffer(Compose(before(), HindsightRelabel(reward_fn)))
     rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
-    message = "(Select|Exclude)Transform comes before HindsightRelabel.*put it after"
-    with pytest.raises(KeyError, match=message):
+    with pytest.raises(RuntimeError, match="select or exclude entries after it"):
         rb.sample()
 
 
