@@ -1,7 +1,5 @@
 """Hindsight goal relabelling for any goal-conditioned TorchRL pipeline."""
 
-from torch_panda.transforms.augment import HindsightAugment
-from torch_panda.transforms.relabel import HindsightRelabel
-from torch_panda.transforms.sampler import GoalSampler
+from torch_panda.transforms.hindsight import GoalSampler, HindsightRelabel
 
-__all__ = ["GoalSampler", "HindsightAugment", "HindsightRelabel"]
+__all__ = ["GoalSampler", "HindsightRelabel"]

@@ -1,13 +1,12 @@
 """Goal strategies, which choose the step whose goal a relabelled transition gets.
 
-The stored steps of a trajectory are numbered from `first` to `end - 1`. For a
-transition at step `step`, most strategies choose one of these steps. Only "random" and
-"desired" take goals from other trajectories.
+The stored steps of a trajectory are numbered from 0 to `end - 1`. For a transition at
+step `step`, most strategies choose one of these steps. Only "random" and "desired" take
+goals from other trajectories.
 
 A strategy may also be a user's function `(step, first, end, generator) -> goal step`.
-Its steps are int32 tensors (n,) on the CPU. They count from the oldest stored step of
-the trajectory, so `first` is always 0. `generator` is None for torch's global
-generator.
+Its steps are int32 tensors (n,) on the CPU. `first` is always 0, the oldest stored
+step. `generator` is None for torch's global generator.
 
 "future", "final", "episode" and "random" are the strategies of Andrychowicz et al. 2017
 (arXiv 1707.01495), section 4.5. "geometric" draws from the discounted future of a
@@ -31,10 +30,7 @@ Strategy = str | StrategyFunction
 StrategyOption = Strategy | Mapping[Any, float]  # what users pass as `strategy`
 
 RANDOM, DESIRED = "random", "desired"  # goals of any stored transition
-# These strategies draw the transition's own step or a later one. A buffer overwrites
-# old transitions first, so it still holds the drawn step.
-LOOKING_AHEAD = ("current", "future", "geometric", "final")
-NAMES = (*LOOKING_AHEAD, "episode", RANDOM, DESIRED)
+NAMES = ("current", "future", "geometric", "final", "episode", RANDOM, DESIRED)
 
 
 @dataclass(frozen=True)
@@ -75,11 +71,6 @@ class Mixture:
         total = sum(weights.values())
         shares = {name: weight / total for name, weight in weights.items()}
         return cls(shares, discount)
-
-    @property
-    def only_looks_ahead(self) -> bool:
-        """Whether every strategy draws this step or a later one of the trajectory."""
-        return all(strategy in LOOKING_AHEAD for strategy in self.weights)
 
     def split(
         self, n: int, generator: Generator | None
@@ -126,7 +117,6 @@ def draw_geometric(
 def choose_steps(
     strategy: Strategy,
     step: Integers,
-    first: Integers,
     end: Integers,
     discount: float,
     generator: Generator | None,
@@ -136,14 +126,14 @@ def choose_steps(
     Args:
         strategy: Name of a strategy other than "random" and "desired", or a user's
             function.
-        step: Steps of the transitions, (n,).
-        first: Oldest stored step of each transition's trajectory, (n,).
-        end: One more than the last stored step of each trajectory, (n,).
+        step: Steps of the transitions, counted from the oldest stored step of their
+            trajectories, (n,).
+        end: Number of stored steps of each trajectory, (n,).
         discount: Discount per step of "geometric".
         generator: Generator of the random draws; None means torch's global generator.
 
     Raises:
-        ValueError: A user's function did not return integers from `first` to `end - 1`.
+        ValueError: A user's function did not return integers from 0 to `end - 1`.
     """
     if strategy == "current":
         return step
@@ -154,9 +144,9 @@ def choose_steps(
     if strategy == "future":
         return draw_integers(step, end, generator)
     if strategy == "episode":
-        return draw_integers(first, end, generator)
+        return draw_integers(0, end, generator)
     assert callable(strategy)
-    return first + _call(strategy, step - first, end - first, generator)
+    return _call(strategy, step, end, generator)
 
 
 def _call(
@@ -165,7 +155,7 @@ def _call(
     end: Integers,
     generator: Generator | None,
 ) -> Integers:
-    """Calls a user's strategy with steps that count from the oldest stored step."""
+    """Calls a user's strategy."""
     first = np.zeros_like(step)
     steps, firsts, ends = (
         torch.from_numpy(numbers.astype(np.int32)) for numbers in (step, first, end)

@@ -65,6 +65,8 @@ def test_each_agent_draws_its_goals(algo, value_goal):
     hp = Hyperparameters(algo=algo, offline=True)
     agent = find_agent(hp)(SPACES, hp)
     expected = {"value_goal": value_goal, "actor_goal": "future"}
+    if algo == "hiql":
+        expected["waypoint"] = MIXTURE
     assert agent.goal_strategies == expected
 
 

@@ -1,16 +1,13 @@
 """Environments, buffers and collectors, as the tests of pipelines build them."""
 
-import pytest
 from hypothesis import Phase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import torch_panda
-from torch_panda.transforms import HindsightAugment, HindsightRelabel
 
 # Shrinking a failing example takes minutes, and the examples are short anyway.
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate)
-BOTH = pytest.mark.parametrize("hindsight", [HindsightRelabel, HindsightAugment])
 
 
 def make(env_id="PandaPush-v1", num_envs=4):

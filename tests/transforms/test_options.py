@@ -3,15 +3,16 @@
 import pytest
 
 from tests.transforms.identifiable import reward_fn
-from torch_panda.transforms import GoalSampler, HindsightAugment, HindsightRelabel
+from tests.transforms.pipelines import make as make_env
+from torch_panda.transforms import GoalSampler, HindsightRelabel
 
 
 def relabel(**options):
     return HindsightRelabel(**{"reward_fn": reward_fn, **options})
 
 
-def augment(**options):
-    return HindsightAugment(reward_fn, **options)
+def from_env(**options):
+    return HindsightRelabel.from_env(None, **options)
 
 
 def sample(strategies=(("goal", "future"),), **options):
@@ -37,22 +38,18 @@ BAD_VALUES = [
     (relabel, {"strategy": {"future": 0.0}}, "strategy must have positive, finite"),
     (relabel, {"strategy": {"future": 1e999}}, "strategy must have positive, finite"),
     (relabel, {"discount": -0.1}, "discount must be within"),
-    (augment, {"k": 0}, "k must be an integer"),
-    (augment, {"strategy": "random"}, "one episode at a time"),
     (sample, {"strategies": {}}, "strategies must map keys"),
     (sample, {"strategies": "future"}, "strategies must map keys.*'future'"),
     (sample, {"strategies": {"goal": "past"}}, "strategy must be one of.*'past'"),
     (sample, {"strategies": {"achieved_goal": "future"}}, "must not replace 'achieved"),
 ]
 UNKNOWN = [
-    (relabel, {"k": 4}, "HindsightRelabel has no argument 'k'; use her_ratio=0.8; "),
-    (relabel, {"n_sampled_goal": 1}, "use her_ratio=0.5; accepted are reward_fn"),
-    (relabel, {"goal_selection_strategy": "final"}, "use strategy='final'"),
-    (relabel, {"stategy": "final"}, "use strategy; .*goal_parts"),
-    (augment, {"her_ratio": 0.8}, "use k=4; .*, trajectory_key"),
-    (sample, {"strategy": "future"}, "'strategy'; pass strategies, one for each key"),
-    (sample, {"her_ratio": 0.8}, "'her_ratio'; accepted are strategies, reward_fn"),
-    (sample, {"goal_selection_strategy": "final"}, "use strategies; accepted"),
+    (from_env, {"k": 4}, "HindsightRelabel has no argument 'k'; use her_ratio=0.8; "),
+    (from_env, {"n_sampled_goal": 1}, "use her_ratio=0.5; accepted are reward_fn"),
+    (from_env, {"goal_selection_strategy": "final"}, "use strategy; accepted"),
+    (from_env, {"stategy": "final"}, "accepted are .* strategy, .*goal_parts"),
+    (relabel, {"stategy": "final"}, "unexpected keyword argument 'stategy'"),
+    (sample, {"her_ratio": 0.8}, "unexpected keyword argument 'her_ratio'"),
 ]
 CASES = [
     *((*case, ValueError) for case in BAD_VALUES),
@@ -68,4 +65,4 @@ def test_options_that_are_not_accepted_raise(make, options, message, error):
 
 def test_from_env_needs_the_strategies_of_a_goal_sampler():
     with pytest.raises(TypeError, match=r"missing .* argument: 'strategies'"):
-        GoalSampler.from_env(None)
+        GoalSampler.from_env(make_env("PandaReach-v1"))

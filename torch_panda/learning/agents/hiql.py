@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torch_panda.learning.agents.base import VALUE_GOALS, Agent
+from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ensemble_loss,
@@ -32,7 +32,7 @@ from torch_panda.learning.hyperparameters import Hyperparameters
 from torch_panda.learning.networks import Ensemble, make_mlp
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.spaces import Spaces
-from torch_panda.transforms.strategies import choose_steps
+from torch_panda.transforms.strategies import StrategyOption
 
 REP_SIZE = 10  # size of the representation of a waypoint
 
@@ -84,36 +84,28 @@ class HIQL(Agent):
         actor = HierarchicalActor(self.high_actor, self.low_actor, columns)
         self.assemble(make_mean_policy(actor))
 
+    @property
+    def goal_strategies(self) -> dict[str, StrategyOption]:
+        """The strategies of goals, and of the waypoints of V(s, phi(s, w))."""
+        return {**super().goal_strategies, "waypoint": self.value_goal}
+
     def extend(self, batch: TensorDictBase, data: OfflineData) -> TensorDictBase:
-        """Draw a waypoint for each of three losses.
+        """Add a waypoint for each of three losses.
 
         The three losses are those of the high-level policy, the low-level policy and
         the values of waypoints. The waypoint of the low level does not lie beyond the
         end of the episode. The waypoint of the high level does not lie beyond the goal
-        of the policy loss. The batch does not say in which row that goal was achieved,
-        so this method draws a new goal.
+        of the policy loss.
         """
-        t = batch["index"].cpu()
-        last = data.last[t].cpu()
-        goal_row = draw_rows(self.hp.actor_goal, t, last, self.gamma)
+        t, goal_row, value_row = (
+            batch[key].cpu() for key in ("index", "actor_goal_row", "waypoint_row")
+        )
         # Row t holds a state s and the next state s', so the state k steps after s is
         # s' of row t + k - 1.
         waypoint_row = t + self.subgoal_steps - 1
-        # The waypoint for the loss of V(s, phi(s, w)) is s' of a row that is drawn like
-        # the goals of V(s, g).
-        rows = {
-            "current": t,
-            "geometric": draw_rows("geometric", t, last, self.gamma),
-            "random": torch.randint(len(data), t.shape),
-        }
-        weights = torch.tensor([VALUE_GOALS[strategy] for strategy in rows])
-        choice = torch.multinomial(weights, len(t), replacement=True)
-        value_row = torch.stack([*rows.values()]).gather(0, choice[None])[0]
-
         observation = data.rows["next", "observation"]
-        batch["actor_goal"] = data.rows["next", "achieved_goal"][goal_row]
         batch["high_waypoint"] = observation[waypoint_row.minimum(goal_row)]
-        batch["low_waypoint"] = observation[waypoint_row.minimum(last)]
+        batch["low_waypoint"] = observation[waypoint_row.minimum(data.last[t].cpu())]
         batch["value_waypoint"] = observation[value_row]
         batch["reaches_waypoint"] = value_row == t
         return batch
@@ -196,12 +188,6 @@ class HierarchicalActor(nn.Module):
         """The mean action, (..., action size)."""
         z = normalize_length(self.high_actor(x))
         return self.low_actor(x[..., self.columns], z)
-
-
-def draw_rows(strategy: str, t: Tensor, last: Tensor, discount: float) -> Tensor:
-    """Draw rows from t to ``last`` by a strategy of `GoalSampler`, (n,)."""
-    step, end = t.numpy(), last.numpy() + 1
-    return torch.from_numpy(choose_steps(strategy, step, step, end, discount, None))
 
 
 def normalize_length(z: Tensor) -> Tensor:
