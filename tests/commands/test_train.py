@@ -16,11 +16,11 @@ from tests.devices import DEVICES
 from torch_panda.bullet import FAST
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
-from torch_panda.learning import curve, sources, training
+from torch_panda.learning import sources, training
 from torch_panda.learning.agents.base import LEARNING_RATE
-from torch_panda.learning.evaluation import evaluate_episodes
+from torch_panda.learning.environments.starts import states_at_objects
+from torch_panda.learning.evaluation import curve, evaluate_episodes
 from torch_panda.learning.options import Args, check, default_args
-from torch_panda.learning.starts import states_at_objects
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")

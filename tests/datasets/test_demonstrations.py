@@ -12,8 +12,8 @@ from tests.commands.runs import After, Kill, weights
 from torch_panda.commands.train import make_run
 from torch_panda.datasets.demonstrations import read_demos
 from torch_panda.learning import training
+from torch_panda.learning.files.policy_files import SavedPolicy
 from torch_panda.learning.options import Args
-from torch_panda.learning.policy_files import SavedPolicy
 
 pytestmark = pytest.mark.usefixtures("quick")
 

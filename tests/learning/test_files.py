@@ -12,9 +12,9 @@ import torch
 import torch_panda
 from torch_panda.commands import train
 from torch_panda.learning import files
+from torch_panda.learning.files.run_files import write_options
 from torch_panda.learning.options import Args
 from torch_panda.learning.plots import plot_curve
-from torch_panda.learning.run_files import write_options
 from torch_panda.policies import shipped_policies
 
 REACH = shipped_policies()["PandaReach-v1"]

@@ -12,8 +12,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import torch_panda
 from tests.learning.transitions import make_transitions
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
-from torch_panda.learning.policy_files import SavedPolicy, save_policy
-from torch_panda.learning.spaces import read_spaces
+from torch_panda.learning.environments.spaces import read_spaces
+from torch_panda.learning.files.policy_files import SavedPolicy, save_policy
 from torch_panda.policies import shipped_policies
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from tensordict import TensorDict, TensorDictBase
 
 from torch_panda.learning import files
-from torch_panda.learning.run_files import check_same
+from torch_panda.learning.files.run_files import check_same
 
 RECIPE = "recipe.json"  # file of the options that determine the data
 

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent, Hyperparameters, find_agent
 from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.spaces import Spaces, read_spaces
+from torch_panda.learning.environments.spaces import Spaces, read_spaces
 from torch_panda.policies import shipped_policies
 
 
