@@ -65,7 +65,7 @@ def test_one_flipped_bit_never_changes_a_policy(tmp_path):
 def test_policies_with_numbers_that_are_not_finite_are_refused(tmp_path, part, number):
     content = torch.load(REACH)
     if part == "policy":
-        content[part]["module.1.module.0.0.weight"][3, 2] = number
+        content[part]["actor"]["module.0.0.weight"][3, 2] = number
     else:
         content[part]["noise_eps"] = number
     path = tmp_path / "policy.pt"

@@ -122,6 +122,12 @@ class Agent(nn.Module, ABC):
             normalize, actor, *noise, *to_env_action
         )
 
+    @property
+    def policy_parts(self) -> dict[str, nn.Module]:
+        """The parts of `policy` that have weights, by their names in its file."""
+        # The type of a TensorDictSequential's modules is unknown to mypy.
+        return {"normalizer": self.normalizer, "actor": self.policy.module[1]}  # type: ignore[index,dict-item]
+
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None
     ) -> dict[str, Tensor]:
