@@ -63,7 +63,7 @@ class HIQL(Agent):
     ) -> None:
         super().__init__(spaces, hp)
         self.expectile, self.subgoal_steps = expectile, subgoal_steps
-        # The state of this class is the part of the network's inputs without the goal.
+        # s below is the part of the inputs that does not depend on the goal.
         columns = self.normalizer.state_columns
         state_size = len(columns)
         # phi(s, w), the values of waypoints and of goals, and targets of all three.
