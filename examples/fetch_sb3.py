@@ -46,7 +46,7 @@ def evaluate(model: BaseAlgorithm, env: gymnasium.Env) -> float:
     successes = 0
     for episode in range(EPISODES):
         observation, _ = env.reset(seed=episode)
-        is_over, info = False, {}
+        is_over = False
         while not is_over:
             action, _ = model.predict(observation, deterministic=True)
             observation, _, terminated, truncated, info = env.step(action)

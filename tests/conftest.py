@@ -36,7 +36,7 @@ def signals():
 def few_starts():
     """Choose the fixed evaluation tasks of every id from few starts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torch_panda.learning.evaluation_tasks.NUM_STARTS", 11)
+        patch.setattr("torch_panda.learning.evaluation.fixed_tasks.NUM_STARTS", 11)
         yield
 
 
@@ -62,7 +62,9 @@ def quick(monkeypatch):
 
     Signal handlers and numbers of threads are restored afterwards.
     """
-    from torch_panda.learning import curve, sources, starts, video
+    from torch_panda.learning import sources
+    from torch_panda.learning.environments import starts
+    from torch_panda.learning.evaluation import curve, video
 
     few_states = partial(starts.states_at_objects, number=8)
     monkeypatch.setattr(sources, "states_at_objects", few_states)

@@ -68,14 +68,14 @@ __all__ = [
 
 if TYPE_CHECKING:
     from torch_panda.learning.evaluation import evaluate
-    from torch_panda.learning.evaluation_tasks import evaluation_tasks
-    from torch_panda.learning.policy_files import load_policy
+    from torch_panda.learning.evaluation.fixed_tasks import evaluation_tasks
+    from torch_panda.learning.files.policy_files import load_policy
 
 # Imported at their first use: torchrl's losses take long to import.
 _MODULES = {
     "evaluate": "torch_panda.learning.evaluation",
-    "evaluation_tasks": "torch_panda.learning.evaluation_tasks",
-    "load_policy": "torch_panda.learning.policy_files",
+    "evaluation_tasks": "torch_panda.learning.evaluation.fixed_tasks",
+    "load_policy": "torch_panda.learning.files.policy_files",
 }
 
 

@@ -8,8 +8,8 @@ import torch
 from tests.commands.runs import read_curve
 from torch_panda import registry
 from torch_panda.commands import plot
-from torch_panda.learning import curve
-from torch_panda.learning.exploration import WARM_UP
+from torch_panda.learning.agents.exploration import WARM_UP
+from torch_panda.learning.evaluation import curve
 
 pytestmark = pytest.mark.slow
 ray = pytest.importorskip("ray")

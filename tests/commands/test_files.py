@@ -10,7 +10,7 @@ import torch_panda
 from torch_panda.commands import evaluate, train, watch
 from torch_panda.commands import record as record_demos
 from torch_panda.datasets.demonstrations import read_demos
-from torch_panda.learning import video
+from torch_panda.learning.evaluation import video
 
 
 def save(path, content):

@@ -8,9 +8,9 @@ import pytest
 
 from torch_panda.commands import plot
 from torch_panda.learning import plots
+from torch_panda.learning.files.run_files import write_options
 from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.recipes import find_changes
-from torch_panda.learning.run_files import write_options
 
 POINT = {"step": 0.5, "success": 0.5, "ever_success": 0.5, "return": -40.0}
 

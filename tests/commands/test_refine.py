@@ -11,7 +11,7 @@ import torch_panda
 from tests.commands.runs import After
 from torch_panda.commands import refine
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.policy_files import SavedPolicy, save_policy
+from torch_panda.learning.files.policy_files import SavedPolicy, save_policy
 from torch_panda.policies import shipped_policies
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -16,8 +16,8 @@ from torch_panda.bullet import FAST
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
 from torch_panda.learning.agents import OFFLINE_AGENTS
+from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.learning.options import default_args
-from torch_panda.learning.policy_files import save_policy
 
 pytestmark = pytest.mark.usefixtures("quick")
 

@@ -15,7 +15,7 @@ import pytest
 import torch_panda
 from torch_panda.commands import watch
 from torch_panda.experts import make_expert
-from torch_panda.learning import video
+from torch_panda.learning.evaluation import video
 
 
 @pytest.mark.parametrize("policy", ["random", "expert"])

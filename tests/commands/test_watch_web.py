@@ -9,7 +9,7 @@ import torch
 import torch_panda
 from torch_panda.commands import watch
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.policy_files import save_policy
+from torch_panda.learning.files.policy_files import save_policy
 
 
 @pytest.mark.slow

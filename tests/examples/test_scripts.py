@@ -19,7 +19,7 @@ from PIL import Image
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from torch_panda.learning.geometry import find_geometry, probe
+from torch_panda.learning.environments.geometry import find_geometry, probe
 from torch_panda.learning.user_modules import import_modules, read_modules
 from torch_panda.testing import check_task
 from torch_panda.transforms import HindsightRelabel

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.environments.spaces import Spaces
 
 # Small spaces without a task, so that tests need no physics.
 SPACES = Spaces(

@@ -6,9 +6,9 @@ import torch
 import torch_panda
 from tests.learning.transitions import make_transitions
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.augmentation import augment, mirror, shift
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.geometry import read_geometry
+from torch_panda.learning.agents.augmentation import augment, mirror, shift
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.environments.geometry import read_geometry
 
 
 @pytest.fixture(scope="module")

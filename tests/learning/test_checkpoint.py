@@ -11,9 +11,9 @@ import torch
 
 from tests.commands.runs import Kill, kill, points, weights
 from torch_panda.commands import train
-from torch_panda.learning import run_files
+from torch_panda.learning.files import run_files
+from torch_panda.learning.files.run_files import check_folder, lock_folder
 from torch_panda.learning.options import Args
-from torch_panda.learning.run_files import check_folder, lock_folder
 from torch_panda.learning.training import Run
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -8,7 +8,7 @@ import torch
 import torch_panda
 from tests.ids import PHYSICS_IDS
 from torch_panda import evaluation_tasks
-from torch_panda.learning.evaluation_tasks import _CHOSEN, QUANTILES
+from torch_panda.learning.evaluation.fixed_tasks import _CHOSEN, QUANTILES
 
 
 @pytest.mark.parametrize("env_id", PHYSICS_IDS[::8])

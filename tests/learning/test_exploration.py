@@ -7,7 +7,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
-from torch_panda.learning.exploration import RandomPointModule, make_random_points
+from torch_panda.learning.agents.exploration import (
+    RandomPointModule,
+    make_random_points,
+)
 
 NUM_ENVS = 64
 

@@ -12,9 +12,9 @@ import torch
 import torch_panda
 from torch_panda.commands import train
 from torch_panda.learning import files
+from torch_panda.learning.files.run_files import write_options
 from torch_panda.learning.options import Args
 from torch_panda.learning.plots import plot_curve
-from torch_panda.learning.run_files import write_options
 from torch_panda.policies import shipped_policies
 
 REACH = shipped_policies()["PandaReach-v1"]
@@ -65,7 +65,7 @@ def test_one_flipped_bit_never_changes_a_policy(tmp_path):
 def test_policies_with_numbers_that_are_not_finite_are_refused(tmp_path, part, number):
     content = torch.load(REACH)
     if part == "policy":
-        content[part]["module.1.module.0.0.weight"][3, 2] = number
+        content[part]["actor"]["module.0.0.weight"][3, 2] = number
     else:
         content[part]["noise_eps"] = number
     path = tmp_path / "policy.pt"

@@ -15,7 +15,11 @@ from torch_panda.experts.cube_orientations import (
     to_matrix,
 )
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.geometry import find_geometry, probe, read_geometry
+from torch_panda.learning.environments.geometry import (
+    find_geometry,
+    probe,
+    read_geometry,
+)
 from torch_panda.rotations import rotation_distance
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)

@@ -18,8 +18,8 @@ from torch_panda.commands import evaluate, main, train, watch
 from torch_panda.commands.train import parse
 from torch_panda.datasets import generate, sha256
 from torch_panda.learning.environments import is_from_gymnasium, make_env
-from torch_panda.learning.geometry import find_geometry, find_hand, probe
-from torch_panda.learning.gym_goal_env import GymGoalEnv
+from torch_panda.learning.environments.geometry import find_geometry, find_hand, probe
+from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
 from torch_panda.learning.options import default_args
 from torch_panda.learning.training import Run
 

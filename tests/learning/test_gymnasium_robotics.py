@@ -4,10 +4,10 @@ import pytest
 
 from torch_panda.commands import train
 from torch_panda.commands.train import parse
+from torch_panda.learning.environments.geometry import find_geometry, find_hand, probe
+from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
 from torch_panda.learning.evaluation import evaluate
-from torch_panda.learning.geometry import find_geometry, find_hand, probe
-from torch_panda.learning.gym_goal_env import GymGoalEnv
-from torch_panda.learning.policy_files import load_policy
+from torch_panda.learning.files.policy_files import load_policy
 
 pytest.importorskip("gymnasium_robotics")
 pytestmark = pytest.mark.slow

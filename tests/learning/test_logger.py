@@ -5,7 +5,7 @@ import csv
 import pytest
 
 from torch_panda.commands import train
-from torch_panda.learning import logger as logger_module
+from torch_panda.learning.files import logger as logger_module
 from torch_panda.learning.options import Args
 from torch_panda.learning.training import Run
 

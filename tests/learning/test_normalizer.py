@@ -7,10 +7,10 @@ import torch_panda
 from tests.learning.episodes import play_randomly
 from tests.learning.gradient_steps import SPACES
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.geometry import read_geometry
-from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.agents.normalizer import Normalizer
+from torch_panda.learning.environments.geometry import read_geometry
+from torch_panda.learning.environments.spaces import read_spaces
 from torch_panda.learning.options import Args, default_args
-from torch_panda.learning.spaces import read_spaces
 from torch_panda.learning.training import Run
 
 

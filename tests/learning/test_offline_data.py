@@ -8,11 +8,11 @@ import torch_panda
 from tests.learning.episodes import play_randomly
 from tests.learning.gradient_steps import SPACES
 from torch_panda.learning.agents import Hyperparameters, find_agent
+from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.hiql import HIQL
-from torch_panda.learning.batch import Batch
 from torch_panda.learning.buffers import STORED_KEYS
+from torch_panda.learning.environments.spaces import read_spaces
 from torch_panda.learning.offline_data import OfflineData
-from torch_panda.learning.spaces import read_spaces
 
 MIXTURE = {"current": 0.2, "geometric": 0.5, "random": 0.3}  # OGBench's
 GOALS = {"value_goal": MIXTURE, "actor_goal": "future"}

@@ -15,8 +15,12 @@ from tests.learning.gradient_steps import (
     fill_normalizer,
     parameters_of,
 )
-from torch_panda.learning import networks
-from torch_panda.learning.agents import OFFLINE_AGENTS, Hyperparameters, find_agent
+from torch_panda.learning.agents import (
+    OFFLINE_AGENTS,
+    Hyperparameters,
+    find_agent,
+    networks,
+)
 from torch_panda.learning.agents.qrl import INTERVALS, IQE
 
 LEARNING_RATE = 3e-4

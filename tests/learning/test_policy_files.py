@@ -1,8 +1,11 @@
 """Trained policies as files: shipped ones, those of runs, and how they act."""
 
+import hashlib
+import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,9 +15,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import torch_panda
 from tests.learning.transitions import make_transitions
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
-from torch_panda.learning.policy_files import SavedPolicy, save_policy
-from torch_panda.learning.spaces import read_spaces
+from torch_panda.learning.environments.spaces import read_spaces
+from torch_panda.learning.files.policy_files import SavedPolicy, save_policy
 from torch_panda.policies import shipped_policies
+
+HASHES = Path(__file__).with_name("policies.json")
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +112,18 @@ def test_a_policy_of_an_unregistered_id_loads(tmp_path):
     policy = torch_panda.load_policy(str(tmp_path))
     assert policy.env_id == "Nowhere-v0"
     assert policy(inputs(policy.spaces, 2))["action"].shape == (2, 4)
+
+
+def test_the_weights_of_shipped_policies_are_the_published_ones():
+    """So a change of the files' format keeps every action, bit for bit."""
+    hashes = {}
+    for env_id, path in shipped_policies().items():
+        weights = SavedPolicy.read(path).weights
+        content = hashlib.sha256()
+        for values in (*weights["normalizer"].values(), *weights["actor"].values()):
+            content.update(values.numpy().tobytes())
+        hashes[env_id] = content.hexdigest()
+    assert hashes == json.loads(HASHES.read_text())
 
 
 LOAD = """

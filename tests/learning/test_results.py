@@ -11,9 +11,9 @@ import pytest
 from torch_panda.commands import refine
 from torch_panda.commands.train import parse
 from torch_panda.learning.evaluation import wilson_interval
+from torch_panda.learning.files.run_files import fixed_options
 from torch_panda.learning.options import Args
 from torch_panda.learning.recipes import RECIPE
-from torch_panda.learning.run_files import fixed_options
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "examples" / "results"

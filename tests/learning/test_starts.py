@@ -7,7 +7,11 @@ import torch
 from torchrl.envs import TransformedEnv
 
 import torch_panda
-from torch_panda.learning.starts import PLACED_KEYS, StartFrom, states_at_objects
+from torch_panda.learning.environments.starts import (
+    PLACED_KEYS,
+    StartFrom,
+    states_at_objects,
+)
 
 NUM_ENVS = 8
 
@@ -161,6 +165,6 @@ def test_states_at_objects_need_objects_and_end_effector_control(env_id):
 
 
 def test_a_hand_that_reaches_no_object_is_an_error(monkeypatch):
-    monkeypatch.setattr("torch_panda.learning.starts.SCRIPT_STEPS", 1)
+    monkeypatch.setattr("torch_panda.learning.environments.starts.SCRIPT_STEPS", 1)
     with pytest.raises(ValueError, match="hand of PandaPush-v1 reaches no object"):
         states_at_objects("PandaPush-v1", seed=0, number=2)

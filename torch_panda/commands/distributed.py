@@ -32,15 +32,15 @@ from tqdm import tqdm
 import torch_panda
 from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
-from torch_panda.learning.curve import Curve, draw_seed
-from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
-from torch_panda.learning.options import CRL_OPTIONS, check_exploration
-from torch_panda.learning.run_files import (
+from torch_panda.learning.evaluation.curve import Curve, draw_seed
+from torch_panda.learning.files.run_files import (
     Progress,
     check_folder,
     lock_folder,
     write_options,
 )
+from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
+from torch_panda.learning.options import CRL_OPTIONS, check_exploration
 from torch_panda.learning.training import StopSignal, crossed
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 

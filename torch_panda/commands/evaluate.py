@@ -15,8 +15,8 @@ from torch import Tensor
 from torch_panda.bullet import PhysicsName
 from torch_panda.learning.environments import is_from_gymnasium
 from torch_panda.learning.evaluation import Tasks, evaluate, wilson_interval
+from torch_panda.learning.files.policy_files import load_policy
 from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 
 

@@ -29,16 +29,16 @@ import torch_panda
 from torch_panda.datasets.recording import play
 from torch_panda.learning.agents import AGENTS
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
-from torch_panda.learning.curve import Curve, reseed
-from torch_panda.learning.limits import Positive, Seed, check_limits
-from torch_panda.learning.policy_files import SavedPolicy
-from torch_panda.learning.run_files import (
+from torch_panda.learning.evaluation.curve import Curve, reseed
+from torch_panda.learning.files.policy_files import SavedPolicy
+from torch_panda.learning.files.run_files import (
     Checkpoint,
     Progress,
     check_folder,
     lock_folder,
     write_options,
 )
+from torch_panda.learning.limits import Positive, Seed, check_limits
 from torch_panda.learning.training import SAVE_INTERVAL, StopSignal, crossed
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
 

@@ -24,7 +24,14 @@ from torch_panda.datasets import generate, read_demos, sha256
 from torch_panda.learning import files
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.environments import is_from_gymnasium, make_env
-from torch_panda.learning.geometry import declares_layout
+from torch_panda.learning.environments.geometry import declares_layout
+from torch_panda.learning.environments.spaces import Spaces
+from torch_panda.learning.evaluation.video import record
+from torch_panda.learning.files.run_files import (
+    check_folder,
+    lock_folder,
+    write_options,
+)
 from torch_panda.learning.options import (
     KINDS,
     ArgGroups,
@@ -32,15 +39,8 @@ from torch_panda.learning.options import (
     check,
     default_args,
 )
-from torch_panda.learning.run_files import (
-    check_folder,
-    lock_folder,
-    write_options,
-)
-from torch_panda.learning.spaces import Spaces
 from torch_panda.learning.training import Run, StopSignal
 from torch_panda.learning.user_modules import import_modules, read_modules
-from torch_panda.learning.video import record
 from torch_panda.registry import find_registration
 from torch_panda.testing import check_task
 

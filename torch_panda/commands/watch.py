@@ -20,10 +20,10 @@ from torchrl.envs.utils import RandomPolicy
 import torch_panda
 from torch_panda.experts import make_expert
 from torch_panda.learning.environments import make_env, refusal
+from torch_panda.learning.evaluation.video import FPS, play, record
+from torch_panda.learning.files.policy_files import load_policy
 from torch_panda.learning.limits import Port, Positive, Seed, check_limits
-from torch_panda.learning.policy_files import load_policy
 from torch_panda.learning.user_modules import Imports, import_modules, read_modules
-from torch_panda.learning.video import FPS, play, record
 
 CAMERA = torch_panda.Camera(distance=1.1)  # view at the start in a browser
 

@@ -9,8 +9,8 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import AdditiveGaussianModule
 
 import torch_panda
+from torch_panda.learning.evaluation.rollouts import play_episodes
 from torch_panda.learning.files import prepare, save
-from torch_panda.learning.rollouts import play_episodes
 
 
 class TensorWriter:

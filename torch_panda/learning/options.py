@@ -9,9 +9,10 @@ from typing_extensions import Self
 from torch_panda.bullet import PhysicsName
 from torch_panda.checks import check_device
 from torch_panda.learning.agents import find_agent
+from torch_panda.learning.agents.hyperparameters import Algo, Hyperparameters
 from torch_panda.learning.buffers import Hindsight
 from torch_panda.learning.environments import is_from_gymnasium, refusal
-from torch_panda.learning.hyperparameters import Algo, Hyperparameters
+from torch_panda.learning.files.logger import LoggerName, check_logger
 from torch_panda.learning.limits import (
     Count,
     Factor,
@@ -22,7 +23,6 @@ from torch_panda.learning.limits import (
     Weight,
     check_limits,
 )
-from torch_panda.learning.logger import LoggerName, check_logger
 from torch_panda.learning.recipes import OFFLINE, find_recipe
 from torch_panda.learning.user_modules import Imports
 

@@ -10,8 +10,8 @@ from dataclasses import asdict
 from typing import Any
 
 from torch_panda.learning.environments import GoalEnv, is_from_gymnasium
-from torch_panda.learning.geometry import declares_layout, find_layout
-from torch_panda.learning.gym_goal_env import GymGoalEnv
+from torch_panda.learning.environments.geometry import declares_layout, find_layout
+from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
 from torch_panda.registry import Registration, find_registration
 
 # The same for all tasks. `derive_options` adds what follows from the task.

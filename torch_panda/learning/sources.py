@@ -12,11 +12,11 @@ from torchrl.envs.utils import ExplorationType
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.buffers import make_buffer, select_sequences
-from torch_panda.learning.curve import reseed
 from torch_panda.learning.environments import GoalEnv
+from torch_panda.learning.environments.starts import StartFrom, states_at_objects
+from torch_panda.learning.evaluation.curve import reseed
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import DEMO_RATIO, Args
-from torch_panda.learning.starts import StartFrom, states_at_objects
 
 # With ``--start-at-object``, each environment takes at most this number of steps in an
 # iteration. Episodes that start in the middle of the task need no more. The limit also

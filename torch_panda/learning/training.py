@@ -25,11 +25,11 @@ from tqdm import tqdm
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.randomization import Randomization
 from torch_panda.learning.agents import make_agent
-from torch_panda.learning.curve import NUM_ENVS, Curve
 from torch_panda.learning.environments import GoalEnv, make_env
-from torch_panda.learning.logger import make_logger
+from torch_panda.learning.evaluation.curve import NUM_ENVS, Curve
+from torch_panda.learning.files.logger import make_logger
+from torch_panda.learning.files.run_files import Checkpoint, Progress
 from torch_panda.learning.options import Args
-from torch_panda.learning.run_files import Checkpoint, Progress
 from torch_panda.learning.sources import DataSet, Experience
 
 # Steps between two saves, including gradient steps of imitation.

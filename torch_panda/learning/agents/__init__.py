@@ -9,12 +9,12 @@ from torch_panda.learning.agents.gcbc import GCBC
 from torch_panda.learning.agents.gciql import GCIQL
 from torch_panda.learning.agents.gcivl import GCIVL
 from torch_panda.learning.agents.hiql import HIQL
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
 from torch_panda.learning.agents.qrl import QRL
 from torch_panda.learning.agents.sac import SAC
 from torch_panda.learning.agents.td3 import TD3
 from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.spaces import read_spaces
+from torch_panda.learning.environments.spaces import read_spaces
 
 AGENTS: dict[str, type[Agent]] = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "crl": CRL}
 """Agents that explore, by name."""

@@ -12,12 +12,12 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torch_panda.learning.augmentation import augment
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.normalizer import Normalizer
+from torch_panda.learning.agents.augmentation import augment
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.normalizer import Normalizer
+from torch_panda.learning.environments.spaces import Spaces
 from torch_panda.learning.offline_data import OfflineData
-from torch_panda.learning.spaces import Spaces
 from torch_panda.transforms.strategies import StrategyOption
 
 POLICY_INPUTS: list[NestedKey] = ["observation", "desired_goal"]
@@ -121,6 +121,12 @@ class Agent(nn.Module, ABC):
         self.explore = TensorDictSequential(  # type: ignore[call-overload]
             normalize, actor, *noise, *to_env_action
         )
+
+    @property
+    def policy_parts(self) -> dict[str, nn.Module]:
+        """The parts of `policy` that have weights, by their names in its file."""
+        # The type of a TensorDictSequential's modules is unknown to mypy.
+        return {"normalizer": self.normalizer, "actor": self.policy.module[1]}  # type: ignore[index,dict-item]
 
     def update(
         self, batch: TensorDictBase, demos: TensorDictBase | None = None

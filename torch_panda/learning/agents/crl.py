@@ -23,18 +23,18 @@ from torch.nn import functional
 from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.ddpg import action_penalty
+from torch_panda.learning.agents.exploration import make_noise
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ascend_and_imitate,
     log_prob,
     make_mean_policy,
 )
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.exploration import make_noise
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.environments.spaces import Spaces
 
 LATENT_SIZE = 64  # size of phi and psi
 LOGSUMEXP_WEIGHT = 0.1  # JaxGCRL's weight of the penalty in the critic's loss

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.agents.base import Agent
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.exploration import make_noise
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import Ensemble, make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.exploration import make_noise
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import Ensemble, make_mlp
+from torch_panda.learning.environments.spaces import Spaces
 
 # Weight of the squared inputs of the actor's tanh in its loss. Without this penalty the
 # inputs can grow until the gradient of the tanh vanishes, which ruined policies of

@@ -9,15 +9,15 @@ later.
 from torch import Tensor
 
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     log_prob,
     make_mean_policy,
 )
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.environments.spaces import Spaces
 
 
 class GCBC(Agent):

@@ -12,6 +12,9 @@ from torch import Tensor
 from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import Ensemble, make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ascend_and_imitate,
@@ -19,10 +22,7 @@ from torch_panda.learning.agents.offline_losses import (
     log_prob,
     make_mean_policy,
 )
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import Ensemble, make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.environments.spaces import Spaces
 
 
 class GCIQL(Agent):

@@ -15,6 +15,9 @@ import torch
 from torch import Tensor
 
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import Ensemble, make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ensemble_loss,
@@ -22,10 +25,7 @@ from torch_panda.learning.agents.offline_losses import (
     make_mean_policy,
     weighted_regression,
 )
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import Ensemble, make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.environments.spaces import Spaces
 
 
 class GCIVL(Agent):

@@ -20,6 +20,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import Ensemble, make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ensemble_loss,
@@ -27,11 +30,8 @@ from torch_panda.learning.agents.offline_losses import (
     make_mean_policy,
     weighted_regression,
 )
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import Ensemble, make_mlp
+from torch_panda.learning.environments.spaces import Spaces
 from torch_panda.learning.offline_data import OfflineData
-from torch_panda.learning.spaces import Spaces
 from torch_panda.transforms.strategies import StrategyOption
 
 REP_SIZE = 10  # size of the representation of a waypoint
@@ -63,7 +63,7 @@ class HIQL(Agent):
     ) -> None:
         super().__init__(spaces, hp)
         self.expectile, self.subgoal_steps = expectile, subgoal_steps
-        # The state of this class is the part of the network's inputs without the goal.
+        # s below is the part of the inputs that does not depend on the goal.
         columns = self.normalizer.state_columns
         state_size = len(columns)
         # phi(s, w), the values of waypoints and of goals, and targets of all three.

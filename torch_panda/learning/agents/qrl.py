@@ -23,16 +23,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torch_panda.learning.agents.base import Agent
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     log_prob,
     make_mean_policy,
     weighted_regression,
 )
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.environments.spaces import Spaces
 
 INTERVALS = 8  # intervals in each component of the quasimetric
 # As in the paper's code: root mean square by which the cost of a step may exceed 1, and

@@ -7,11 +7,11 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
 from torch_panda.learning.agents.base import Agent
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.exploration import make_random_points
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.networks import make_mlp
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.exploration import make_random_points
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.agents.networks import make_mlp
+from torch_panda.learning.environments.spaces import Spaces
 
 ALPHA = 0.2  # entropy coefficient, which is not trained
 

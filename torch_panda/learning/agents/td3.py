@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from torch_panda.learning.agents.ddpg import DDPG
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.environments.spaces import Spaces
 
 POLICY_NOISE = 0.2  # standard deviation of the noise on target actions
 NOISE_CLIP = 0.5  # limit at which this noise is clipped

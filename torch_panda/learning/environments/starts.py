@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Transform
 
 from torch_panda.experts.moves import carry, go_over, is_held, norm
-from torch_panda.learning.geometry import read_geometry
+from torch_panda.learning.environments.geometry import read_geometry
 from torch_panda.registry import make
 from torch_panda.rotations import NO_ROTATION
 from torch_panda.tasks import Flip, Push, Slide, Stack

@@ -25,8 +25,7 @@ class Hyperparameters:
     offline: bool = False
     """learn from a data set instead of an environment"""
     double_q: bool = True
-    """TD3, SAC: learn two critics, and use the smaller value as target. DDPG and CRL
-    always have one critic"""
+    """TD3, SAC: learn two critics, and use the smaller value as target"""
     gamma: Discount | None = None
     """discount factor; None means 1 - 1 / (steps of an episode), as in OpenAI
     Baselines"""

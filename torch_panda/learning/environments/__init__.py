@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import gymnasium
 
 from torch_panda.envs import RobotTaskEnv
-from torch_panda.learning.gym_goal_env import GymGoalEnv
+from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
 from torch_panda.registry import (
     find_registration,
     is_registered,

@@ -13,9 +13,9 @@ from torch_panda.learning.evaluation import (
     evaluate_episodes,
     evaluate_fixed_starts,
 )
-from torch_panda.learning.evaluation_tasks import evaluation_tasks
-from torch_panda.learning.logger import close_logger
-from torch_panda.learning.run_files import Checkpoint, Progress, write_results
+from torch_panda.learning.evaluation.fixed_tasks import evaluation_tasks
+from torch_panda.learning.files.logger import close_logger
+from torch_panda.learning.files.run_files import Checkpoint, Progress, write_results
 
 EPISODES = 80  # episodes of each evaluation
 NUM_ENVS = 16  # environments that run these episodes in parallel

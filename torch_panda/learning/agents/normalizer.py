@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from torch_panda.learning.hyperparameters import RelativeInputs
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.agents.hyperparameters import RelativeInputs
+from torch_panda.learning.environments.spaces import Spaces
 
 CLIP_OBSERVATION = 200.0  # from the panda-gym paper
 CLIP_NORMALIZED = 5.0  # from the HER of OpenAI Baselines

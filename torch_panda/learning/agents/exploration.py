@@ -17,8 +17,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 
-from torch_panda.learning.hyperparameters import Hyperparameters
-from torch_panda.learning.spaces import Spaces
+from torch_panda.learning.agents.hyperparameters import Hyperparameters
+from torch_panda.learning.environments.spaces import Spaces
 
 # Two corners of the box from which points are drawn, in the world frame [m]. The box is
 # around the origin, where the objects start.

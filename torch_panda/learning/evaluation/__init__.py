@@ -13,8 +13,8 @@ from torch import Tensor
 from torch_panda.checks import check_positive
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.environments import GoalEnv, make_env, refusal
-from torch_panda.learning.evaluation_tasks import evaluation_tasks
-from torch_panda.learning.rollouts import Policy, play_episodes
+from torch_panda.learning.evaluation.fixed_tasks import evaluation_tasks
+from torch_panda.learning.evaluation.rollouts import Policy, play_episodes
 
 Tasks = Literal["random", "fixed"]
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torch_panda.learning.hyperparameters import Network
+from torch_panda.learning.agents.hyperparameters import Network
 
 # Units of each hidden layer.
 HIDDEN_SIZE = 256  # as in the panda-gym paper

@@ -28,8 +28,8 @@ from torchrl.data import ReplayBuffer
 
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent
+from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.learning.plots import plot_curve
-from torch_panda.learning.policy_files import save_policy
 from torch_panda.learning.recipes import find_changes
 
 LOCK, PROCESS, OPTIONS = "run.lock", "process.txt", "args.json"
@@ -119,7 +119,7 @@ class Checkpoint:
         """
         keys = (
             *("args", "agent", "optimizer", "updates", "buffer"),
-            *("random", "cuda_random", "progress"),
+            *("data_hash", "random", "cuda_random", "progress"),
         )
         finite = ("agent", "optimizer")
         path = self.out / STATE
@@ -134,8 +134,7 @@ class Checkpoint:
         if steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps
         check_same(self.out, saved, options)
-        # Runs of earlier versions saved no hash under this key.
-        data_hash = state.get("data_hash", self.data_hash)
+        data_hash = state["data_hash"]
         if data_hash != self.data_hash:
             raise ValueError(
                 "cannot resume with other data: the run learned from data with the "

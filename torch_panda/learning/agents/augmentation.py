@@ -8,9 +8,9 @@ Invariant Transform Experience Replay (arXiv 1909.10707).
 import torch
 from torch import Tensor
 
-from torch_panda.learning.batch import Batch
-from torch_panda.learning.geometry import Geometry
-from torch_panda.learning.hyperparameters import AugmentationKind
+from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.hyperparameters import AugmentationKind
+from torch_panda.learning.environments.geometry import Geometry
 
 SHIFT = 0.15  # largest shift along x and y [m]
 

@@ -14,7 +14,7 @@ from typing_extensions import Self
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.geometry import (
+from torch_panda.learning.environments.geometry import (
     Geometry,
     find_geometry,
     find_layout,

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent, Hyperparameters, find_agent
 from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.spaces import Spaces, read_spaces
+from torch_panda.learning.environments.spaces import Spaces, read_spaces
 from torch_panda.policies import shipped_policies
 
 
@@ -71,14 +71,14 @@ class SavedPolicy:
         env_id: Id of the environment that the policy was trained on.
         hp: Hyperparameters of the agent.
         spaces: Sizes and layout of observations, goals and actions.
-        weights: State dict of `Agent.policy`.
+        weights: State dict of each of `Agent.policy_parts`, by name.
     """
 
     path: Path
     env_id: str
     hp: Hyperparameters
     spaces: Spaces
-    weights: Mapping[str, Tensor]
+    weights: Mapping[str, Mapping[str, Tensor]]
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -130,8 +130,9 @@ class SavedPolicy:
         with torch.device("cpu"):
             agent = find_agent(self.hp)(spaces, self.hp)
         try:
-            agent.policy.load_state_dict(self.weights)
-        except RuntimeError:
+            for name, part in agent.policy_parts.items():
+                part.load_state_dict(self.weights[name])
+        except (KeyError, RuntimeError):
             raise ValueError(
                 f"{self.path} does not hold a policy, or is damaged: its weights do "
                 "not fit its hyperparameters"
@@ -174,7 +175,9 @@ def save_policy(path: Path, agent: Agent, env_id: str) -> None:
         "env_id": env_id,
         "hyperparameters": hp,
         "spaces": asdict(agent.spaces),
-        "policy": agent.policy.state_dict(),
+        "policy": {
+            name: part.state_dict() for name, part in agent.policy_parts.items()
+        },
     }
     files.save(path, content)
 
