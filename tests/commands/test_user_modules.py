@@ -7,7 +7,7 @@ import pytest
 import torch_panda
 from torch_panda import registry
 from torch_panda.commands import main, plot
-from torch_panda.learning.user_modules import import_modules, read_modules
+from torch_panda.learning.user_modules import import_modules
 
 MODULE = """
 import torch_panda
@@ -36,7 +36,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_module_is_imported_by_its_name(folder):
-    import_modules(read_modules(["near_task"]))
+    import_modules(["near_task"])
     assert torch_panda.max_episode_steps("Near-v0") == 10
 
 

@@ -20,7 +20,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from torch_panda.learning.environments.geometry import find_geometry, probe
-from torch_panda.learning.user_modules import import_modules, read_modules
+from torch_panda.learning.user_modules import import_modules
 from torch_panda.testing import check_task
 from torch_panda.transforms import HindsightRelabel
 
@@ -135,7 +135,7 @@ def test_the_arm_of_own_task_moves_the_balls():
     ],
 )
 def test_the_layout_of_each_own_task_is_found(name, env_id, num_objects):
-    import_modules(read_modules([str(ROOT / "examples" / "own_tasks" / f"{name}.py")]))
+    import_modules([str(ROOT / "examples" / "own_tasks" / f"{name}.py")])
     check_task(env_id)
     with torch_panda.make(env_id, num_envs=4, seed=0) as env:
         geometry = find_geometry(probe(env))

@@ -35,7 +35,7 @@ from torch_panda.bullet.pool import num_cores
 from torch_panda.bullet.solver import SOLVER_VARIABLE
 from torch_panda.learning import files
 from torch_panda.learning.limits import Positive, check_limits
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 
 @dataclass(frozen=True)
@@ -347,7 +347,7 @@ def measure(name: str, setting: Setting, steps: int) -> Measurement:
 
 def _measure_here(name: str, setting: Setting, steps: int) -> Measurement:
     torch.set_num_threads(1)
-    import_modules(read_modules(setting.imports))
+    import_modules(setting.imports)
     # pybullet prints on stdout whenever it loads a robot.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     contender = CONTENDERS[name]
@@ -535,7 +535,7 @@ def run(arguments: Sequence[str]) -> None:
     """
     args = tyro.cli(Args, args=arguments, prog="python -m torch_panda bench")
     try:
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         check(args)
     except (ValueError, OSError) as error:
         sys.exit(str(error))

@@ -42,7 +42,7 @@ from torch_panda.learning.files.run_files import (
 from torch_panda.learning.limits import Positive, Seed, Weight, check_limits
 from torch_panda.learning.options import CRL_OPTIONS, check_exploration
 from torch_panda.learning.training import StopSignal, crossed
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 TRAJECTORY_KEY = ("collector", "traj_ids")
 
@@ -180,7 +180,7 @@ def make_env(args: Args, seed: int) -> torch_panda.RobotTaskEnv:
     """Make a worker's environments, and seed them and its exploration noise."""
     # Ray has copied the files of a user into a folder of `sys.path`.
     names = [Path(x).stem if x.endswith(".py") else x for x in args.imports]
-    import_modules(read_modules(names))
+    import_modules(names)
     torch.manual_seed(seed)
     return torch_panda.make(
         args.env_id,
@@ -254,7 +254,7 @@ def main(args: Args) -> None:
     out = args.out or Path(f"runs/{args.env_id}-{args.algo}-distributed-{args.seed}")
     try:
         check_limits(args)
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         check_exploration(args, args.num_envs)
         if args.offline:
             raise ValueError("distributed learns in environments: drop --offline")

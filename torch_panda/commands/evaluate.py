@@ -17,7 +17,7 @@ from torch_panda.learning.environments import is_from_gymnasium
 from torch_panda.learning.evaluation import Tasks, evaluate, wilson_interval
 from torch_panda.learning.files.policy_files import load_policy
 from torch_panda.learning.limits import Finite, Positive, Seed, check_limits
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 
 @dataclass
@@ -52,7 +52,7 @@ def main(args: Args) -> None:
     """Print success rates and return, with 95 % intervals."""
     try:
         check_limits(args)
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         policy = load_policy(args.run)
         env_id = args.env_id or policy.env_id
         result = evaluate(

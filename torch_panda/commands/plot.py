@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from torch_panda.learning.plots import Metric, plot_panels, read_runs
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 
 @dataclass
@@ -32,7 +32,7 @@ def main(args: Args) -> None:
     """Draw the runs."""
     out = args.out.with_suffix(args.out.suffix or ".png")
     try:
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         out.parent.mkdir(parents=True, exist_ok=True)
         plot_panels(read_runs(args.runs), args.metric, out)
     except (ValueError, OSError) as error:

@@ -37,7 +37,7 @@ from torch_panda.datasets.recording import TensorWriter, add_noise, play
 from torch_panda.experts import make_expert
 from torch_panda.learning.files import prepare, save
 from torch_panda.learning.limits import Finite, Positive, Seed, Weight, check_limits
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 # Keys of pictures. The hash does not include them.
 PIXELS = ("pixels", ("next", "pixels"))
@@ -152,7 +152,7 @@ def main(args: Args) -> None:
     """Record, and print what was recorded."""
     try:
         check(args)
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         if args.kind == "expert":
             record_demonstrations(args)
         else:

@@ -40,7 +40,7 @@ from torch_panda.learning.files.run_files import (
 )
 from torch_panda.learning.limits import Positive, Seed, check_limits
 from torch_panda.learning.training import SAVE_INTERVAL, StopSignal, crossed
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 LEARNING_RATE = 0.3  # first learning rate, as a fraction of the rate of training
 
@@ -239,7 +239,7 @@ def main(args: Args) -> None:
     """Refine, and print where the results are."""
     try:
         check_limits(args)
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         check_folder(args.out, resume=args.resume)
         run = Refinement(args)
         default = Args(args.policy, args.out, env_id=args.env_id)

@@ -40,7 +40,7 @@ from torch_panda.learning.options import (
     default_args,
 )
 from torch_panda.learning.training import Run, StopSignal
-from torch_panda.learning.user_modules import import_modules, read_modules
+from torch_panda.learning.user_modules import import_modules
 from torch_panda.registry import find_registration
 from torch_panda.testing import check_task
 
@@ -60,7 +60,7 @@ def parse(arguments: Sequence[str]) -> Args:
     without_help = [x for x in arguments if x not in ("-h", "--help")]
     recipe = Args(preset="recipe")
     first = tyro.cli(Args, prog=PROG, args=without_help, default=recipe)
-    import_modules(read_modules(first.imports))
+    import_modules(first.imports)
     names = [x.split("=")[0].replace("_", "-") for x in arguments]
     if first.offline and "--preset" not in names:
         first.preset = "offline"

@@ -23,7 +23,7 @@ from torch_panda.learning.environments import make_env, refusal
 from torch_panda.learning.evaluation.video import FPS, play, record
 from torch_panda.learning.files.policy_files import load_policy
 from torch_panda.learning.limits import Port, Positive, Seed, check_limits
-from torch_panda.learning.user_modules import Imports, import_modules, read_modules
+from torch_panda.learning.user_modules import Imports, import_modules
 
 CAMERA = torch_panda.Camera(distance=1.1)  # view at the start in a browser
 
@@ -133,7 +133,7 @@ def main(args: Args) -> None:
             raise ValueError(
                 "human and web show the episodes in different places: pass one of them"
             )
-        import_modules(read_modules(args.imports))
+        import_modules(args.imports)
         torch.manual_seed(args.seed)
         trained = None
         if args.policy not in ("random", "expert"):

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import tyro
 
@@ -17,67 +17,40 @@ Imports = Annotated[
 """The type of the option ``--import``, which may be given several times."""
 
 
-class UserModule(NamedTuple):
-    """A module to import, in this process or in another one.
+def import_modules(names: Iterable[str]) -> None:
+    """Import the arguments of ``--import``, also from the current folder.
 
-    Attributes:
-        name: Dotted name of a module, or path of a .py file.
-        source: Content of the .py file, so that other machines can run it without the
-            file. None for the name of a module.
-    """
-
-    name: str
-    source: str | None
-
-
-def read_modules(names: Iterable[str]) -> tuple[UserModule, ...]:
-    """Read the files among the arguments of ``--import``.
+    A .py file becomes a module that is named after it, so that its classes can be
+    pickled. An error inside a module is not caught.
 
     Raises:
-        ValueError: A file does not exist or is not text.
-    """
-    modules = []
-    for name in names:
-        source = None
-        if name.endswith(".py"):
-            try:
-                source = Path(name).read_text()
-            except (OSError, UnicodeDecodeError) as error:
-                raise ValueError(f"cannot import the file {name}: {error}") from None
-        modules.append(UserModule(name, source))
-    return tuple(modules)
-
-
-def import_modules(modules: Iterable[UserModule]) -> None:
-    """Import modules in this process, also from the current folder.
-
-    A file becomes a module that is named after it, so that its classes can be pickled.
-    An error inside a module is not caught.
-
-    Raises:
-        ValueError: There is no module of that name, or a file would replace a module
+        ValueError: There is no such module or file, or a file would replace a module
             that is loaded.
     """
     folder = str(Path.cwd())
     if folder not in sys.path:  # a console script has its own folder there instead
         sys.path.insert(0, folder)
-    for name, source in modules:
-        if source is None:
-            try:
-                importlib.import_module(name)
-            except ModuleNotFoundError as error:
-                if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-                    raise  # the user's module exists, but imports a missing module
-                raise ValueError(
-                    f"cannot import {name!r}: there is no such module; --import takes "
-                    "the name of a module or the path of a .py file"
-                ) from None
-        else:
-            _run_file(name, source)
+    for name in names:
+        if name.endswith(".py"):
+            _run_file(name)
+            continue
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+                raise  # the user's module exists, but imports a missing module
+            raise ValueError(
+                f"cannot import {name!r}: there is no such module; --import takes "
+                "the name of a module or the path of a .py file"
+            ) from None
 
 
-def _run_file(file: str, source: str) -> None:
+def _run_file(file: str) -> None:
     """Run a file as a module. The file itself may have been loaded before."""
+    try:
+        source = Path(file).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot import the file {file}: {error}") from None
     name = Path(file).stem
     if name in sys.modules:
         loaded = getattr(sys.modules[name], "__file__", None)
