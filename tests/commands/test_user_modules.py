@@ -40,6 +40,12 @@ def test_a_module_is_imported_by_its_name(folder):
     assert torch_panda.max_episode_steps("Near-v0") == 10
 
 
+def test_a_missing_library_is_refused_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+    with pytest.raises(ValueError, match="it comes with the extra 'fetch'"):
+        import_modules(["gymnasium_robotics"])
+
+
 @pytest.mark.usefixtures("quick")
 def test_a_registered_task_is_trained_evaluated_watched_and_plotted(folder, capsys):
     module = "near_task.py"

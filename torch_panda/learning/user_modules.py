@@ -9,6 +9,8 @@ from typing import Annotated
 
 import tyro
 
+from torch_panda.extras import explain_missing
+
 Imports = Annotated[
     tuple[str, ...],
     tyro.conf.arg(name="import", metavar="MODULE_OR_FILE"),
@@ -40,7 +42,8 @@ def import_modules(names: Iterable[str]) -> None:
             if error.name is None or not f"{name}.".startswith(f"{error.name}."):
                 raise  # the user's module exists, but imports a missing module
             raise ValueError(
-                f"cannot import {name!r}: there is no such module; --import takes "
+                explain_missing(error)
+                or f"cannot import {name!r}: there is no such module; --import takes "
                 "the name of a module or the path of a .py file"
             ) from None
 
