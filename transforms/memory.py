@@ -302,11 +302,8 @@ class TrajectoryMemory:
         rows = serials % len(self._rings[NUMBER])
         return self._rings[NUMBER].take(rows), self._rings[STEP].take(rows)
 
-    def get_achieved(self, serials: Integers) -> Goals:
-        """Returns the goals that transitions achieved, (n, *goal)."""
-        return self._get_goals(ACHIEVED_GOAL, serials)
-
-    def _get_goals(self, column: int, serials: Integers) -> Goals:
+    def get_goals(self, serials: Integers, column: int = ACHIEVED_GOAL) -> Goals:
+        """Returns achieved or desired goals of transitions, (n, *goal)."""
         ring = self._rings[column]
         return ring.take(serials % len(ring), axis=0)
 
@@ -346,7 +343,7 @@ class TrajectoryMemory:
                     numbers, first + chosen, serials[rows] + first + chosen - steps
                 )
             column = DESIRED_GOAL if strategy == DESIRED else ACHIEVED_GOAL
-            goals[rows] = self._get_goals(column, sources[rows])
+            goals[rows] = self.get_goals(sources[rows], column)
         return sources, goals
 
     def _find_serials(
