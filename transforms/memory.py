@@ -71,7 +71,7 @@ class TrajectoryMemory:
         self.oldest = 0  # serial number of the oldest remembered transition
         self._rings: list[NDArray[Any]] = []
         # By trajectory number: the oldest remembered step, the newest step + 1, and the
-        # serial numbers of these steps.
+        # serial numbers of these steps, perhaps after those of forgotten steps.
         self._first = self._end = np.zeros(0, np.int64)
         self._serials: list[array[int]] = []
         self._free: list[int] = []  # trajectory numbers that are not in use
@@ -287,8 +287,14 @@ class TrajectoryMemory:
         numbers, _ = self.find(np.arange(self.oldest, oldest))
         for number, n in Counter(numbers.tolist()).items():
             self._first[number] += n
-            del self._serials[number][:n]
-            if not self._serials[number]:
+            length, serials = (
+                self._end[number] - self._first[number],
+                self._serials[number],
+            )
+            # Not on every call, because it moves all other entries.
+            if len(serials) > 2 * length:
+                del serials[: len(serials) - length]
+            if not length:
                 self._free.append(number)
                 self._open = {
                     trajectory_id: trajectory
@@ -362,7 +368,7 @@ class TrajectoryMemory:
         is_wrong = (found_numbers != numbers) | (found_steps != steps)
         for i in is_wrong.nonzero()[0].tolist():
             number = numbers[i]
-            serials[i] = self._serials[number][steps[i] - self._first[number]]
+            serials[i] = self._serials[number][steps[i] - self._end[number]]
         return serials
 
     def state(self) -> dict[str, Any]:
