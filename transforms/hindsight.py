@@ -158,13 +158,14 @@ class Hindsight(envs.Transform):
             ValueError: The environment lacks a function that is not among the options,
                 or the environment's transforms normalise a goal.
         """
+        # Translate arguments of the HER paper and of Stable-Baselines3.
         accepted = inspect.signature(cls).parameters
         for name in options:
             if name not in accepted:
                 hint = ""
-                if name in ("k", "n_sampled_goal"):  # of the paper, of SB3
+                if name in ("k", "n_sampled_goal") and "her_ratio" in accepted:
                     hint = f"use her_ratio={options[name] / (options[name] + 1):.3g}; "
-                elif name == "goal_selection_strategy":  # of Stable-Baselines3
+                elif name == "goal_selection_strategy" and "strategy" in accepted:
                     hint = "use strategy; "
                 raise TypeError(
                     f"{cls.__name__} has no argument {name!r}; {hint}accepted are "
@@ -378,7 +379,7 @@ class Hindsight(envs.Transform):
         # One buffer of an ensemble may hold rows of another transform.
         if is_first or isinstance(buffer, ReplayBufferEnsemble):
             achieved = batch.get(keys.next_achieved_goal)
-            remembered = torch.from_numpy(memory.get_achieved(serials)).to(achieved)
+            remembered = torch.from_numpy(memory.get_goals(serials)).to(achieved)
             differs = ((achieved != remembered) & ~achieved.isnan()).flatten(1).any(1)
             # Another thread may have overwritten rows since they were sampled.
             if differs.sum() > len(batch) / 2 and (serials >= memory.oldest).all():

@@ -71,7 +71,7 @@ class TrajectoryMemory:
         self.oldest = 0  # serial number of the oldest remembered transition
         self._rings: list[NDArray[Any]] = []
         # By trajectory number: the oldest remembered step, the newest step + 1, and the
-        # serial numbers of these steps.
+        # serial numbers of these steps, perhaps after those of forgotten steps.
         self._first = self._end = np.zeros(0, np.int64)
         self._serials: list[array[int]] = []
         self._free: list[int] = []  # trajectory numbers that are not in use
@@ -287,8 +287,14 @@ class TrajectoryMemory:
         numbers, _ = self.find(np.arange(self.oldest, oldest))
         for number, n in Counter(numbers.tolist()).items():
             self._first[number] += n
-            del self._serials[number][:n]
-            if not self._serials[number]:
+            length, serials = (
+                self._end[number] - self._first[number],
+                self._serials[number],
+            )
+            # Not on every call, because it moves all other entries.
+            if len(serials) > 2 * length:
+                del serials[: len(serials) - length]
+            if not length:
                 self._free.append(number)
                 self._open = {
                     trajectory_id: trajectory
@@ -302,11 +308,8 @@ class TrajectoryMemory:
         rows = serials % len(self._rings[NUMBER])
         return self._rings[NUMBER].take(rows), self._rings[STEP].take(rows)
 
-    def get_achieved(self, serials: Integers) -> Goals:
-        """Returns the goals that transitions achieved, (n, *goal)."""
-        return self._get_goals(ACHIEVED_GOAL, serials)
-
-    def _get_goals(self, column: int, serials: Integers) -> Goals:
+    def get_goals(self, serials: Integers, column: int = ACHIEVED_GOAL) -> Goals:
+        """Returns achieved or desired goals of transitions, (n, *goal)."""
         ring = self._rings[column]
         return ring.take(serials % len(ring), axis=0)
 
@@ -346,7 +349,7 @@ class TrajectoryMemory:
                     numbers, first + chosen, serials[rows] + first + chosen - steps
                 )
             column = DESIRED_GOAL if strategy == DESIRED else ACHIEVED_GOAL
-            goals[rows] = self._get_goals(column, sources[rows])
+            goals[rows] = self.get_goals(sources[rows], column)
         return sources, goals
 
     def _find_serials(
@@ -365,7 +368,7 @@ class TrajectoryMemory:
         is_wrong = (found_numbers != numbers) | (found_steps != steps)
         for i in is_wrong.nonzero()[0].tolist():
             number = numbers[i]
-            serials[i] = self._serials[number][steps[i] - self._first[number]]
+            serials[i] = self._serials[number][steps[i] - self._end[number]]
         return serials
 
     def state(self) -> dict[str, Any]:
