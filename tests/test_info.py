@@ -49,5 +49,5 @@ def test_the_text_lists_every_extra():
         "\n[project.scripts]"
     )[0]
     declared = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
-    declared -= {"test", "docs", "examples"}  # `examples` is `learning`, renamed
+    declared -= {"test", "docs"}
     assert declared == set(EXTRAS)

@@ -160,7 +160,7 @@ class ArgGroups:
 
 
 # Options that environments of Gymnasium do not have.
-OWN_OPTIONS = (*("task_options", "physics", "start_at_object", "randomize", "demos"),)
+OWN_OPTIONS = ("task_options", "physics", "start_at_object", "randomize", "demos")
 
 
 # Options that have an effect only with an environment, or only with --offline.

@@ -111,8 +111,7 @@ class Checkpoint:
     def load(self) -> None:
         """Restore the state that `save` wrote.
 
-        The options must be those of the saved run. Only `total_steps` may be larger,
-        if the learning rate does not depend on it.
+        The options must be those of the saved run. Only `total_steps` may be larger.
 
         Raises:
             ValueError: The file is damaged, or its run had other options or data.
