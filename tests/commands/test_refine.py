@@ -48,7 +48,7 @@ def crooked(tmp_path):
     """A policy of Reach whose hand comes to rest beside the goal."""
     agent = SavedPolicy.read(shipped_policies()["PandaReach-v1"]).make_agent()
     with torch.no_grad():
-        agent.actor[0][-1].bias[0] += 1.5
+        agent.actor[0][-1].bias[0] += 2.0
     save_policy(tmp_path / "crooked.pt", agent, "PandaReach-v1")
     return tmp_path / "crooked.pt"
 
