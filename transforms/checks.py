@@ -7,7 +7,7 @@ concatenation of observation and goal, the transition then contains two goals.
 
 import inspect
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -44,7 +44,7 @@ FIX = "compute it in the buffer, after this transform (append_transform)"
 
 @dataclass
 class Keys:
-    """Keys of the entries that hindsight reads and rewrites.
+    """Keys of the entries that hindsight reads and rewrites, in their shortest form.
 
     Attributes:
         goal: Desired goal, at the root and under "next".
@@ -64,7 +64,9 @@ class Keys:
     trajectory: NestedKey
 
     def __post_init__(self) -> None:
-        """Adds the keys under "next"."""
+        """Shortens the keys, and adds those under "next"."""
+        for key in fields(self):
+            setattr(self, key.name, unravel_key(getattr(self, key.name)))
         self.next_goal = next_key(self.goal)
         self.next_achieved_goal = next_key(self.achieved_goal)
         self.remembered = self.next_achieved_goal, self.goal, self.next_goal, DONE

@@ -635,8 +635,9 @@ class HindsightRelabel(Hindsight):
             raise ValueError(f"her_ratio must be within [0, 1], got {her_ratio}")
         if goal_parts is not None and (not goal_parts or min(goal_parts) < 1):
             raise ValueError(f"goal_parts must be positive sizes, got {goal_parts!r}")
-        entries = goal_key, achieved_goal_key, reward_key, success_key, trajectory_key
-        keys = Keys(*map(unravel_key, entries))
+        keys = Keys(
+            goal_key, achieved_goal_key, reward_key, success_key, trajectory_key
+        )
         super().__init__(
             reward_fn,
             {keys.goal: Mixture.parse(strategy, discount)},
@@ -739,8 +740,9 @@ class GoalSampler(Hindsight):
                 "strategies must map keys of new entries to strategies, such as "
                 f'{{"value_goal": "geometric"}}, got {strategies!r}'
             )
-        entries = goal_key, achieved_goal_key, reward_key, success_key, trajectory_key
-        keys = Keys(*map(unravel_key, entries))
+        keys = Keys(
+            goal_key, achieved_goal_key, reward_key, success_key, trajectory_key
+        )
         mixtures: dict[NestedKey, Mixture] = {
             unravel_key(key): Mixture.parse(strategy, discount)
             for key, strategy in strategies.items()
