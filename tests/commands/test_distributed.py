@@ -160,16 +160,15 @@ def test_another_run_is_not_overwritten(tmp_path, monkeypatch):
     assert (tmp_path / "curve.csv").read_text() == "theirs"
 
 
+def few_steps(address, folder, **options):
+    """Options of a run of 40 steps."""
+    options |= {"steps_per_batch": 5, "total_steps": 40, "updates_per_step": 0.25}
+    return distributed.Args(address=address, num_envs=4, out=folder / "run", **options)
+
+
 @pytest.mark.usefixtures("quick")
 def test_plot_draws_a_distributed_run(address, tmp_path):
-    args = distributed.Args(
-        address=address,
-        num_envs=4,
-        steps_per_batch=5,
-        total_steps=40,
-        updates_per_step=0.25,
-        out=tmp_path / "run",
-    )
+    args = few_steps(address, tmp_path)
     distributed.main(args)
     written = json.loads((args.out / "args.json").read_text())
     assert (written["env_id"], written["total_steps"]) == ("PandaReach-v1", 40)
@@ -187,15 +186,6 @@ def test_workers_know_the_task_of_a_users_file(address, tmp_path, monkeypatch):
     file.write_text(TASK)
     known = dict(registry._REGISTRATIONS)
     monkeypatch.setattr(registry, "_REGISTRATIONS", known)
-    args = distributed.Args(
-        address=address,
-        env_id="Far-v0",
-        imports=(str(file),),
-        num_envs=4,
-        steps_per_batch=5,
-        total_steps=40,
-        updates_per_step=0.25,
-        out=tmp_path / "run",
-    )
+    args = few_steps(address, tmp_path, env_id="Far-v0", imports=(str(file),))
     distributed.main(args)
     assert [row["step"] for row in read_curve(args.out)] == ["0", "40"]
