@@ -1,8 +1,9 @@
 """The recipe: one set of hyperparameters with which ``train`` learns any task.
 
-Options that depend on the task follow from what it declares, or are found in its first
-steps. An option that the recipe does not name keeps its default, the value of the
-preset "paper". An option on the command line overrides the recipe.
+Some options depend on the task. `derive_options` computes them from what the task
+declares, and `find_options` from a few random episodes. An option that the recipe does
+not name keeps its default, the value of the preset "paper". An option on the command
+line overrides the recipe.
 """
 
 import functools
