@@ -28,9 +28,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs.utils import ExplorationType
 from tqdm import tqdm
+from tyro.conf import Suppress
 
 import torch_panda
 from torch_panda.learning.agents import Hyperparameters, make_agent
+from torch_panda.learning.agents.hyperparameters import ActorGoal, OnlineAlgo
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
 from torch_panda.learning.evaluation.curve import Curve, draw_seed
 from torch_panda.learning.files.run_files import (
@@ -50,6 +52,13 @@ TRAJECTORY_KEY = ("collector", "traj_ids")
 @dataclass
 class Args(Hyperparameters):
     """Train on the machines of a Ray cluster."""
+
+    algo: OnlineAlgo = "ddpg"
+    """algorithm: DDPG, TD3, SAC or CRL"""
+    # The workers step environments, so the options of offline agents have no effect.
+    offline: Suppress[bool] = False
+    actor_goal: Suppress[ActorGoal] = "future"
+    alpha: Suppress[float | None] = None
 
     address: str = "local"
     """address of the Ray cluster; "local" starts one on this machine for this run,
@@ -256,8 +265,6 @@ def main(args: Args) -> None:
         check_limits(args)
         import_modules(args.imports)
         check_exploration(args, args.num_envs)
-        if args.offline:
-            raise ValueError("distributed learns in environments: drop --offline")
         check_folder(out, resume=False)
         connect(args)
         learner = Learner(args, out)

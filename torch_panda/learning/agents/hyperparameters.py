@@ -8,7 +8,9 @@ from typing import Literal
 
 from torch_panda.learning.limits import Discount, Ratio, Weight
 
-Algo = Literal["ddpg", "td3", "sac", "crl", "gcbc", "gcivl", "gciql", "hiql", "qrl"]
+OnlineAlgo = Literal["ddpg", "td3", "sac", "crl"]
+Algo = Literal[OnlineAlgo, "gcbc", "gcivl", "gciql", "hiql", "qrl"]
+ActorGoal = Literal["future", "geometric"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 Exploration = Literal["actions", "points"]
 Network = Literal["paper", "layer-norm", "wide", "gelu"]
@@ -60,7 +62,7 @@ class Hyperparameters:
     augmentation: AugmentationKind = "none"
     """mirror half of each batch in the robot's plane of symmetry ("mirror"), and also
     shift half of each batch over the table ("mirror-shift")"""
-    actor_goal: Literal["future", "geometric"] = "future"
+    actor_goal: ActorGoal = "future"
     """with --offline, how to draw the goals of the policy among those achieved later in
     the episode. "future", as in OGBench: all are equally likely. "geometric": the goal
     achieved k steps later has probability proportional to gamma**k"""
