@@ -453,8 +453,13 @@ def test_a_training_is_resumed_evaluated_and_watched(tmp_path, capsys):
     assert runs[0].agent.spaces.has_free_gripper
     assert (whole / "video.mp4").exists()
 
-    evaluate.main(evaluate.Args(run=stopped, episodes=3))
-    assert f"{env_id}, 3 episodes\n" in capsys.readouterr().out
+    results = []
+    for workers in (1, 2):
+        capsys.readouterr()
+        evaluate.main(evaluate.Args(run=stopped, episodes=3, workers=workers))
+        results.append(capsys.readouterr().out)
+    assert results[0] == results[1]
+    assert results[0].startswith(f"{env_id}, 3 episodes\n")
     watched = tmp_path / "watch.gif"
     main(["watch", "--policy", str(stopped), "--num-envs", "1", "--out", str(watched)])
     assert watched.stat().st_size

@@ -38,6 +38,9 @@ class Args:
     num_threads: Positive | None = None
     """number of threads that step the environments; None means one per core that the
     process may use"""
+    workers: Positive = 1
+    """processes for environments of Gymnasium: 1 steps them in this process, and a
+    larger number gives each of them a process of its own"""
     seed: Seed = 1_000
     """seed of the environments"""
     task_options: dict[str, Finite] = field(default_factory=dict)
@@ -63,6 +66,7 @@ def main(args: Args) -> None:
             num_envs=args.num_envs,
             tasks=args.tasks,
             num_threads=args.num_threads,
+            workers=args.workers,
             physics=args.physics,
             task_options=args.task_options,
         )
