@@ -176,7 +176,6 @@ def test_the_script_of_stable_baselines3_trains(monkeypatch, capsys):
 
 
 def test_every_cell_of_the_gallery_succeeds(monkeypatch, tmp_path):
-    monkeypatch.setattr(gallery, "RENDERER", "tiny")
     monkeypatch.setattr(gallery, "NUM_FRAMES", 2)
     monkeypatch.setattr(gallery, "CELL", (60, 48))
     path = tmp_path / "gallery.webp"
