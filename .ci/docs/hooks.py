@@ -1,4 +1,4 @@
-"""MkDocs hooks that add the guides and the registered classes to the pages."""
+"""MkDocs hooks that add the guides, a page per task and the registered classes."""
 
 import re
 import subprocess
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from task_pages import draw_picture, families, write_page
 
 import torch_panda
 from torch_panda.registry import FAMILIES
@@ -19,14 +20,27 @@ CLASSES: dict[str, list[type]] = {
 }
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """List the pages of the tasks."""
+    pages = [{name: f"tasks/{name}.md"} for name in families()]
+    config.nav.insert(2, {"Tasks": pages})
+    return config
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the guides under ``guides/``, and the files to which they link.
+    """Add the guides under ``guides/`` and the pages of the tasks under ``tasks/``.
+
+    The files to which guides link are added, too.
 
     Relative links between guides stay valid, because the folders are kept.
     """
     for path in sorted(guide_files()):
         name = f"guides/{path.relative_to(ROOT)}"
         files.append(File.generated(config, name, abs_src_path=str(path)))
+    for name in families():
+        page, picture = f"tasks/{name}.md", f"tasks/{name}.webp"
+        files.append(File.generated(config, page, content=write_page(name)))
+        files.append(File.generated(config, picture, content=draw_picture(name)))
     return files
 
 
@@ -52,8 +66,10 @@ def guide_files() -> set[Path]:
 def on_page_markdown(markdown: str, **_: object) -> str:
     """Replace ``{{ tasks }}``, ``{{ robots }}`` and ``{{ sensors }}`` by sections.
 
-    There is one section for each registered class.
+    There is one section for each registered class. ``{{ task_pages }}`` becomes links.
     """
+    links = ", ".join(f"[{name}](tasks/{name}.md)" for name in families())
+    markdown = markdown.replace("{{ task_pages }}", links)
     for name, classes in CLASSES.items():
         sections = "\n\n".join(f"::: {_path(item)}" for item in dict.fromkeys(classes))
         markdown = markdown.replace(f"{{{{ {name} }}}}", sections)

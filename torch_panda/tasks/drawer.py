@@ -109,7 +109,8 @@ class Drawer(Task):
         """Position of the handle, and position and velocity of the slide.
 
         Returns:
-            (num_envs, 5) in [m] and [m/s]. Opening the drawer is positive.
+            (num_envs, 5): position of the handle; distance by which the drawer is open;
+            speed at which the drawer opens.
         """
         slide = simulation.object_joint_position, simulation.object_joint_velocity
         return torch.cat((self.achieved_goal(simulation), *slide), dim=1)

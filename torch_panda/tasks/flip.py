@@ -94,7 +94,12 @@ class Flip(Task):
         return ((*position, *NO_ROTATION),)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, quaternion and velocities of the cube, (num_envs, 13)."""
+        """Pose and velocities of the cube.
+
+        Returns:
+            (num_envs, 13): position of the cube; quaternion xyzw of the cube; velocity
+            of the cube; angular velocity of the cube.
+        """
         pose, velocity = simulation.object_pose[:, 0], simulation.object_velocity[:, 0]
         return torch.cat((pose, velocity), dim=1)
 

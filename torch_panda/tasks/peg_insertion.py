@@ -123,8 +123,9 @@ class PegInsertion(Task):
         """State of the peg and position of the hole.
 
         Returns:
-            (num_envs, 15): position of the peg's lower end, Euler angles and velocities
-            of the peg, and the position of the hole on the table.
+            (num_envs, 15): position of the peg's lower end; roll, pitch and yaw of the
+            peg; velocity of the peg's middle; angular velocity of the peg; position of
+            the hole's middle, on the table.
         """
         peg = object_observation(simulation, 0)[:, 3:]
         hole = simulation.object_pose[:, 1, :3]

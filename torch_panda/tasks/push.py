@@ -86,7 +86,12 @@ class Push(Task):
         return ((*position, *NO_ROTATION),)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, Euler angles and velocities of the cube, (num_envs, 12)."""
+        """Pose and velocities of the cube.
+
+        Returns:
+            (num_envs, 12): position of the cube; roll, pitch and yaw of the cube;
+            velocity of the cube; angular velocity of the cube.
+        """
         return object_observation(simulation, 0)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:

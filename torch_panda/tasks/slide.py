@@ -115,7 +115,12 @@ class Slide(Task):
         return ((*position, *NO_ROTATION),)
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, Euler angles and velocities of the puck, (num_envs, 12)."""
+        """Pose and velocities of the puck.
+
+        Returns:
+            (num_envs, 12): position of the puck; roll, pitch and yaw of the puck;
+            velocity of the puck; angular velocity of the puck.
+        """
         return object_observation(simulation, 0)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:

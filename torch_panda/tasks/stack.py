@@ -112,7 +112,14 @@ class Stack(Task):
         )
 
     def observation(self, simulation: VectorSimulation) -> Tensor:
-        """Position, Euler angles and velocities of both cubes, (num_envs, 24)."""
+        """Poses and velocities of both cubes.
+
+        Returns:
+            (num_envs, 24): position of the lower cube; roll, pitch and yaw of the lower
+            cube; velocity of the lower cube; angular velocity of the lower cube;
+            position of the upper cube; roll, pitch and yaw of the upper cube; velocity
+            of the upper cube; angular velocity of the upper cube.
+        """
         return simulation.object_state.flatten(1)
 
     def achieved_goal(self, simulation: VectorSimulation) -> Tensor:
