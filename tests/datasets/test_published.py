@@ -1,49 +1,72 @@
-"""The published hashes are those of the data that `generate` makes here."""
+"""The published hashes are those of the data that `record --verify` makes here."""
 
-import re
-from pathlib import Path
+import json
+from itertools import product
 
 import pytest
 
-import torch_panda
-from torch_panda import datasets
+from torch_panda.commands import main, record
 
-GUIDE = Path(torch_panda.__file__).parent / "datasets" / "README.md"
-SMALL = 1000  # transitions of the data sets that the tests generate
-
-
-def read_hashes(transitions):
-    """The hashes of the table of this size, by id and kind."""
-    table = GUIDE.read_text().split(f"sha256 of {transitions:,} transitions |\n")[1]
-    rows = re.findall(
-        r"^\| `([\w-]+)` \| (\w+) \| .*`([0-9a-f]{64})` \|$",
-        table.split("\n\n")[0],
-        re.MULTILINE,
-    )
-    return {(env_id, kind): digest for env_id, kind, digest in rows}
+SIZES = ("1000", "100000", "1000000")
+TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
+KINDS = ("noisy", "play", "random")
 
 
-def test_every_task_and_kind_has_a_hash():
-    tasks = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
-    expected = {
-        (f"Panda{task}-v1", kind)
-        for task in tasks
-        for kind in ("noisy", "play", "random")
+def verify(env_id, kind="expert"):
+    record.main(record.Args(verify=True, env_id=env_id, kind=kind, num_envs=10))
+
+
+def test_every_size_task_and_kind_has_a_hash():
+    published = json.loads(record.PUBLISHED.read_text())
+    hashes = {
+        published[size][f"Panda{task}-v1"][kind]
+        for size, task, kind in product(SIZES, TASKS, KINDS)
     }
-    hashes = read_hashes(SMALL)
-    assert hashes.keys() == expected
-    assert len(set(hashes.values())) == len(hashes)
+    assert len(hashes) == len(SIZES) * len(TASKS) * len(KINDS)
+    assert all(len(digest) == 64 for digest in hashes)
 
 
 @pytest.mark.parametrize(
     ("env_id", "kind"),
     [
         ("PandaPush-v1", "noisy"),
-        ("PandaReach-v1", "play"),
         ("PandaStack-v1", "random"),
         ("PandaFlip-v1", "noisy"),
     ],
 )
-def test_a_data_set_has_its_published_hash(env_id, kind):
-    data = datasets.generate(env_id, kind=kind, transitions=SMALL, seed=0, num_envs=10)
-    assert datasets.sha256(data) == read_hashes(SMALL)[env_id, kind]
+def test_a_data_set_has_its_published_hash(env_id, kind, capsys):
+    verify(env_id, kind)
+    assert f"{env_id} {kind}, 1000 transitions" in capsys.readouterr().out
+
+
+def test_verify_takes_all_kinds_by_default(capsys):
+    verify("PandaReach-v1")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1].strip(",") for line in lines] == list(KINDS)
+    assert all(line.endswith("as published") for line in lines)
+
+
+def test_verify_fails_if_a_hash_differs(tmp_path, monkeypatch):
+    published = json.loads(record.PUBLISHED.read_text())
+    published["1000"]["PandaReach-v1"]["random"] = 64 * "0"
+    path = tmp_path / "published.json"
+    path.write_text(json.dumps(published))
+    monkeypatch.setattr(record, "PUBLISHED", path)
+    with pytest.raises(SystemExit, match="differs from the published one: random"):
+        verify("PandaReach-v1", "random")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--env-id", "PandaDrawer-v1"],
+            "no hashes of 1000 transitions of PandaDrawer",
+        ),
+        (["--transitions", "5"], "the numbers 1000, 100000, 1000000"),
+        (["--seed", "1", "--out", "x.pt"], "verify does not work with out, seed"),
+    ],
+)
+def test_verify_refuses_what_was_not_published(arguments, message):
+    with pytest.raises(SystemExit, match=message):
+        main(["record", "--verify", *arguments])

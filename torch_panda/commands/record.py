@@ -4,16 +4,18 @@ python -m torch_panda record --env-id PandaPush-v1 --episodes 200 --out demos.pt
 python -m torch_panda record --format minari --out panda/push-expert-v0
 python -m torch_panda record --format lerobot --out push_lerobot
 python -m torch_panda record --kind play --transitions 100000 --out push_play.pt
+python -m torch_panda record --verify
 
 By default, the command records demonstrations and prints the expert's success rate.
 With ``--kind``, one of the kinds of `torch_panda.datasets.generate`, it prints the hash
-of the data.
+of the data. With ``--verify``, it compares such hashes with the published ones.
 """
 
+import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 import tyro
@@ -30,6 +32,7 @@ from torch_panda.datasets.generation import (
     batch_shape,
     episode_seed,
     fixed_options,
+    generate,
     generate_parts,
     sha256,
 )
@@ -42,6 +45,9 @@ from torch_panda.learning.user_modules import Imports, import_modules
 # Keys of pictures. The hash does not include them.
 PIXELS = ("pixels", ("next", "pixels"))
 EPISODES = 200  # default number of demonstrations
+# Published hashes by number of transitions, id and kind.
+PUBLISHED = Path(torch_panda.__file__).parent / "datasets" / "published.json"
+VERIFY_OPTIONS = {"verify", "env_id", "kind", "transitions", "num_envs", "num_threads"}
 
 
 @dataclass
@@ -81,7 +87,10 @@ class Args:
     reset ("play"), or random actions ("random")"""
     transitions: Positive | None = None
     """number of generated transitions, rounded up to whole episodes; None means
-    100,000"""
+    100,000, or 1,000 with `verify`"""
+    verify: bool = False
+    """generate published data sets of the id, write no file, and compare their hashes.
+    The kind "expert" means all kinds"""
 
 
 def open_writer(args: Args, out: Path, env: torch_panda.RobotTaskEnv) -> Writer:
@@ -103,6 +112,15 @@ def check(args: Args) -> None:
         ValueError: An option is outside its limits, or two options are incompatible.
     """
     check_limits(args)
+    if args.verify:
+        default = asdict(Args())
+        changed = {key for key, value in asdict(args).items() if value != default[key]}
+        if refused := ", ".join(sorted(changed - VERIFY_OPTIONS)):
+            raise ValueError(
+                f"verify does not work with {refused}; published data sets have seed 0 "
+                "and no other options"
+            )
+        return
     is_generated = args.kind != "expert"
     if is_generated and (args.episodes is not None or args.noise_eps):
         raise ValueError(
@@ -153,7 +171,9 @@ def main(args: Args) -> None:
     try:
         check(args)
         import_modules(args.imports)
-        if args.kind == "expert":
+        if args.verify:
+            verify(args)
+        elif args.kind == "expert":
             record_demonstrations(args)
         else:
             record_generated_data(args, args.kind)
@@ -241,6 +261,44 @@ def record_generated_data(args: Args, kind: Kind) -> None:
             place, data = write_episodes(args, out, parts)
     print(f"{data.numel()} transitions in {place}")
     print(f"sha256 {sha256(data)}")
+
+
+def verify(args: Args) -> None:
+    """Generate data sets, and compare their hashes with the published ones.
+
+    Raises:
+        ValueError: No hash was published, or the hash of a data set differs.
+    """
+    transitions = args.transitions or 1_000
+    published = json.loads(PUBLISHED.read_text())
+    hashes = published.get(str(transitions), {}).get(args.env_id)
+    if hashes is None:
+        ids = ", ".join(published["1000"])
+        raise ValueError(
+            f"no hashes of {transitions} transitions of {args.env_id} were published; "
+            f"the published ids are {ids}, and the numbers {', '.join(published)}"
+        )
+    different = []
+    for kind in get_args(Kind) if args.kind == "expert" else (args.kind,):
+        data = generate(
+            args.env_id,
+            kind=kind,
+            transitions=transitions,
+            seed=0,
+            num_envs=args.num_envs,
+            num_threads=args.num_threads,
+        )
+        is_equal = sha256(data) == hashes[kind]
+        print(
+            f"{args.env_id} {kind}, {transitions} transitions: sha256 {sha256(data)} "
+            + ("as published" if is_equal else f"instead of {hashes[kind]}")
+        )
+        if not is_equal:
+            different.append(kind)
+    if different:
+        raise ValueError(
+            f"the hash differs from the published one: {', '.join(different)}"
+        )
 
 
 def write_episodes(
