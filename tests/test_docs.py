@@ -1,7 +1,6 @@
 """The pages of the API reference, in .ci/docs."""
 
 import importlib
-import importlib.util
 import pkgutil
 import re
 from collections import Counter
@@ -14,12 +13,14 @@ import torch_panda
 DOCS = Path(__file__).parents[1] / ".ci" / "docs"
 
 
+def load_hooks():
+    pytest.importorskip("mkdocs")
+    return importlib.import_module("hooks")
+
+
 def read_pages():
     """Text of every page by name, as the hook completes it."""
-    pytest.importorskip("mkdocs")
-    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
-    hooks = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(hooks)
+    hooks = load_hooks()
     pages = (DOCS / "pages").glob("*.md")
     return {page.name: hooks.on_page_markdown(page.read_text()) for page in pages}
 
@@ -61,3 +62,24 @@ def test_every_public_name_is_on_exactly_one_page():
 def test_no_entry_is_repeated():
     names = [name for name, _ in documented()]
     assert [name for name, number in Counter(names).items() if number > 1] == []
+
+
+def test_the_list_for_language_models_has_every_page_with_its_first_sentence():
+    nav = [{"Overview": "index.md"}, {"Guides": [{"Use": "guides/README.md"}]}]
+    pages = {"index.md": "# Title\n\nIt steps\nrobots. It relabels."}
+    pages["guides/README.md"] = (
+        "![a](b.png)\n\nUse [the tasks](tasks.md) 1.5 times. No more."
+    )
+    assert load_hooks().list_pages(nav, pages).splitlines() == [
+        "# torch_panda",
+        "",
+        "> It steps robots.",
+        "",
+        "## Overview",
+        "",
+        "- [Overview](index.html): It steps robots.",
+        "",
+        "## Guides",
+        "",
+        "- [Use](guides/index.html): Use the tasks 1.5 times.",
+    ]

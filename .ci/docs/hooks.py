@@ -1,9 +1,11 @@
-"""MkDocs hooks that add the guides, a page per task and the registered classes."""
+"""MkDocs hooks: guides, a page per task, registered classes, and ``llms.txt``."""
 
 import re
 import subprocess
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from jinja2 import Environment
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from task_pages import draw_picture, families, write_page
@@ -74,6 +76,41 @@ def on_page_markdown(markdown: str, **_: object) -> str:
         sections = "\n\n".join(f"::: {_path(item)}" for item in dict.fromkeys(classes))
         markdown = markdown.replace(f"{{{{ {name} }}}}", sections)
     return markdown
+
+
+def on_env(env: Environment, config: MkDocsConfig, files: Files) -> Environment:
+    """Add ``llms.txt``, the list of pages for language models (llmstxt.org)."""
+    pages = {file.src_uri: file.page.markdown for file in files.documentation_pages()}
+    text = list_pages(config.nav, pages)
+    files.append(File.generated(config, "llms.txt", content=text))
+    return env
+
+
+def list_pages(nav: Sequence[dict], pages: Mapping[str, str]) -> str:
+    """Links to all pages in the order of the navigation, with their first sentences.
+
+    Args:
+        nav: The navigation: titles with the path of a page, or with such a list.
+        pages: The Markdown of each page by its path.
+    """
+    lines = ["# torch_panda", "", f"> {_first_sentence(pages['index.md'])}"]
+    for title, content in (pair for entry in nav for pair in entry.items()):
+        lines += ["", f"## {title}", ""]
+        entries = [{title: content}] if isinstance(content, str) else content
+        for name, path in (pair for entry in entries for pair in entry.items()):
+            url = path.replace("README.md", "index.html").replace(".md", ".html")
+            text = _first_sentence(pages[path])
+            lines.append(f"- [{name}]({url})" + (f": {text}" if text else ""))
+    return "\n".join(lines) + "\n"
+
+
+def _first_sentence(markdown: str) -> str:
+    """The first sentence of a page, in one line without links."""
+    for paragraph in markdown.split("\n\n"):
+        if not re.match(r"\s*(#|!|\||:::|```|- )", paragraph):
+            text = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", " ".join(paragraph.split()))
+            return re.split(r"(?<=\.) ", text)[0]
+    return ""
 
 
 def _path(item: type) -> str:
