@@ -64,6 +64,11 @@ def test_no_entry_is_repeated():
     assert [name for name, number in Counter(names).items() if number > 1] == []
 
 
+def test_the_version_has_a_section_on_the_page_of_changes():
+    page = (DOCS / "pages" / "changes.md").read_text()
+    assert f"\n## {torch_panda.__version__}\n" in page
+
+
 def test_the_list_for_language_models_has_every_page_with_its_first_sentence():
     nav = [{"Overview": "index.md"}, {"Guides": [{"Use": "guides/README.md"}]}]
     pages = {"index.md": "# Title\n\nIt steps\nrobots. It relabels."}
