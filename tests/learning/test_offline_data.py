@@ -9,6 +9,7 @@ from tests.learning.episodes import play_randomly
 from tests.learning.gradient_steps import SPACES
 from torch_panda.learning.agents import Hyperparameters, find_agent
 from torch_panda.learning.agents.batch import Batch
+from torch_panda.learning.agents.gciql_nstep import NStepGCIQL
 from torch_panda.learning.agents.hiql import HIQL
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.environments.spaces import read_spaces
@@ -56,6 +57,7 @@ def test_rewards_are_those_of_the_value_goal(env, transitions):
         ("gcbc", MIXTURE),
         ("gcivl", MIXTURE),
         ("gciql", MIXTURE),
+        ("gciql-nstep", MIXTURE),
         ("hiql", MIXTURE),
         ("qrl", "random"),
         ("crl", "geometric"),
@@ -111,6 +113,39 @@ def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, acto
     is_own = (value == names[t]).all(-1)
     assert torch.equal(is_own, batch["reaches_waypoint"])
     assert 0.2 < is_own.float().mean() < 0.5
+
+
+def test_n_step_rows_stop_at_the_goal_and_at_the_end_of_the_episode(env):
+    """Each row has its episode and step as its observation and goal."""
+    lengths = [7, 30, 1, 12]
+    episode = torch.cat([torch.full((n,), i) for i, n in enumerate(lengths)])
+    step = torch.cat([torch.arange(n) for n in lengths])
+    names = torch.stack([episode, step], -1).float()
+    hp = Hyperparameters(algo="gciql-nstep", offline=True, gamma=0.9)
+    agent = NStepGCIQL(read_spaces(env), hp, num_steps=5)
+    named = named_transitions(env, episode, names, torch.zeros(50, 1))
+    data = OfflineData(named, env, agent.goal_strategies, discount=0.9)
+    torch.manual_seed(0)
+    batch = agent.extend(data.sample(2_000), data)
+    kinds = set()
+    for row in batch:
+        first, goal = int(row["index"]), row["value_goal"][:2].tolist()
+        rewards = []
+        for i in range(first, first + 5):
+            reached = names[i].tolist() == goal
+            rewards.append(0.0 if reached else -1.0)
+            ends = step[i] + 1 == lengths[episode[i]]
+            if reached or ends:
+                break
+        assert row["next", "observation"][:2].tolist() == names[i].tolist()
+        expected = sum(0.9**k * reward for k, reward in enumerate(rewards))
+        assert row["next", "reward"].item() == pytest.approx(expected)
+        assert row["next", "terminated"].item() == reached
+        assert row["discount"].item() == pytest.approx(0.9 ** len(rewards))
+        kinds.add((len(rewards), reached, bool(ends)))
+    # Shorter rows reach the goal, end the episode, or both. Rows of five steps may also
+    # do neither.
+    assert len(kinds) == 4 * 3 + 4
 
 
 def named_transitions(env, episode, names, rows):

@@ -160,8 +160,13 @@ def test_gcivl_takes_the_calculated_step():
     check_step(agent, lambda: agent.update(rows), expected, targets, TAU)
 
 
-def test_gciql_takes_the_calculated_step():
-    agent, rows = make_agent("gciql"), make_rows()
+@pytest.mark.parametrize("algo", ["gciql", "gciql-nstep"])
+def test_gciql_takes_the_calculated_step(algo):
+    agent, rows = make_agent(algo), make_rows()
+    discounts = [DISCOUNT] * 4
+    if algo == "gciql-nstep":
+        discounts = [0.9, 0.5, 0.7, 0.2]
+        rows["discount"] = torch.tensor(discounts)
     disperse(agent.value, scale=4, bias=-5)
     for net in (*agent.critic, *agent.target_critic):
         disperse(net, scale=4)
@@ -175,7 +180,9 @@ def test_gciql_takes_the_calculated_step():
     value_loss = (weights * difference**2).mean()
 
     v_next = agent.value(x_next)[:, 0].tolist()
-    target = torch.tensor([-1 + DISCOUNT * v for v in v_next])
+    target = torch.tensor(
+        [-1 + discount * v for discount, v in zip(discounts, v_next, strict=True)]
+    )
     target[1] = 0.0  # the second row reaches its goal
     q = pair_of_values(agent.critic, x, action)
     critic_loss = ((q - target) ** 2).mean(1).sum()

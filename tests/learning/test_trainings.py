@@ -32,7 +32,9 @@ def transitions():
     return data.select(*STORED_KEYS).reshape(-1)
 
 
-@pytest.mark.parametrize("algo", ["gcbc", "gcivl", "gciql", "hiql", "qrl"])
+@pytest.mark.parametrize(
+    "algo", ["gcbc", "gcivl", "gciql", "gciql-nstep", "hiql", "qrl"]
+)
 def test_offline_agents_learn_to_reach(env, transitions, algo):
     torch.manual_seed(0)
     agent = make_agent(env, default_args("offline", "PandaReach-v1", algo))

@@ -32,6 +32,7 @@ class OfflineData:
     Attributes:
         rows: The transitions, (n,).
         last: Index of the last transition of each transition's episode, (n,).
+        is_success: Whether achieved goals reach desired goals, (..., goal size) each.
     """
 
     def __init__(
@@ -41,8 +42,10 @@ class OfflineData:
         goal_strategies: Mapping[str, StrategyOption],
         discount: float,
     ) -> None:
+        self.is_success = env.is_success
+
         def reward(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-            return env.is_success(achieved_goal, desired_goal).float() - 1.0
+            return self.is_success(achieved_goal, desired_goal).float() - 1.0
 
         # Number the episodes 0, 1, ... in the order of the rows. Episode i then ends in
         # row `ends.nonzero()[i]`.
@@ -60,7 +63,7 @@ class OfflineData:
         transform = GoalSampler(
             goal_strategies,
             reward_fn=reward,
-            terminated_fn=env.is_success,
+            terminated_fn=self.is_success,
             discount=discount,
         )
         self.rows = transform.prepare(data)

@@ -7,6 +7,7 @@ from torch_panda.learning.agents.crl import CRL, OfflineCRL
 from torch_panda.learning.agents.ddpg import DDPG
 from torch_panda.learning.agents.gcbc import GCBC
 from torch_panda.learning.agents.gciql import GCIQL
+from torch_panda.learning.agents.gciql_nstep import NStepGCIQL
 from torch_panda.learning.agents.gcivl import GCIVL
 from torch_panda.learning.agents.hiql import HIQL
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
@@ -22,6 +23,7 @@ OFFLINE_AGENTS: dict[str, type[Agent]] = {
     "gcbc": GCBC,
     "gcivl": GCIVL,
     "gciql": GCIQL,
+    "gciql-nstep": NStepGCIQL,
     "hiql": HIQL,
     "qrl": QRL,
     "crl": OfflineCRL,

@@ -71,9 +71,13 @@ class GCIQL(Agent):
         """Squared error of Q with respect to r + discount * V(s', g) (eq. 6)."""
         with torch.no_grad():
             v_next = self.value(self.normalizer(b.s_next, b.g)).squeeze(-1)
-            target = b.r + self.gamma * ~b.ends * v_next
+            target = b.r + self.discount(b) * ~b.ends * v_next
         q = self.critic(self.normalizer(b.s, b.g), b.a)
         return (q - target).square().sum(0).mean()
+
+    def discount(self, b: Batch) -> float | Tensor:
+        """Discount of the next value."""
+        return self.gamma
 
     def actor_loss(self, b: Batch) -> Tensor:
         """DDPG+BC, instead of the paper's weighted imitation (eq. 7)."""

@@ -9,7 +9,8 @@ from typing import Literal
 from torch_panda.learning.limits import Discount, Ratio, Weight
 
 OnlineAlgo = Literal["ddpg", "td3", "sac", "crl"]
-Algo = Literal[OnlineAlgo, "gcbc", "gcivl", "gciql", "hiql", "qrl"]
+OfflineAlgo = Literal["gcbc", "gcivl", "gciql", "gciql-nstep", "hiql", "qrl", "crl"]
+Algo = Literal[OnlineAlgo, OfflineAlgo]
 ActorGoal = Literal["future", "geometric"]
 RelativeInputs = Literal["none", "coarse", "fine"]
 Exploration = Literal["actions", "points"]
@@ -22,8 +23,8 @@ class Hyperparameters:
     """Hyperparameters, by default those of the panda-gym paper (arXiv 2106.13687)."""
 
     algo: Algo = "ddpg"
-    """algorithm: DDPG, TD3, SAC or CRL; with --offline GCBC, GCIVL, GCIQL, HIQL, QRL or
-    CRL"""
+    """algorithm: DDPG, TD3, SAC or CRL; with --offline GCBC, GCIVL, GCIQL, GCIQL with
+    n-step returns, HIQL, QRL or CRL"""
     offline: bool = False
     """learn from a data set instead of an environment"""
     double_q: bool = True
