@@ -53,7 +53,7 @@ DEMOS = ["--demos", "nofile.pt"]
         ("record", [*DATA, "--episodes", "3"], "do not work with the kind noisy"),
         ("record", [*DATA, "--noise-eps", "0.1"], "episodes and noise_eps do not work"),
         ("record", DATA[:2], "needs a file or name to write"),
-        ("record", ["--transitions", "9"], "transitions does not work with the kind"),
+        ("record", ["--transitions", "9"], "transitions and play_noise do not work"),
         ("record", [*DATA, "--env-id", "KukaReach-v1"], "no expert for"),
         (
             "record",

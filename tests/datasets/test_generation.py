@@ -1,5 +1,7 @@
 """Generated data sets: their content, and that the arguments determine it."""
 
+import math
+
 import pytest
 import torch
 
@@ -16,20 +18,23 @@ def short_play(monkeypatch):
 
 
 def generate(kind, *, env_id="PandaReach-v3", num_envs=3, transitions=130, **options):
+    options = {"seed": 7, **options}
     return datasets.generate(
-        env_id, kind=kind, transitions=transitions, seed=7, num_envs=num_envs, **options
+        env_id, kind=kind, transitions=transitions, num_envs=num_envs, **options
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_hash_depends_on_the_recipe_alone(kind):
-    expected = datasets.sha256(generate(kind))
-    assert datasets.sha256(generate(kind, num_envs=1, num_threads=1)) == expected
-    assert datasets.sha256(generate(kind, num_envs=8, num_threads=2)) == expected
-    other = datasets.generate(
-        "PandaReach-v3", kind=kind, transitions=130, seed=8, num_envs=3
-    )
-    assert datasets.sha256(other) != expected
+@pytest.mark.parametrize(
+    ("kind", "noise"), [("noisy", 0), ("play", 0), ("play", 0.1), ("random", 0)]
+)
+def test_the_hash_depends_on_the_recipe_alone(kind, noise):
+    def sha256(**options):
+        return datasets.sha256(generate(kind, play_noise=noise, **options))
+
+    expected = sha256()
+    assert sha256(num_envs=1, num_threads=1) == expected
+    assert sha256(num_envs=8, num_threads=2) == expected
+    assert sha256(seed=8) != expected
 
 
 @pytest.mark.parametrize(("kind", "steps"), [("noisy", 50), ("play", 120)])
@@ -109,6 +114,24 @@ def test_the_noise_of_an_episode_has_a_scale_of_its_own():
     assert 0.17 < noise.mean() < 0.33
 
 
+def test_the_noise_of_play_is_smoothed_over_time():
+    """The filter's weights are in proportion to exp(-2 k^2), k steps away."""
+    data = generate("play", play_noise=0.1, transitions=2_000, num_envs=8)
+    expert = torch_panda.experts.make_expert("PandaReach-v3")
+    intended = expert(data.exclude("next"))["action"]
+    noise, near = data["action"] - intended, intended.abs() < 0.5  # not clipped
+    weights = torch.tensor([math.exp(-8), math.exp(-2), 1, math.exp(-2), math.exp(-8)])
+    weights /= weights.sum()
+    scale = 0.1 * weights.square().sum().sqrt()
+    assert noise[near].std() == pytest.approx(scale.item(), rel=0.05)
+    for steps in (1, 2):
+        both = near[:, steps:] & near[:, :-steps]
+        pairs = torch.stack([noise[:, steps:][both], noise[:, :-steps][both]])
+        expected = (weights[steps:] * weights[:-steps]).sum() * (0.1 / scale) ** 2
+        correlation = torch.corrcoef(pairs)[0, 1].item()
+        assert correlation == pytest.approx(expected.item(), abs=0.05)
+
+
 def segments(episode, key="desired_goal"):
     """Lengths of the pieces of an episode in which an entry is constant."""
     changes = (episode[key].diff(dim=0) != 0).any(dim=1).nonzero().flatten() + 1
@@ -153,6 +176,7 @@ def test_play_pursues_goal_after_goal():
         ({"kind": "random", "transitions": 0}, "transitions must be"),
         ({"kind": "noisy", "goal": "observation"}, "leave out goal='observation'"),
         ({"kind": "play", "max_episode_steps": 50}, "max_episode_steps must be 120"),
+        ({"kind": "noisy", "play_noise": 0.1}, "play_noise works with the kind play"),
         ({"kind": "random", "terminate_on_success": True}, "must be False .* random"),
         (
             {"kind": "play", "env_id": "PandaPegInsertion-v1"},

@@ -85,6 +85,9 @@ class Args:
     """demonstrations ("expert"), or data of `torch_panda.datasets.generate`: the expert
     with noise on its actions ("noisy"), the expert pursuing goal after goal without
     reset ("play"), or random actions ("random")"""
+    play_noise: Weight = 0.0
+    """scale of smooth noise on the actions of the kind "play"; 0.1 is that of OGBench's
+    play data"""
     transitions: Positive | None = None
     """number of generated transitions, rounded up to whole episodes; None means
     100,000, or 1,000 with `verify`"""
@@ -129,10 +132,10 @@ def check(args: Args) -> None:
         )
     if is_generated and args.out is None:
         raise ValueError(f"the kind {args.kind} needs a file or name to write, --out")
-    if not is_generated and args.transitions is not None:
+    if not is_generated and (args.transitions is not None or args.play_noise):
         raise ValueError(
-            "transitions does not work with the kind expert; use episodes, or another "
-            "kind"
+            "transitions and play_noise do not work with the kind expert; use episodes "
+            "and noise_eps, or another kind"
         )
     if args.noise_eps and args.format == "minari":
         raise ValueError(
@@ -249,6 +252,7 @@ def record_generated_data(args: Args, kind: Kind) -> None:
             seed=args.seed,
             num_envs=args.num_envs,
             num_threads=args.num_threads,
+            play_noise=args.play_noise,
             progress=bar.update,
             **options,
         )

@@ -5,6 +5,7 @@ Compare data sets by their `sha256`.
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args
 
@@ -15,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_panda import RobotTaskEnv
-from torch_panda.checks import check_positive, check_seed
+from torch_panda.checks import check_not_negative, check_positive, check_seed
 from torch_panda.experts import make_expert
 from torch_panda.learning.environments import (
     GoalEnv,
@@ -30,6 +31,9 @@ Kind = Literal["noisy", "play", "random"]
 PLAY_STEPS = 1000  # length of an episode of "play"
 HOLD_STEPS = 10  # steps for which "play" stays at a goal after reaching it
 MAX_NOISE = 0.5  # largest standard deviation of the noise of "noisy"
+# A Gaussian filter with a standard deviation of half a step smooths `play_noise`. It is
+# cut off after four standard deviations. Its weights, as multiples of the largest one:
+SMOOTHING = [math.exp(-2 * k**2) for k in range(-2, 3)]
 
 
 def generate(
@@ -40,6 +44,7 @@ def generate(
     seed: int,
     num_envs: int,
     num_threads: int | None = None,
+    play_noise: float = 0.0,
     progress: Callable[[int], object] | None = None,
     **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> TensorDict:
@@ -62,6 +67,10 @@ def generate(
         num_envs: Number of environments stepped in parallel.
         num_threads: Number of threads that step them; None means one per core
             that the process may use.
+        play_noise: Scale of noise on the actions of "play", as in OGBench's play data
+            (arXiv 2410.20092), where it is 0.1: Gaussian noise of this standard
+            deviation, smoothed over time by a Gaussian filter whose standard deviation
+            is half a step. The data contain the executed, noisy actions.
         progress: Called with the number of new transitions after every step.
         **make_options: Further arguments of `torch_panda.make`.
 
@@ -84,6 +93,7 @@ def generate(
         seed=seed,
         num_envs=num_envs,
         num_threads=num_threads,
+        play_noise=play_noise,
         progress=progress,
         **make_options,
     )
@@ -98,6 +108,7 @@ def generate_parts(
     seed: int,
     num_envs: int,
     num_threads: int | None,
+    play_noise: float,
     progress: Callable[[int], object] | None,
     **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> Iterator[TensorDict]:
@@ -115,6 +126,11 @@ def generate_parts(
         names = ", ".join(get_args(Kind))
         raise ValueError(f"kind must be one of {names}, got {kind!r}")
     check_positive(transitions=transitions, num_envs=num_envs)
+    check_not_negative(play_noise=play_noise)
+    if play_noise and kind != "play":
+        raise ValueError(
+            f'play_noise works with the kind play only, got {play_noise} and "{kind}"'
+        )
     seed = check_seed(seed)
     for name, fixed in fixed_options(kind).items():
         if make_options.get(name) not in (None, fixed):
@@ -148,7 +164,7 @@ def generate_parts(
         for start in range(0, num_episodes, num_envs):
             # In the last batch, environments may be left over: drop their episodes.
             episode_ids = torch.arange(start, min(start + num_envs, num_episodes))
-            batch = _Batch(env, expert, kind, seed, start)
+            batch = _Batch(env, expert, kind, seed, start, play_noise)
             rows = []
             for _ in range(steps):
                 rows.append(batch.step())
@@ -206,6 +222,7 @@ class _Batch:
         kind: Kind,
         seed: int,
         first: int,
+        play_noise: float,
     ) -> None:
         self._env, self._expert, self._kind = env, expert, kind
         self._generators = []
@@ -230,6 +247,8 @@ class _Batch:
             assert isinstance(env, RobotTaskEnv)  # the others have no expert
             self._task = env.task
             self._max_steps_per_goal = type(env.task).max_episode_steps
+            self._play_noise = play_noise
+            self._draws: list[Tensor] = []  # noise of the last steps, newest last
 
     @torch.no_grad()
     def step(self) -> TensorDictBase:
@@ -273,7 +292,21 @@ class _Batch:
         if self._kind == "noisy":
             noise = self._draw(lambda rng: rng.normal(0.0, 1.0, shape))
             action = (action + self._noise * noise).clamp(-1.0, 1.0)
+        if self._kind == "play" and self._play_noise:
+            noise = self._play_noise * self._draw_smooth_noise(shape)
+            action = (action + noise).clamp(-1.0, 1.0)
         return action
+
+    def _draw_smooth_noise(self, shape: torch.Size) -> Tensor:
+        """Draw standard normal noise, smoothed over the last steps."""
+        while len(self._draws) < len(SMOOTHING):
+            self._draws.append(self._draw(lambda rng: rng.normal(0.0, 1.0, shape)))
+        # Add tensor by tensor: `Tensor.sum` rounds differently for other `num_envs`.
+        smooth = torch.zeros_like(self._draws[0])
+        for weight, draw in zip(SMOOTHING, self._draws, strict=True):
+            smooth += weight * draw
+        del self._draws[0]
+        return smooth / sum(SMOOTHING)
 
     def _apply_pursued_goals(self, row: TensorDictBase) -> None:
         """Replace goal, reward and success of a step by those of the pursued goals."""
