@@ -15,9 +15,11 @@ from tests.learning.gradient_steps import SPACES, fill_normalizer
 from torch_panda.bullet import FAST
 from torch_panda.commands import plot, refine, train
 from torch_panda.commands.train import parse
+from torch_panda.learning import sources
 from torch_panda.learning.agents import OFFLINE_AGENTS
 from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.learning.options import default_args
+from torch_panda.learning.sources import draw_batches
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -77,16 +79,49 @@ def test_a_resumed_offline_run_equals_an_uninterrupted_run(tmp_path, device):
 
     args = make_args(tmp_path / "stopped", "hiql", device=device)
     stopped = train.make_run(args, args.out)
-    assert not stopped.train(After(2))
+    # On a GPU, an iteration is two gradient steps.
+    assert not stopped.train(After(2 if device == "cpu" else 0))
     stopped.close()
-    assert stopped.progress.steps == 3
+    steps = stopped.progress.steps
+    assert steps == (3 if device == "cpu" else 2)
     resumed = train.make_run(replace(args, resume=True), args.out)
-    assert resumed.progress.steps == 3
+    assert resumed.progress.steps == steps
     assert resumed.train()
     resumed.close()
     torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
     assert points(resumed) == points(whole)
     assert [row["step"] for row in points(whole)] == [0, 4, 6]
+
+
+def test_the_curve_has_mean_losses_if_batches_are_drawn_at_once(tmp_path, monkeypatch):
+    """As on a GPU, where an iteration is more than one gradient step."""
+    monkeypatch.setattr(sources, "drawn_at_once", lambda device: 6)
+    run = train.make_run(make_args(tmp_path), tmp_path)
+    losses, update = [], run.agent.update
+    run.agent.update = lambda *batches: losses.append(update(*batches)) or losses[-1]
+    assert run.train()
+    run.close()
+    assert run.source.collect() == 2  # divides 4 steps and 6 steps
+    losses = [loss["actor_loss"].item() for loss in losses]
+    assert len({*losses}) == 6
+    rows = [(row["step"], row.get("actor_loss")) for row in run.progress.curve]
+    means = [(4, sum(losses[:4]) / 4), (6, sum(losses[4:]) / 2)]
+    assert rows[1:] == [(step, pytest.approx(mean)) for step, mean in means]
+
+
+def test_batches_drawn_at_once_have_their_size():
+    sizes = []
+
+    def draw(size):
+        sizes.append(size)
+        return TensorDict({"x": torch.rand(size)}, [size])
+
+    for device, expected in (("cpu", [8] * 250), ("cuda", [800, 800, 400])):
+        batches = [*draw_batches(draw, 8, 250, torch.device(device))]
+        assert [len(batch) for batch in batches] == [8] * 250
+        assert len(torch.cat(batches)["x"].unique()) > 1_900
+        assert sizes == expected
+        sizes.clear()
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -4,6 +4,7 @@ Orientations in which the edges of the cube are parallel to the world's axes are
 straight. There are 24 of them.
 """
 
+import functools
 import math
 
 import torch
@@ -15,7 +16,7 @@ from torch_panda.rotations import quaternion_product as compose
 
 def inverse(quaternion: Tensor) -> Tensor:
     """Inverse rotations, (..., 4)."""
-    return quaternion * quaternion.new_tensor((-1.0, -1.0, -1.0, 1.0))
+    return torch.cat((-quaternion[..., :3], quaternion[..., 3:]), -1)
 
 
 def to_matrix(quaternion: Tensor) -> Tensor:
@@ -72,7 +73,13 @@ def _straight_orientations() -> Tensor:
 STRAIGHT = _straight_orientations()
 
 
+@functools.cache
+def straight_orientations(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Copy `STRAIGHT`, once for each device: CUDA graphs do not copy from the CPU."""
+    return STRAIGHT.to(device, dtype)
+
+
 def straighten(cube: Tensor) -> Tensor:
     """Return the nearest straight orientation of each cube, (..., 4)."""
-    straight = STRAIGHT.to(cube)
+    straight = straight_orientations(cube.dtype, cube.device)
     return straight[dot(cube[..., None, :], straight).squeeze(-1).abs().argmax(-1)]

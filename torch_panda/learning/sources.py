@@ -1,8 +1,14 @@
 """Where the batches of a training come from: environments, or a data set.
 
-The loop calls `collect` once per iteration, and `sample` for each gradient step.
+The loop calls `collect` once per iteration, and then `sample` for the batches of its
+gradient steps.
 """
 
+import math
+from collections.abc import Callable, Iterator
+from itertools import repeat
+
+import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer, TensorStorage
@@ -23,6 +29,37 @@ from torch_panda.learning.options import DEMO_RATIO, Args
 # cuts the other episodes, because all environments take the same number of steps.
 MAX_STEPS_FROM_MIDDLE = 50
 FIT_ROWS = 100_000  # rows of a data set from which the normaliser gets its statistics
+# Batches that are drawn at once on a GPU. The CPU draws their goals. For one batch this
+# takes longer than the gradient step, and for a hundred batches ten times as long.
+DRAWN_AT_ONCE = 100
+
+Batches = Iterator[tuple[TensorDictBase, TensorDictBase | None]]
+
+
+def drawn_at_once(device: torch.device | None) -> int:
+    """Number of batches that are drawn at once on a device."""
+    return 1 if device is None or device.type == "cpu" else DRAWN_AT_ONCE
+
+
+def draw_batches(
+    draw: Callable[[int], TensorDictBase],
+    batch_size: int,
+    number: int,
+    device: torch.device | None,
+) -> Iterator[TensorDictBase]:
+    """Draw batches, several of them at once on a GPU.
+
+    Args:
+        draw: Draws as many rows as its argument says.
+        batch_size: Rows of a batch.
+        number: Number of batches.
+        device: Device of the rows.
+    """
+    at_once = drawn_at_once(device)
+    for start in range(0, number, at_once):
+        rows = draw(min(at_once, number - start) * batch_size)
+        # `split` takes time even if there is nothing to split.
+        yield from [rows] if at_once == 1 else rows.split(batch_size)
 
 
 class Experience:
@@ -106,10 +143,15 @@ class Experience:
             normalizer = self.agent.normalizer
             normalizer.update(stored["observation"], stored["desired_goal"])
 
-    def sample(self, batch_size: int) -> tuple[TensorDictBase, TensorDictBase | None]:
-        """Draw transitions from the buffer, and `DEMO_RATIO` of them from the demos."""
-        batch = self.buffer.sample(batch_size - self.num_demos)
-        return batch, self.demos.sample(self.num_demos) if self.num_demos else None
+    def sample(self, batch_size: int, number: int) -> Batches:
+        """Draw batches from the buffer, and `DEMO_RATIO` of each from the demos."""
+        device = self.env.device
+        size = batch_size - self.num_demos
+        batches = draw_batches(self.buffer.sample, size, number, device)
+        if not self.num_demos:
+            return zip(batches, repeat(None), strict=False)
+        demos = draw_batches(self.demos.sample, self.num_demos, number, device)
+        return zip(batches, demos, strict=True)
 
     def close(self) -> None:
         """Stop the collector, and close the environments."""
@@ -119,9 +161,11 @@ class Experience:
 class DataSet:
     """Transitions of a data set, with goals that the agent draws.
 
-    An iteration is one gradient step.
+    An iteration is one gradient step, and on a GPU as many as evenly divide the steps
+    between evaluations, at most `DRAWN_AT_ONCE`.
 
     Args:
+        args: Options of the training.
         env: Environment of the task, for its function `is_success`.
         agent: Agent that learns from the data.
         data: Transitions (n,), see `OfflineData`.
@@ -129,24 +173,33 @@ class DataSet:
 
     buffer: ReplayBuffer | None = None  # its state need not be saved
 
-    def __init__(self, env: RobotTaskEnv, agent: Agent, data: TensorDictBase) -> None:
+    def __init__(
+        self, args: Args, env: RobotTaskEnv, agent: Agent, data: TensorDictBase
+    ) -> None:
         self.env, self.agent = env, agent
+        at_once = drawn_at_once(env.device)
+        self.steps = math.gcd(at_once, args.eval_interval, args.total_steps)
         self.data = OfflineData(
             data.to(env.device), env, agent.goal_strategies, agent.gamma
         )
-        sample, _ = self.sample(min(FIT_ROWS, len(self.data)))
+        sample = self.draw(min(FIT_ROWS, len(self.data)))
         agent.normalizer.update(sample["observation"], sample["actor_goal"])
 
     def __len__(self) -> int:
         return len(self.data)
 
     def collect(self) -> int:
-        """Count one step."""
-        return 1
+        """Count the gradient steps of an iteration."""
+        return self.steps
 
-    def sample(self, batch_size: int) -> tuple[TensorDictBase, None]:
-        """Draw transitions with all entries that the agent needs."""
-        return self.agent.extend(self.data.sample(batch_size), self.data), None
+    def draw(self, size: int) -> TensorDictBase:
+        """Draw transitions with all entries that the agent needs, (size,)."""
+        return self.agent.extend(self.data.sample(size), self.data)
+
+    def sample(self, batch_size: int, number: int) -> Batches:
+        """Draw batches."""
+        batches = draw_batches(self.draw, batch_size, number, self.env.device)
+        return zip(batches, repeat(None), strict=False)
 
     def close(self) -> None:
         """Close the environment."""

@@ -85,7 +85,7 @@ class Run:
         self.source: Experience | DataSet
         if args.offline:
             assert data is not None and isinstance(self.env, RobotTaskEnv)
-            self.source = DataSet(self.env, self.agent, data)
+            self.source = DataSet(args, self.env, self.agent, data)
         else:
             self.source = Experience(args, self.env, self.agent, data)
         self.curve = Curve(
@@ -200,13 +200,15 @@ class Run:
         """
         args, progress = self.args, self.progress
         before = progress.steps
-        progress.steps += self.source.collect()
+        steps = self.source.collect()
+        progress.steps += steps
         losses = self.learn()
-        # With a data set, an iteration is one gradient step, and a row of the curve has
-        # the mean over all steps since the last row. Otherwise it has the mean over the
-        # gradient steps of one iteration.
-        sums = progress.loss_sums if args.offline else {}
-        progress.loss_sums = {key: sums.get(key, 0.0) + x for key, x in losses.items()}
+        # With a data set, a row of the curve has the mean over all gradient steps since
+        # the last row. Otherwise it has the mean over those of one iteration.
+        sums, weight = (progress.loss_sums, steps) if args.offline else ({}, 1)
+        progress.loss_sums = {
+            key: sums.get(key, 0.0) + weight * x for key, x in losses.items()
+        }
         is_last = progress.steps >= args.total_steps
         return is_last or crossed(args.eval_interval, before, progress.steps)
 
@@ -219,8 +221,8 @@ class Run:
         args, agent = self.args, self.agent
         losses: dict[str, list[Tensor]] = defaultdict(list)
         due = int(self.progress.steps * args.updates_per_step) - agent.updates
-        for _ in range(due if len(self.source) else 0):
-            batch, demos = self.source.sample(args.batch_size)
+        number = due if len(self.source) else 0
+        for batch, demos in self.source.sample(args.batch_size, number):
             for key, loss in agent.update(batch, demos).items():
                 losses[key].append(loss)
         return {key: float(torch.stack(x).mean()) for key, x in losses.items()}

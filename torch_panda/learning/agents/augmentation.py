@@ -5,6 +5,8 @@ augmented transitions are nearly as realistic as the observed ones. Mirroring fo
 Invariant Transform Experience Replay (arXiv 1909.10707).
 """
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -37,7 +39,7 @@ def mirror(rows: Batch, geometry: Geometry) -> Batch:
 
     def mirrored(values: Tensor, factors: tuple[float, ...]) -> Tensor:
         values = values.clone()
-        values[::2] *= values.new_tensor(factors)
+        values[::2] *= _to_tensor(factors, values.device)
         return values
 
     return rows._replace(
@@ -46,6 +48,12 @@ def mirror(rows: Batch, geometry: Geometry) -> Batch:
         s_next=mirrored(rows.s_next, geometry.observation),
         g=mirrored(rows.g, geometry.goal),
     )
+
+
+@functools.cache
+def _to_tensor(factors: tuple[float, ...], device: torch.device) -> Tensor:
+    """Make a tensor, once for each device: CUDA graphs do not copy from the CPU."""
+    return torch.tensor(factors, device=device)
 
 
 def shift(rows: Batch, geometry: Geometry, distance: float) -> Batch:

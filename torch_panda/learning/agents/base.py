@@ -16,6 +16,7 @@ from torch_panda.learning.agents.augmentation import augment
 from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
 from torch_panda.learning.agents.normalizer import Normalizer
+from torch_panda.learning.agents.recorded_step import RecordedStep, Step
 from torch_panda.learning.environments.spaces import Spaces
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.transforms.strategies import StrategyOption
@@ -59,6 +60,8 @@ class Agent(nn.Module, ABC):
     learning_rate: ClassVar[float] = LEARNING_RATE
     tau: ClassVar[float] = TAU
     default_alpha: ClassVar[float] = 0.0
+    actor_interval: ClassVar[int] = 1
+    """Gradient steps of the critics per gradient step of the actor."""
     value_goal: ClassVar[StrategyOption] = VALUE_GOALS
     """Strategy with which a data set draws the goals of critics and value functions."""
     policy: TensorDictModuleBase
@@ -77,6 +80,7 @@ class Agent(nn.Module, ABC):
         self.updates = 0
         self._online: list[Tensor] = []
         self._targets: list[Tensor] = []
+        self._recorded_steps: dict[tuple[int, ...], RecordedStep] = {}
 
     @property
     def goal_strategies(self) -> dict[str, StrategyOption]:
@@ -140,13 +144,36 @@ class Agent(nn.Module, ABC):
         Returns:
             The losses by name, scalars without gradients.
         """
+        batches = [batch] if demos is None else [batch, demos]
+        losses = self._get_step(*map(len, batches))(*batches)
+        self.updates += 1
+        return losses
+
+    @property
+    def records_steps(self) -> bool:
+        """Whether gradient steps are recorded as CUDA graphs, which is so on a GPU."""
+        return self.normalizer.mean.is_cuda
+
+    def _get_step(self, *sizes: int) -> Step:
+        """Return the function that takes a gradient step on batches of these sizes."""
+        if not self.records_steps:
+            return self._step
+        # A step with the actor's loss has other kernels than one without.
+        key = self.updates % self.actor_interval, *sizes
+        if key not in self._recorded_steps:
+            self._recorded_steps[key] = RecordedStep(self._step, self.optimizer)
+        return self._recorded_steps[key]
+
+    def _step(
+        self, batch: TensorDictBase, demos: TensorDictBase | None = None
+    ) -> dict[str, Tensor]:
+        """Take a gradient step, which may be recorded; see `RecordedStep`."""
         b = self._prepare(Batch.from_tensordict(batch, demos))
         self.optimizer.zero_grad()
         losses = self.losses(b)
         torch.stack([*losses.values()]).sum().backward()
         self.optimizer.step()
         self._move_average()
-        self.updates += 1
         self.move_targets()
         return {key: loss.detach() for key, loss in losses.items()}
 
@@ -208,13 +235,16 @@ class Agent(nn.Module, ABC):
             # With its reward of -1, an agent would fail on purpose, to avoid the
             # rewards of -1 in the steps that follow.
             failed = b.ends & (b.r < 0)
-            b = b._replace(r=torch.where(failed, self.min_return, b.r))
+            b = b._replace(r=b.r.masked_fill(failed, self.min_return))
         if self.hp.fine_fingers:
             b = b._replace(a=to_fine(b.a))
         return b
 
     def set_learning_rate(self, factor: float) -> None:
-        """Use factor * `learning_rate` in the next gradient steps."""
+        """Use factor * `learning_rate` in the next gradient steps.
+
+        On a GPU, the steps that `update` has recorded keep their learning rate.
+        """
         for group in self.optimizer.param_groups:
             group["lr"] = factor * self.learning_rate
 

@@ -31,7 +31,6 @@ class DDPG(Agent):
     """
 
     num_critics = 1
-    actor_interval = 1  # gradient steps of the critics per gradient step of the actor
 
     def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__(spaces, hp)

@@ -175,14 +175,17 @@ class HierarchicalActor(nn.Module):
     Args:
         high_actor: Network from inputs with goals to a waypoint's representation.
         low_actor: Network from inputs without goals and representation to action.
-        columns: Columns of the inputs that do not depend on the goal.
+        columns: Columns of the inputs that do not depend on the goal, int64.
     """
 
+    columns: Tensor
+
     def __init__(
-        self, high_actor: nn.Module, low_actor: nn.Module, columns: list[int]
+        self, high_actor: nn.Module, low_actor: nn.Module, columns: Tensor
     ) -> None:
         super().__init__()
-        self.high_actor, self.low_actor, self.columns = high_actor, low_actor, columns
+        self.high_actor, self.low_actor = high_actor, low_actor
+        self.register_buffer("columns", columns, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """The mean action, (..., action size)."""

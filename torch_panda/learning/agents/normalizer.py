@@ -26,6 +26,7 @@ class Normalizer(nn.Module):
         std: Standard deviation of each input, at least 0.01, (state size,).
     """
 
+    state_columns: Tensor
     count: Tensor
     total: Tensor
     total_squared: Tensor
@@ -50,7 +51,9 @@ class Normalizer(nn.Module):
                     if point < spaces.observation_size
                 ]
                 size += len(geometry.points)
-        self.state_columns = state_columns
+        self.register_buffer(
+            "state_columns", torch.tensor(state_columns), persistent=False
+        )
         self.geometry, self.relative_inputs = geometry, relative_inputs
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
@@ -102,9 +105,9 @@ class Normalizer(nn.Module):
         geometry = self.geometry
         if geometry is not None and self.relative_inputs != "none":
             if geometry.goal_height is not None:
-                heights = [start + 2 for start in geometry.goal_positions]
                 goal = goal.clone()
-                goal[..., heights] = geometry.goal_height
+                for start in geometry.goal_positions:
+                    goal[..., start + 2].fill_(geometry.goal_height)
             differences = geometry.differences(observation, goal)
             inputs = [observation, goal, differences]
             if geometry.orientation is not None:

@@ -1,5 +1,6 @@
 """Soft actor-critic (arXiv 1801.01290), with torchrl's loss."""
 
+import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -28,6 +29,8 @@ class SAC(Agent):
             TensorDictModule(parameters, ["normalized"], ["loc", "scale"]),
             in_keys=["loc", "scale"],
             distribution_class=TanhNormal,
+            # By default, every call would copy them from the CPU.
+            distribution_kwargs={"low": torch.tensor(-1.0), "high": torch.tensor(1.0)},
         )
         critic = TensorDictModule(
             make_mlp(inputs + spaces.action_size, 1, hp.network),

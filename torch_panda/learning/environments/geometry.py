@@ -11,10 +11,10 @@ from torchrl.envs import EnvBase
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.experts.cube_orientations import (
-    STRAIGHT,
     compose,
     inverse,
     same_half,
+    straight_orientations,
     straighten,
     to_matrix,
 )
@@ -103,7 +103,13 @@ class Geometry:
     def differences(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Offsets from the hand to objects and from objects to goals, (..., n) [m]."""
         inputs = torch.cat((observation, goal), -1)
-        return inputs[..., self.points] - inputs[..., self.origins]
+        # The three coordinates of a position follow each other.
+        starts = zip(self.points[::_AXES], self.origins[::_AXES], strict=True)
+        differences = [
+            inputs[..., point : point + _AXES] - inputs[..., origin : origin + _AXES]
+            for point, origin in starts
+        ]
+        return torch.cat((*differences, inputs[..., :0]), -1)
 
     def rotations(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """Express the orientations of cube and goal as inputs of the networks.
@@ -130,7 +136,8 @@ class Geometry:
         observation[..., columns] = same_half(compose(cube, inverse_straight))
         to_goal = same_half(compose(goal, inverse(cube)))
         straight_to_goal = compose(goal, inverse_straight)
-        similarity = (straight_to_goal @ STRAIGHT.to(goal).T).square()
+        straight = straight_orientations(goal.dtype, goal.device)
+        similarity = (straight_to_goal @ straight.T).square()
         return observation, to_goal, to_matrix(to_goal).flatten(-2), similarity
 
 
