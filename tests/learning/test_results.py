@@ -20,6 +20,7 @@ RESULTS = ROOT / "examples" / "results"
 RUNS = RESULTS / "runs"
 PAGE = (RESULTS / "README.md").read_text()
 HELPED = (RESULTS / "what_helped.md").read_text()
+README = (ROOT / "README.md").read_text()
 POLICIES = (ROOT / "torch_panda" / "policies" / "README.md").read_text()
 # These options may differ between a command and its run: the page's seed is a
 # placeholder, and runs may begin on another device.
@@ -260,3 +261,52 @@ def test_numbers_of_1000_episodes_stand_beside_their_command():
         has_numbers = any(re.search(r"\d\.\d( \[| to | \|)", row) for row in rows)
         # The summary points to the command below it.
         assert not has_numbers or "--episodes 1000" in section or title == "Summary"
+
+
+RECIPE_TASKS = ("Reach", "Push", "PickAndPlace", "Drawer")
+
+
+def read_cells(text, name):
+    """The cells of the first row with this text in its first cell."""
+    row = re.search(rf"^\| {name} \|(.*)\|$", text, re.M)
+    return [cell.strip() for cell in row[1].split("|")]
+
+
+def read_recipe_row(name):
+    """Steps, minutes and success of each seed of a task, in the table of the recipe."""
+    steps, minutes, *seeds = read_cells(read_section("One recipe", PAGE), name)
+    return steps, minutes, [cell.split()[0] for cell in seeds if cell]
+
+
+def read_range(cell):
+    """The numbers of a cell such as "98.8 to 99.5"."""
+    return {float(x) for x in re.findall(r"\d+(?:\.\d)?", cell)}
+
+
+def limits(seeds):
+    """The smallest and the largest number of texts."""
+    return {min(map(float, seeds)), max(map(float, seeds))}
+
+
+@pytest.mark.parametrize("task", RECIPE_TASKS)
+def test_the_readme_has_the_numbers_of_the_results(task):
+    name = {"PickAndPlace": "PickAndPlace, no special starts"}.get(task, task)
+    steps, minutes, seeds = read_recipe_row(name)
+    _, success, *others, _ = read_cells(README, task)
+    assert read_range(success) == limits(seeds)
+    assert others == [steps, str(len(seeds)), minutes]
+    version, success, number, summary_steps, _ = read_cells(PAGE, task)
+    assert version == "`-v1`"
+    assert read_range(success) == limits(seeds)
+    assert (number, summary_steps) == (str(len(seeds)), steps)
+    policy = read_cells(POLICIES, f"`Panda{task}-v1`")
+    assert (policy[0], policy[3]) == (f"{seeds[0]} %", steps)
+
+
+@pytest.mark.parametrize("task", ["Reach-v3", "Push-v3"])
+def test_the_summary_has_the_numbers_of_version_3(task):
+    steps, _, seeds = read_recipe_row(task)
+    following = read_section("Summary", PAGE).split(f"| {task[:-3]} |")[1]
+    row = re.search(r"\| `-v3` \| (.*) \| (\d+) \| (\S+) \| the recipe", following)
+    assert read_range(row[1]) == limits(seeds)
+    assert (row[2], row[3]) == (str(len(seeds)), steps)
