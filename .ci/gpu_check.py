@@ -61,8 +61,8 @@ COMPARED = 20  # steps whose results are compared
 # wrong batch or a missing update makes it 0.01 or more.
 TOLERANCE = 1e-3
 WARM_UP, TIMED = 200, 1_000  # steps before the timing, and timed ones
-# Those of Push: 18 observed numbers, of which the first three are the hand's position
-# and three more the cube's.
+# The layout of Push. The hand's position is in the first three of the 18 observed
+# numbers, and the cube's position follows the hand's velocity.
 SIGNS = (1.0, -1.0, 1.0)
 GEOMETRY = Geometry(
     points=(6, 7, 8, 18, 19, 20),

@@ -200,7 +200,7 @@ def action_rows(registrations: tuple[Registration, ...]) -> str:
 
 
 def end_of_episodes(versions: list[Registration]) -> str:
-    """What ends an episode."""
+    """Sentences that say when the episodes of a task end."""
     text = f"An episode is `truncated` after {versions[0].max_episode_steps} steps."
     if any(x.terminate_on_success for x in versions):
         return f"{text} In `-v3`, success ends an episode as `terminated`."

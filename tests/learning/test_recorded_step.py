@@ -28,7 +28,8 @@ from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import default_args
 
 REPLAYS = 2
-# What a GPU cannot record: reading a number, and making a tensor from numbers.
+# A CUDA graph cannot record these operations: one reads a number of a tensor, the other
+# makes a tensor from numbers.
 ON_CPU = (
     torch.ops.aten._local_scalar_dense.default,
     torch.ops.aten.lift_fresh.default,
