@@ -6,10 +6,14 @@ It runs in a few minutes, needs torch, tensordict and torchrl only, and makes it
 itself: episodes in which the hand and the cube of Push wander at random. Recorded and
 plain steps start from the same weights and random numbers. After `COMPARED` steps, the
 difference of their weights must be a small fraction of the weights; see `TOLERANCE`.
+
+A second table compares `SEEDS` agents that take their steps together, as with ``train
+--offline --seeds``, with the same agents one after another.
 """
 
 import sys
 import time
+from collections.abc import Iterator
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -47,15 +51,17 @@ sys.modules["torch_panda.bullet.library"] = MagicMock()
 
 from torch_panda.learning.agents import Hyperparameters, find_agent  # noqa: E402
 from torch_panda.learning.agents.base import Agent  # noqa: E402
+from torch_panda.learning.agents.stacked import StackedAgents  # noqa: E402
 from torch_panda.learning.environments.geometry import Geometry  # noqa: E402
 from torch_panda.learning.environments.spaces import Spaces  # noqa: E402
 from torch_panda.learning.offline_data import OfflineData  # noqa: E402
-from torch_panda.learning.sources import draw_batches  # noqa: E402
+from torch_panda.learning.sources import DRAWN_AT_ONCE, draw_batches  # noqa: E402
 from torch_panda.transforms import HindsightRelabel  # noqa: E402
 
 DEVICE = torch.device("cuda")
 EPISODES, STEPS = 2_000, 50
 BATCH_SIZE = 256
+SEEDS = 8  # agents whose steps are taken together
 COMPARED = 20  # steps whose results are compared
 # Largest root mean square of the differences, as a fraction of that of the weights. A
 # wrong batch or a missing update makes it 0.01 or more.
@@ -138,8 +144,8 @@ def make_data() -> TensorDict:
 class Training:
     """An agent and its data, which take gradient steps as `train` does."""
 
-    def __init__(self, algo: str, data: TensorDict) -> None:
-        torch.manual_seed(0)
+    def __init__(self, algo: str, data: TensorDict, seed: int = 0) -> None:
+        torch.manual_seed(seed)
         hp = Hyperparameters(algo=algo, **ALGORITHMS[algo])
         with torch.device(DEVICE):
             self.agent = find_agent(hp)(SPACES, hp)
@@ -156,10 +162,14 @@ class Training:
             buffer.extend(data)
             self.draw = buffer.sample
 
+    def batches(self, number: int, *, at_once: bool) -> Iterator[TensorDict]:
+        """Draw batches, many at once or one by one."""
+        device = DEVICE if at_once else torch.device("cpu")
+        return draw_batches(self.draw, BATCH_SIZE, number, device)
+
     def take_steps(self, number: int, *, at_once: bool) -> None:
         """Take gradient steps, on batches drawn at once or one by one."""
-        device = DEVICE if at_once else torch.device("cpu")
-        for batch in draw_batches(self.draw, BATCH_SIZE, number, device):
+        for batch in self.batches(number, at_once=at_once):
             self.agent.update(batch)
         torch.cuda.synchronize()
 
@@ -171,31 +181,79 @@ class Training:
         return TIMED / (time.perf_counter() - start)
 
 
+def weights(agent: Agent) -> torch.Tensor:
+    """All weights of an agent in one vector."""
+    parameters = [x.flatten() for x in agent.parameters()]
+    return torch.cat(parameters).detach().double()
+
+
+def difference(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Root mean square of the difference, as a fraction of that of the weights."""
+    return float((one - other).norm() / one.norm())
+
+
+def compare_recorded(algo: str, data: TensorDict) -> tuple[float, float, float]:
+    """Plain and recorded steps per second, and the difference of their weights."""
+    results, speeds = [], []
+    for records in (False, True):
+        Agent.records_steps = records
+        training = Training(algo, data)
+        training.take_steps(COMPARED, at_once=True)
+        results.append(weights(training.agent))
+        # Plain steps draw their batches one by one, as before they were recorded.
+        speeds.append(training.measure(at_once=records))
+    return *speeds, difference(*results)
+
+
+def compare_seeds(algo: str, data: TensorDict) -> tuple[float, float, float]:
+    """Steps per second of one agent and of `SEEDS`, and the difference of weights."""
+    Agent.records_steps = True
+    alone, group = ([Training(algo, data, i) for i in range(SEEDS)] for _ in range(2))
+    agents = StackedAgents([training.agent for training in group])
+
+    def take_together(number: int) -> list[tuple[TensorDict, ...]]:
+        drawn = [training.batches(number, at_once=True) for training in group]
+        rows = [*zip(*drawn, strict=True)]
+        for batches in rows:
+            agents.update(batches)
+        torch.cuda.synchronize()
+        return rows
+
+    rows = take_together(COMPARED)
+    agents.write_back()
+    differences = []
+    for i, training in enumerate(alone):
+        for batches in rows:
+            training.agent.update(batches[i])
+        other = weights(group[i].agent)
+        differences.append(difference(weights(training.agent), other))
+    take_together(WARM_UP)
+    start = time.perf_counter()
+    for _ in range(0, TIMED, DRAWN_AT_ONCE):
+        take_together(DRAWN_AT_ONCE)
+    speed = SEEDS * TIMED / (time.perf_counter() - start)
+    return alone[0].measure(at_once=True), speed, max(differences)
+
+
 def main() -> None:
     """Check every algorithm, and print a row of a table for it."""
     print(torch.cuda.get_device_name(), "torch", torch.__version__, flush=True)
     data, failed = make_data(), []
-    print("| algorithm | plain [steps/s] | recorded [steps/s] | ratio | difference |")
-    print("|---|---|---|---|---|")
-    for algo in ALGORITHMS:
-        weights, speeds = [], []
-        for records in (False, True):
-            Agent.records_steps = records
-            training = Training(algo, data)
-            training.take_steps(COMPARED, at_once=True)
-            parameters = [x.flatten() for x in training.agent.parameters()]
-            weights.append(torch.cat(parameters).detach().double())
-            # Plain steps draw their batches one by one, as before they were recorded.
-            speeds.append(training.measure(at_once=records))
-        plain, recorded = weights
-        difference = float((plain - recorded).norm() / plain.norm())
-        before, after = speeds
-        row = f"{before:.0f} | {after:.0f} | {after / before:.1f} | {difference:.1e}"
-        print(f"| {algo} | {row} |", flush=True)
-        if not difference < TOLERANCE:
-            failed.append(algo)
+    offline = [algo for algo, options in ALGORITHMS.items() if options is OFFLINE]
+    for compare, names, algorithms in (
+        (compare_recorded, ("plain", "recorded"), ALGORITHMS),
+        (compare_seeds, ("one agent", f"{SEEDS} agents"), offline),
+    ):
+        units = " | ".join(f"{name} [steps/s]" for name in names)
+        print(f"| algorithm | {units} | ratio | difference |\n|---|---|---|---|---|")
+        for algo in algorithms:
+            before, after, change = compare(algo, data)
+            row = f"{before:.0f} | {after:.0f} | {after / before:.1f} | {change:.1e}"
+            print(f"| {algo} | {row} |", flush=True)
+            if not change < TOLERANCE:
+                failed.append(algo)
     if failed:
-        raise SystemExit(f"recorded and plain steps differ: {', '.join(failed)}")
+        raise SystemExit(f"the weights differ: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

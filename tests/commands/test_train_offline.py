@@ -20,6 +20,7 @@ from torch_panda.learning.agents import OFFLINE_AGENTS
 from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.learning.options import default_args
 from torch_panda.learning.sources import draw_batches
+from torch_panda.learning.training import SeveralRuns
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -91,6 +92,64 @@ def test_a_resumed_offline_run_equals_an_uninterrupted_run(tmp_path, device):
     torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
     assert points(resumed) == points(whole)
     assert [row["step"] for row in points(whole)] == [0, 4, 6]
+
+
+def read_weights(folder):
+    """The weights of a run's policy."""
+    return torch.load(folder / "checkpoint.pt")["policy"]
+
+
+def test_seeds_learn_together_as_each_would_alone(tmp_path, capsys):
+    train.main(make_args(tmp_path / "run", seeds=(0, 3)))
+    printed = capsys.readouterr().out
+    for seed in (0, 3):
+        out, alone = tmp_path / f"run-{seed}", tmp_path / f"alone-{seed}"
+        assert f"after 6 steps; see {out}" in printed
+        train.main(make_args(alone, seed=seed))
+        data, expected = (torch.load(path / "data.pt") for path in (out, alone))
+        assert torch.equal(data["action"], expected["action"])
+        rows, expected = read_curve(out), read_curve(alone)
+        for row in rows + expected:
+            del row["seconds"]
+        numbers = [[float(x or 0) for x in row.values()] for row in rows]
+        expected = [[float(x or 0) for x in row.values()] for row in expected]
+        assert numbers == [pytest.approx(row, rel=1e-3) for row in expected]
+        torch.testing.assert_close(
+            read_weights(out), read_weights(alone), rtol=1e-3, atol=1e-5
+        )
+        options = json.loads((out / "args.json").read_text())
+        assert (options["seed"], options["seeds"]) == (seed, [])
+    first, second = (read_curve(tmp_path / f"run-{seed}") for seed in (0, 3))
+    assert first[1]["actor_loss"] != second[1]["actor_loss"]
+
+
+def test_resumed_seeds_equal_uninterrupted_ones(tmp_path):
+    def make_runs(out, **options):
+        args = make_args(out, "hiql", seeds=(0, 3), **options)
+        folders = train.find_folders(args).items()
+        return SeveralRuns([train.make_run(options, out) for out, options in folders])
+
+    whole = make_runs(tmp_path / "whole")
+    assert whole.train()
+    whole.close()
+    stopped = make_runs(tmp_path / "stopped")
+    assert not stopped.train(After(2))
+    stopped.close()
+    assert [run.progress.steps for run in stopped.runs] == [3, 3]
+    resumed = make_runs(tmp_path / "stopped", resume=True)
+    assert resumed.train()
+    resumed.close()
+    for run, expected in zip(resumed.runs, whole.runs, strict=True):
+        torch.testing.assert_close(weights(run), weights(expected), rtol=0, atol=0)
+        assert points(run) == points(expected)
+
+
+def test_seeds_with_different_numbers_of_steps_are_refused(tmp_path):
+    train.main(make_args(tmp_path / "run-0", seed=0, total_steps=4))
+    train.main(make_args(tmp_path / "run-3", seed=3))
+    args = make_args(tmp_path / "run", seeds=(0, 3), resume=True)
+    with pytest.raises(SystemExit, match=r"number of steps, got 4, 6: continue each"):
+        train.main(args)
 
 
 def test_the_curve_has_mean_losses_if_batches_are_drawn_at_once(tmp_path, monkeypatch):
@@ -209,6 +268,9 @@ def test_the_command_line_sets_the_options():
         ("--offline --alpha -1", "alpha must be at least 0 and finite"),
         ("--offline --algo gcbc --alpha 1", "algo gcbc has no alpha: drop --alpha"),
         ("--offline --noise-eps 0", "noise_eps has no effect with --offline: drop --n"),
+        ("--offline --seeds 1 1", "seeds must differ, got 1, 1"),
+        ("--offline --seeds 1 2 --seed 3", "seed has no effect with --seeds"),
+        ("--seeds 1 2", "seeds has no effect without --offline: drop --seeds"),
         ("--alpha 1", "alpha has no effect without --offline: drop --alpha"),
         ("--offline --env-id PandaFly-v1", "unknown environment id"),
         ("--offline --resume", "there is no run to resume"),

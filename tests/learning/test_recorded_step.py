@@ -23,6 +23,7 @@ from torch_panda.learning.agents import (
 )
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.recorded_step import WARM_UP
+from torch_panda.learning.agents.stacked import StackedAgents
 from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import default_args
@@ -156,3 +157,25 @@ def test_replayed_steps_equal_steps(env_id, preset, algo, monkeypatch):
     torch.testing.assert_close(curve, expected, rtol=0, atol=0)
     weights = agent.state_dict(), plain.state_dict()
     torch.testing.assert_close(*weights, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("algo", ["hiql", "qrl"])
+def test_replayed_steps_of_stacked_agents_equal_steps(algo, monkeypatch):
+    env, data = play("PandaPush-v1")
+
+    def train(*, records):
+        monkeypatch.setattr(Agent, "records_steps", records)
+        torch.manual_seed(0)
+        options = default_args("offline", "PandaPush-v1", algo)
+        agents = [make_agent(env, options) for _ in range(2)]
+        drawn = [make_batches(env, data, agent, WARM_UP + REPLAYS) for agent in agents]
+        stacked = StackedAgents(agents)
+        losses = [
+            stacked.update([batch for (batch,) in batches])
+            for batches in zip(*drawn, strict=True)
+        ]
+        stacked.write_back()
+        return losses, [agent.state_dict() for agent in agents]
+
+    expected = train(records=False)
+    torch.testing.assert_close(train(records=True), expected, rtol=0, atol=0)

@@ -13,6 +13,8 @@ With ``--offline`` the agent learns from a data set.
 """
 
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import tyro
@@ -39,7 +41,7 @@ from torch_panda.learning.options import (
     check,
     default_args,
 )
-from torch_panda.learning.training import Run, StopSignal
+from torch_panda.learning.training import Run, SeveralRuns, StopSignal
 from torch_panda.learning.user_modules import import_modules
 from torch_panda.registry import find_registration
 from torch_panda.testing import check_task
@@ -144,47 +146,69 @@ def default_folder(args: Args) -> Path:
 
 def main(args: Args) -> None:
     """Train, and print where the results are."""
-    out = args.out or default_folder(args)
     try:
         check(args)
-        default = default_args(args.preset, args.env_id, args.algo)
-        check_folder(out, resume=args.resume)
+        folders = find_folders(args)
+        for out in folders:
+            check_folder(out, resume=args.resume)
         is_declared = False
         if args.offline or not is_from_gymnasium(args.env_id):
             registration = find_registration(args.env_id)
             task = registration.make_task(args.task_options)
             check_task(task, robot=registration.make_robot())
             is_declared = declares_layout(task)
-        run = make_run(args, out)
+        runs = [make_run(options, out) for out, options in folders.items()]
         if args.preset == "recipe":
-            print(describe_recipe(args, run.agent.spaces, is_declared=is_declared))
+            spaces = runs[0].agent.spaces
+            print(describe_recipe(args, spaces, is_declared=is_declared))
+        training = runs[0] if len(runs) == 1 else SeveralRuns(runs)
         stop = StopSignal()
-        with lock_folder(out):
-            write_options(out, args, default, resume=args.resume)
-            finished = run.train(stop)
+        default = default_args(args.preset, args.env_id, args.algo)
+        with ExitStack() as locks:
+            for out, options in folders.items():
+                locks.enter_context(lock_folder(out))
+                write_options(out, options, default, resume=args.resume)
+            finished = training.train(stop)
     except (ValueError, TypeError, OSError) as error:
         raise SystemExit(str(error)) from None
     stop.release()
-    run.close()
-    if finished and args.video:
-        try:
-            with make_env(
-                args.env_id,
-                num_envs=4,
-                seed=args.seed,
-                device=args.device,
-                renders=True,
-                **args.env_options,
-            ) as env:
-                record(env, run.agent.policy, out / "video.mp4")
-        except KeyboardInterrupt:
-            print("interrupted: no video was written")
-        except OSError as error:
-            print(f"no video was written: {error}")
-    progress = run.progress
-    print(f"success {progress.success} after {progress.steps} steps; see {out}")
-    if not finished:
-        print(f"stopped and saved in {out}: the same command with --resume goes on")
+    training.close()
+    for out, run in zip(folders, runs, strict=True):
+        if finished and args.video:
+            record_video(run, out)
+        progress = run.progress
+        print(f"success {progress.success} after {progress.steps} steps; see {out}")
+        if not finished:
+            print(f"stopped and saved in {out}: the same command with --resume goes on")
+
+
+def find_folders(args: Args) -> dict[Path, Args]:
+    """Return the folder of each run with its options: one run, or one for each seed."""
+    if not args.seeds:
+        return {args.out or default_folder(args): args}
+    runs = [replace(args, seed=seed, seeds=()) for seed in args.seeds]
+    if args.out is None:
+        return {default_folder(run): run for run in runs}
+    return {args.out.with_name(f"{args.out.name}-{run.seed}"): run for run in runs}
+
+
+def record_video(run: Run, out: Path) -> None:
+    """Record a video of a run's policy into its folder."""
+    args = run.args
+    try:
+        with make_env(
+            args.env_id,
+            num_envs=4,
+            seed=args.seed,
+            device=args.device,
+            renders=True,
+            **args.env_options,
+        ) as env:
+            record(env, run.agent.policy, out / "video.mp4")
+    except KeyboardInterrupt:
+        print("interrupted: no video was written")
+    except OSError as error:
+        print(f"no video was written: {error}")
 
 
 def describe_recipe(args: Args, spaces: Spaces, *, is_declared: bool) -> str:

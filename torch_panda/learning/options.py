@@ -86,6 +86,9 @@ class RunOptions:
     panda-gym, or "fast" and coarser"""
     seed: Seed = 0
     """seed of the environments, the generated data, the networks and the sampling"""
+    seeds: tuple[Seed, ...] = ()
+    """with --offline, seeds of several runs that learn together, which is meant for a
+    GPU. Each run has a folder of its own, and learns what it would learn alone"""
     total_steps: Count = 4_000
     """environment steps, summed over all environments; 0 stops after the
     `pretrain_updates`. With --offline, gradient steps"""
@@ -110,7 +113,7 @@ class RunOptions:
     """with --offline, transitions to generate, rounded up to whole episodes"""
     out: Path | None = None
     """folder of the results; None means runs/<env-id>-<algo>-<her>-<seed>, with
-    --offline the data instead of <her>"""
+    --offline the data instead of <her>. With --seeds, -<seed> is added to a folder"""
     resume: bool = False
     """continue the run in the folder. Only --out, --video, --import, --logger, --device
     and --workers may differ from the options with which it was started, and
@@ -170,7 +173,7 @@ ONLINE_OPTIONS = (
     *("desired_ratio", "keep_unmoved", "updates_per_step", "randomize"),
     *("pretrain_updates", "start_at_object", "demos", "workers"),
 )
-OFFLINE_OPTIONS = ("alpha", "actor_goal", "data", "transitions")
+OFFLINE_OPTIONS = ("alpha", "actor_goal", "data", "transitions", "seeds")
 
 
 # CRL needs these goals: the critic's positive goals are achieved k steps later in the
@@ -223,6 +226,10 @@ def check_offline(args: Args) -> None:
         )
     if args.algo == "gcbc" and args.alpha is not None:
         raise ValueError("algo gcbc has no alpha: drop --alpha")
+    if len(set(args.seeds)) < len(args.seeds):
+        raise ValueError(f"seeds must differ, got {', '.join(map(str, args.seeds))}")
+    if args.seeds and args.seed:
+        raise ValueError("seed has no effect with --seeds: drop --seed")
 
 
 def check(args: Args) -> None:

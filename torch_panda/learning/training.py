@@ -12,8 +12,9 @@ by default one.
 import os
 import signal
 import time
+from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from tqdm import tqdm
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.randomization import Randomization
 from torch_panda.learning.agents import make_agent
+from torch_panda.learning.agents.stacked import StackedAgents
 from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.evaluation.curve import NUM_ENVS, Curve
 from torch_panda.learning.files.logger import make_logger
@@ -38,7 +40,93 @@ SAVE_INTERVAL = 20_000
 SOLVED_EVALUATIONS = 3
 
 
-class Run:
+class Training(ABC):
+    """The training loop, of one run or of `SeveralRuns`.
+
+    Attributes:
+        args: Options of the training.
+        progress: Progress of the training; with several runs, of the first one.
+    """
+
+    args: Args
+    progress: Progress
+
+    def train(self, stop: object = False) -> bool:
+        """Train until the last step, or until ``stop`` is true after an iteration.
+
+        Args:
+            stop: Object that becomes true to end the training early, such as
+                `StopSignal`.
+
+        Returns:
+            Whether the training reached the last step.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
+        args, progress = self.args, self.progress
+        self.begin()
+        bar = tqdm(
+            desc=f"{args.env_id} {args.algo}",
+            initial=progress.iterated,
+            total=args.pretrain_updates + args.total_steps,
+            unit="step",
+        )
+        finished = stopped = self.is_finished()
+        while not stopped:
+            started, before = time.perf_counter(), progress.iterated
+            is_row = self.iterate()
+            self.add_time(time.perf_counter() - started)
+            bar.update(progress.iterated - before)
+            if is_row:
+                self.evaluate()
+            finished = self.is_finished()
+            bar.set_postfix(success=self.success)
+            stopped = finished or bool(stop)
+            if stopped or crossed(SAVE_INTERVAL, before, progress.iterated):
+                self.save()
+        bar.close()
+        return finished
+
+    @property
+    @abstractmethod
+    def success(self) -> str:
+        """The last success rate as text."""
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Evaluate the policy of a new run."""
+
+    @abstractmethod
+    def iterate(self) -> bool:
+        """Take the steps of one iteration.
+
+        Returns:
+            Whether the policy is to be evaluated.
+        """
+
+    @abstractmethod
+    def add_time(self, seconds: float) -> None:
+        """Add the time of an iteration [s]."""
+
+    @abstractmethod
+    def evaluate(self) -> None:
+        """Evaluate the policy, and write the results."""
+
+    @abstractmethod
+    def is_finished(self) -> bool:
+        """Whether the last step was taken, or the task is solved."""
+
+    @abstractmethod
+    def save(self) -> None:
+        """Write the state from which the training can be resumed."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the environments."""
+
+
+class Run(Training):
     """A training with its environments, its agent and the source of its batches.
 
     Args:
@@ -105,6 +193,7 @@ class Run:
         )
         if args.resume:
             self.checkpoint.load()
+        self.random_state = torch.get_rng_state()  # for `SeveralRuns`
 
     def _make_env(self) -> GoalEnv:
         """Make the environments of the options, for training."""
@@ -124,57 +213,22 @@ class Run:
             **options,
         )
 
-    def train(self, stop: object = False) -> bool:
-        """Train until the last step, or until ``stop`` is true after an iteration.
+    @property
+    def success(self) -> str:
+        """The last success rate as text."""
+        return self.progress.success
 
-        Args:
-            stop: Object that becomes true to end the training early, such as
-                `StopSignal`.
-
-        Returns:
-            Whether the training reached the last step.
-
-        Raises:
-            OSError: A file cannot be written.
-        """
-        args, progress = self.args, self.progress
+    def begin(self) -> None:
+        """Evaluate the policy of a new run."""
         self.curve.begin(self.checkpoint)
-        bar = tqdm(
-            desc=f"{args.env_id} {args.algo}",
-            initial=progress.iterated,
-            total=args.pretrain_updates + args.total_steps,
-            unit="step",
-        )
-        finished = stopped = self.is_finished()
-        while not stopped:
-            started, before = time.perf_counter(), progress.iterated
-            if progress.pretrained < args.pretrain_updates:
-                is_row = self.imitate()
-            else:
-                is_row = self.iterate()
-            progress.seconds += time.perf_counter() - started
-            bar.update(progress.iterated - before)
-            if is_row:
-                self.curve.add(progress, self.mean_losses())
-                progress.loss_sums = {}
-            finished = self.is_finished()
-            bar.set_postfix(success=progress.success)
-            stopped = finished or bool(stop)
-            if stopped or crossed(SAVE_INTERVAL, before, progress.iterated):
-                self.checkpoint.save()
-        bar.close()
-        return finished
 
-    def is_finished(self) -> bool:
-        """Whether the last step was taken, or the task is solved."""
-        args, progress = self.args, self.progress
-        last = [row["success"] for row in progress.curve[-SOLVED_EVALUATIONS:]]
-        is_solved = len(last) == SOLVED_EVALUATIONS and min(last) == 1.0
-        is_last = (
-            progress.pretrained >= args.pretrain_updates
-            and progress.steps >= args.total_steps
-        )
-        return is_last or (args.stop_when_solved and is_solved)
+    def iterate(self) -> bool:
+        """Imitate, or else get steps from the source and learn from them."""
+        if self.progress.pretrained < self.args.pretrain_updates:
+            return self.imitate()
+        steps = self.collect()
+        self.add_losses(self.learn(), steps)
+        return self.has_row(steps)
 
     def imitate(self) -> bool:
         """Take one gradient step of imitation. The learning rate falls linearly to 0.
@@ -192,53 +246,159 @@ class Run:
             self.agent.set_learning_rate(1.0)
         return is_last
 
-    def iterate(self) -> bool:
-        """Get steps from the source, and take the gradient steps that are then due.
-
-        Returns:
-            Whether the policy is to be evaluated.
-        """
-        args, progress = self.args, self.progress
-        before = progress.steps
+    def collect(self) -> int:
+        """Get steps from the source, and return their number."""
         steps = self.source.collect()
-        progress.steps += steps
-        losses = self.learn()
-        # With a data set, a row of the curve has the mean over all gradient steps since
-        # the last row. Otherwise it has the mean over those of one iteration.
-        sums, weight = (progress.loss_sums, steps) if args.offline else ({}, 1)
-        progress.loss_sums = {
-            key: sums.get(key, 0.0) + weight * x for key, x in losses.items()
-        }
-        is_last = progress.steps >= args.total_steps
-        return is_last or crossed(args.eval_interval, before, progress.steps)
+        self.progress.steps += steps
+        return steps
 
-    def learn(self) -> dict[str, float]:
-        """Take the gradient steps that are due after the steps so far.
+    def learn(self) -> list[dict[str, Tensor]]:
+        """Take the gradient steps that are due, and return the losses of each."""
+        batches = self.source.sample(self.args.batch_size, self.num_due())
+        return [self.agent.update(batch, demos) for batch, demos in batches]
 
-        Returns:
-            The mean of each loss over these steps.
+    def num_due(self) -> int:
+        """Number of gradient steps that are due after the steps so far."""
+        due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
+        return due if len(self.source) else 0
+
+    def add_losses(self, losses: Sequence[dict[str, Tensor]], steps: int) -> None:
+        """Add the losses of an iteration, which took ``steps`` steps.
+
+        With a data set, a row of the curve has the mean over all gradient steps since
+        the last row. Otherwise it has the mean over those of one iteration.
         """
-        args, agent = self.args, self.agent
-        losses: dict[str, list[Tensor]] = defaultdict(list)
-        due = int(self.progress.steps * args.updates_per_step) - agent.updates
-        number = due if len(self.source) else 0
-        for batch, demos in self.source.sample(args.batch_size, number):
-            for key, loss in agent.update(batch, demos).items():
-                losses[key].append(loss)
-        return {key: float(torch.stack(x).mean()) for key, x in losses.items()}
+        sums, weight = (
+            (self.progress.loss_sums, steps) if self.args.offline else ({}, 1)
+        )
+        lists: dict[str, list[Tensor]] = defaultdict(list)
+        for step in losses:
+            for key, loss in step.items():
+                lists[key].append(loss)
+        self.progress.loss_sums = {
+            key: sums.get(key, 0.0) + weight * float(torch.stack(x).mean())
+            for key, x in lists.items()
+        }
 
-    def mean_losses(self) -> dict[str, float]:
-        """The losses for the next row of the curve."""
+    def has_row(self, steps: int) -> bool:
+        """Whether the policy is to be evaluated after an iteration of these steps."""
+        args, after = self.args, self.progress.steps
+        is_last = after >= args.total_steps
+        return is_last or crossed(args.eval_interval, after - steps, after)
+
+    def add_time(self, seconds: float) -> None:
+        """Add the time of an iteration [s]."""
+        self.progress.seconds += seconds
+
+    def evaluate(self) -> None:
+        """Evaluate the policy, and write the results."""
         progress = self.progress
         count = 1
         if self.args.offline:
             count = progress.steps - int(progress.curve[-1]["step"])
-        return {key: total / count for key, total in progress.loss_sums.items()}
+        losses = {key: total / count for key, total in progress.loss_sums.items()}
+        self.curve.add(progress, losses)
+        progress.loss_sums = {}
+
+    def is_finished(self) -> bool:
+        """Whether the last step was taken, or the task is solved."""
+        args, progress = self.args, self.progress
+        last = [row["success"] for row in progress.curve[-SOLVED_EVALUATIONS:]]
+        is_solved = len(last) == SOLVED_EVALUATIONS and min(last) == 1.0
+        is_last = (
+            progress.pretrained >= args.pretrain_updates
+            and progress.steps >= args.total_steps
+        )
+        return is_last or (args.stop_when_solved and is_solved)
+
+    def save(self) -> None:
+        """Write the state from which the run can be resumed."""
+        self.checkpoint.save()
 
     def close(self) -> None:
         """Close the environments."""
         self.source.close()
         self.curve.close()
+
+
+class SeveralRuns(Training):
+    """Runs with a data set that differ in their seeds, and learn together.
+
+    Each run has its files and its random numbers, as if it learned alone.
+
+    Args:
+        runs: The runs.
+
+    Raises:
+        ValueError: The runs have taken different numbers of steps.
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self.runs = runs
+        self.args, self.progress = runs[0].args, runs[0].progress
+        steps = [run.progress.steps for run in runs]
+        if len(set(steps)) > 1:
+            raise ValueError(
+                f"runs that learn together must have taken the same number of steps, "
+                f"got {', '.join(map(str, steps))}: continue each alone, with --seed"
+            )
+        self.agents = StackedAgents([run.agent for run in runs])
+        self._random_states = [run.random_state for run in runs]
+
+    def each(self) -> Iterator[Run]:
+        """Go through the runs, each with its state of torch's random generator."""
+        for i, run in enumerate(self.runs):
+            torch.set_rng_state(self._random_states[i])
+            yield run
+            self._random_states[i] = torch.get_rng_state()
+
+    @property
+    def success(self) -> str:
+        """The last success rate of each run as text."""
+        return " ".join(run.success for run in self.runs)
+
+    def begin(self) -> None:
+        """Evaluate the policies of new runs."""
+        for run in self.each():
+            run.begin()
+
+    def iterate(self) -> bool:
+        """Take gradient steps, each on a batch of every run."""
+        drawn, steps = [], 0
+        for run in self.each():
+            steps = run.collect()
+            batches = run.source.sample(self.args.batch_size, run.num_due())
+            drawn.append([batch for batch, _ in batches])
+        losses = [self.agents.update(batches) for batches in zip(*drawn, strict=True)]
+        for i, run in enumerate(self.runs):
+            run.add_losses([step[i] for step in losses], steps)
+        return self.runs[0].has_row(steps)
+
+    def add_time(self, seconds: float) -> None:
+        """Add the time of an iteration [s], which the runs share."""
+        for run in self.runs:
+            run.add_time(seconds)
+
+    def evaluate(self) -> None:
+        """Evaluate the policies, and write the results."""
+        self.agents.write_back()
+        for run in self.each():
+            run.evaluate()
+
+    def is_finished(self) -> bool:
+        """Whether all runs are finished."""
+        return all(run.is_finished() for run in self.runs)
+
+    def save(self) -> None:
+        """Write the states from which the runs can be resumed."""
+        self.agents.write_back()
+        for run in self.each():
+            run.save()
+
+    def close(self) -> None:
+        """Close the environments."""
+        for run in self.runs:
+            run.close()
 
 
 def crossed(interval: int, before: int, after: int) -> bool:

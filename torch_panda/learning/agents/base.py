@@ -168,14 +168,19 @@ class Agent(nn.Module, ABC):
         self, batch: TensorDictBase, demos: TensorDictBase | None = None
     ) -> dict[str, Tensor]:
         """Take a gradient step, which may be recorded; see `RecordedStep`."""
-        b = self._prepare(Batch.from_tensordict(batch, demos))
         self.optimizer.zero_grad()
-        losses = self.losses(b)
+        losses = self(batch, demos)
         torch.stack([*losses.values()]).sum().backward()
         self.optimizer.step()
         self._move_average()
         self.move_targets()
         return {key: loss.detach() for key, loss in losses.items()}
+
+    def forward(
+        self, batch: TensorDictBase, demos: TensorDictBase | None = None
+    ) -> dict[str, Tensor]:
+        """The losses on a batch; see `update` and `losses`."""
+        return self.losses(self._prepare(Batch.from_tensordict(batch, demos)))
 
     @abstractmethod
     def losses(self, b: Batch) -> dict[str, Tensor]:

@@ -27,7 +27,7 @@ from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.ddpg import action_penalty
 from torch_panda.learning.agents.exploration import make_noise
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
-from torch_panda.learning.agents.networks import make_mlp
+from torch_panda.learning.agents.networks import freeze, make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ascend_and_imitate,
@@ -129,27 +129,24 @@ class OfflineCRL(Agent):
 
     def losses(self, b: Batch) -> dict[str, Tensor]:
         """The losses of critics and policy."""
-        phi, psi = self.encode(b.s, b.a, b.g)
+        s, g = self.normalizer.state(b.s), self.normalizer.goal(b.g)
+        phi = torch.stack([net(s, b.a) for net in self.phi])
+        psi = torch.stack([net(g) for net in self.psi])
         # Row i of the logits has (s, a) of row i, column j the goal of row j.
         logits = phi @ psi.mT / sqrt(OFFLINE_LATENT_SIZE)  # (2, n, n)
         return {
             "critic_loss": binary_loss(logits),
-            "actor_loss": self.actor_loss(b),
+            "actor_loss": self.actor_loss(b, s),
         }
 
-    def encode(self, s: Tensor, a: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
-        """phi(s, a) and psi(g) of both critics, (2, n, size of phi) each."""
-        x, y = self.normalizer.state(s), self.normalizer.goal(g)
-        phi = torch.stack([net(x, a) for net in self.phi])
-        psi = torch.stack([net(y) for net in self.psi])
-        return phi, psi
-
-    def actor_loss(self, b: Batch) -> Tensor:
+    def actor_loss(self, b: Batch, s: Tensor) -> Tensor:
         """Ascend f(s, pi(s, g), g) (section 4.3), and imitate as OGBench does."""
         mean = self.actor(self.normalizer(b.s, b.g_actor))
-        with hold_out_net(self.phi), hold_out_net(self.psi):
-            phi, psi = self.encode(b.s, mean.clamp(-1.0, 1.0), b.g_actor)
-            f = (phi * psi).sum(-1).amin(0) / sqrt(OFFLINE_LATENT_SIZE)
+        action, g = mean.clamp(-1.0, 1.0), self.normalizer.goal(b.g_actor)
+        phi = torch.stack([freeze(net)(s, action) for net in self.phi])
+        with torch.no_grad():
+            psi = torch.stack([net(g) for net in self.psi])
+        f = (phi * psi).sum(-1).amin(0) / sqrt(OFFLINE_LATENT_SIZE)
         return ascend_and_imitate(f, log_prob(mean, b.a), self.alpha)
 
 

@@ -9,12 +9,11 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torchrl.objectives import hold_out_net
 
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
-from torch_panda.learning.agents.networks import Ensemble, make_mlp
+from torch_panda.learning.agents.networks import Ensemble, freeze, make_mlp
 from torch_panda.learning.agents.offline_losses import (
     OGBENCH_RATES,
     ascend_and_imitate,
@@ -83,6 +82,5 @@ class GCIQL(Agent):
         """DDPG+BC, instead of the paper's weighted imitation (eq. 7)."""
         x = self.normalizer(b.s, b.g_actor)
         mean = self.actor(x)
-        with hold_out_net(self.critic):
-            q = self.critic(x, mean.clamp(-1.0, 1.0)).amin(0)
+        q = freeze(self.critic)(x, mean.clamp(-1.0, 1.0)).amin(0)
         return ascend_and_imitate(q, log_prob(mean, b.a), self.alpha)

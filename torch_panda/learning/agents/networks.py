@@ -1,7 +1,10 @@
 """Multilayer perceptrons of actors, critics and value functions."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 from torchrl.modules import MLP
 
 from torch_panda.learning.agents.hyperparameters import Network
@@ -47,3 +50,16 @@ class Ensemble(nn.ModuleList):
     def forward(self, *inputs: Tensor) -> Tensor:
         """The values, (number, n)."""
         return torch.stack([net(*inputs).squeeze(-1) for net in self])
+
+
+def freeze(network: nn.Module) -> Callable[..., Tensor]:
+    """Return the function of a network, through which a loss does not train it.
+
+    torchrl's `hold_out_net` does the same, but not under `torch.vmap`.
+    """
+    constants = {name: p.detach() for name, p in network.named_parameters()}
+
+    def compute(*inputs: Tensor) -> Tensor:
+        return functional_call(network, constants, inputs)
+
+    return compute

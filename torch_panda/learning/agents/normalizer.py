@@ -79,7 +79,7 @@ class Normalizer(nn.Module):
             ``(..., state size)``.
         """
         normalized = (self._inputs(observation, goal) - self.mean) / self.std
-        return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+        return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def state(self, observation: Tensor) -> Tensor:
         """Standardise observations (..., size) and the offsets that need no goal.
@@ -97,7 +97,7 @@ class Normalizer(nn.Module):
             return goal
         columns = self.goal_columns
         normalized = (goal - self.mean[columns]) / self.std[columns]
-        return normalized.clamp_(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+        return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Concatenate observation, goal and relative inputs, (..., state size)."""
@@ -114,4 +114,4 @@ class Normalizer(nn.Module):
                 inputs = [*geometry.rotations(observation, goal), differences]
             if self.relative_inputs == "fine":
                 inputs.append(differences.clamp(-FINE_LIMIT, FINE_LIMIT))
-        return torch.cat(inputs, -1).clamp_(-CLIP_OBSERVATION, CLIP_OBSERVATION)
+        return torch.cat(inputs, -1).clamp(-CLIP_OBSERVATION, CLIP_OBSERVATION)

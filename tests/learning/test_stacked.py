@@ -1,0 +1,95 @@
+"""Agents that take their gradient steps together learn as each would alone."""
+
+import functools
+
+import pytest
+import torch
+
+import torch_panda
+from tests.learning.episodes import play_randomly
+from torch_panda.learning.agents import OFFLINE_AGENTS, make_agent, networks
+from torch_panda.learning.agents.stacked import StackedAgents
+from torch_panda.learning.buffers import STORED_KEYS
+from torch_panda.learning.offline_data import OfflineData
+from torch_panda.learning.options import default_args
+
+SEEDS, STEPS = 3, 20
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch):
+    monkeypatch.setattr(networks, "HIDDEN_SIZE", 32)
+
+
+@functools.cache
+def play():
+    """An environment and random transitions."""
+    env = torch_panda.make("PandaPush-v1", num_envs=4, seed=0)
+    return env, play_randomly(env).select(*STORED_KEYS).reshape(-1)
+
+
+def make_learner(algo, seed):
+    """An agent, and batches for it."""
+    env, data = play()
+    torch.manual_seed(seed)
+    agent = make_agent(env, default_args("offline", "PandaPush-v1", algo))
+    # So that the statistics of the agents differ.
+    part = data[torch.randperm(len(data))[:100]]
+    agent.normalizer.update(part["observation"], part["desired_goal"])
+    rows = OfflineData(data, env, agent.goal_strategies, agent.gamma)
+    return agent, [agent.extend(rows.sample(16), rows) for _ in range(STEPS)]
+
+
+def make_learners(algo):
+    agents, batches = zip(*(make_learner(algo, i) for i in range(SEEDS)), strict=True)
+    return agents, [*zip(*batches, strict=True)]
+
+
+def states(agents):
+    """Weights, statistics and the optimizer's state of each agent."""
+    return [(a.state_dict(), a.optimizer.state_dict()["state"]) for a in agents]
+
+
+@pytest.mark.parametrize("algo", OFFLINE_AGENTS)
+def test_agents_learn_together_as_alone(algo):
+    agents, batches = make_learners(algo)
+    expected = [
+        [agent.update(batch) for agent, batch in zip(agents, rows, strict=True)]
+        for rows in batches
+    ]
+    others, _ = make_learners(algo)
+    stacked = StackedAgents(others)
+    losses = [stacked.update(rows) for rows in batches[:STEPS]]
+    stacked.write_back()
+
+    close = {"rtol": 1e-3, "atol": 1e-5}
+    torch.testing.assert_close(losses, expected, **close)
+    assert [agent.updates for agent in others] == [STEPS] * SEEDS
+    torch.testing.assert_close(states(others), states(agents), **close)
+    first, second = losses[0][:2]
+    assert all(first[key] != second[key] for key in first if key != "multiplier_loss")
+
+
+@pytest.mark.parametrize("algo", ["hiql", "qrl"])
+def test_agents_continue_alone_and_together_bit_for_bit(algo):
+    """`write_back` and the constructor lose nothing."""
+    agents, batches = make_learners(algo)
+    stacked = StackedAgents(agents)
+    for rows in batches:
+        stacked.update(rows)
+    stacked.write_back()
+    expected = states(agents)
+
+    others, _ = make_learners(algo)
+    stacked = StackedAgents(others)
+    for rows in batches[:5]:
+        stacked.update(rows)
+    stacked.write_back()
+    stacked = StackedAgents(others)
+    for rows in batches[5:]:
+        stacked.update(rows)
+    stacked.write_back()
+    torch.testing.assert_close(states(others), expected, rtol=0, atol=0)
+    for agent, batch in zip(others, batches[0], strict=True):
+        agent.update(batch)
+    assert [agent.updates for agent in others] == [STEPS + 1] * SEEDS
