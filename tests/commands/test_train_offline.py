@@ -100,12 +100,12 @@ def read_weights(folder):
 
 
 def test_seeds_learn_together_as_each_would_alone(tmp_path, capsys):
-    train.main(make_args(tmp_path / "run", seeds=(0, 3)))
+    train.main(make_args(tmp_path / "run", seeds=(0, 3), total_steps=4))
     printed = capsys.readouterr().out
     for seed in (0, 3):
         out, alone = tmp_path / f"run-{seed}", tmp_path / f"alone-{seed}"
-        assert f"after 6 steps; see {out}" in printed
-        train.main(make_args(alone, seed=seed))
+        assert f"after 4 steps; see {out}" in printed
+        train.main(make_args(alone, seed=seed, total_steps=4))
         data, expected = (torch.load(path / "data.pt") for path in (out, alone))
         assert torch.equal(data["action"], expected["action"])
         rows, expected = read_curve(out), read_curve(alone)
@@ -125,7 +125,7 @@ def test_seeds_learn_together_as_each_would_alone(tmp_path, capsys):
 
 def test_resumed_seeds_equal_uninterrupted_ones(tmp_path):
     def make_runs(out, **options):
-        args = make_args(out, "hiql", seeds=(0, 3), **options)
+        args = make_args(out, "hiql", seeds=(0, 3), total_steps=4, **options)
         folders = train.find_folders(args).items()
         return SeveralRuns([train.make_run(options, out) for out, options in folders])
 
@@ -145,10 +145,10 @@ def test_resumed_seeds_equal_uninterrupted_ones(tmp_path):
 
 
 def test_seeds_with_different_numbers_of_steps_are_refused(tmp_path):
-    train.main(make_args(tmp_path / "run-0", seed=0, total_steps=4))
-    train.main(make_args(tmp_path / "run-3", seed=3))
-    args = make_args(tmp_path / "run", seeds=(0, 3), resume=True)
-    with pytest.raises(SystemExit, match=r"number of steps, got 4, 6: continue each"):
+    train.main(make_args(tmp_path / "run-0", seed=0, total_steps=1))
+    train.main(make_args(tmp_path / "run-3", seed=3, total_steps=2))
+    args = make_args(tmp_path / "run", seeds=(0, 3), total_steps=2, resume=True)
+    with pytest.raises(SystemExit, match=r"number of steps, got 1, 2: continue each"):
         train.main(args)
 
 
