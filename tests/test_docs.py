@@ -88,3 +88,15 @@ def test_the_list_for_language_models_has_every_page_with_its_first_sentence():
         "",
         "- [Use](guides/index.html): Use the tasks 1.5 times.",
     ]
+
+
+def test_links_of_guides_lead_to_files():
+    """The built pages contain the files to which guides link, but no folders."""
+    guides = [path for path in load_hooks().guide_files() if path.suffix == ".md"]
+    links = [
+        (guide, link)
+        for guide in guides
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", guide.read_text())
+    ]
+    assert len(links) > 100
+    assert [x for x in links if not (x[0].parent / x[1]).is_file()] == []
