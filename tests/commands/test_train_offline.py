@@ -208,8 +208,8 @@ def test_a_file_trains_as_its_data_do_and_a_changed_file_is_refused(tmp_path):
     data = tmp_path / "first" / "data.pt"
     args = make_args(tmp_path / "second", data=str(data), total_steps=2)
     train.main(args)
-    runs = [tmp_path / name / "checkpoint.pt" for name in ("first", "second")]
-    ours, theirs = (torch.load(path)["policy"] for path in runs)
+    runs = [tmp_path / name for name in ("first", "second")]
+    ours, theirs = map(read_weights, runs)
     torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
     content = torch.load(data)
     content["action"] *= 0.5

@@ -4,16 +4,13 @@
 tensors, and runs none of its Python code.
 """
 
-import functools
-
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torchrl.modules.distributions import continuous
 
-import torch_panda
-from tests.learning.episodes import play_randomly
+from tests.learning.episodes import play
 from torch_panda.learning.agents import (
     AGENTS,
     OFFLINE_AGENTS,
@@ -24,7 +21,6 @@ from torch_panda.learning.agents import (
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.recorded_step import WARM_UP
 from torch_panda.learning.agents.stacked import StackedAgents
-from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import default_args
 
@@ -105,13 +101,6 @@ def _fake_gpu(monkeypatch):
     # torchrl checks the arguments of distributions only outside of recordings.
     name = "safe_is_current_stream_capturing"
     monkeypatch.setattr(continuous, name, lambda: True)
-
-
-@functools.cache
-def play(env_id):
-    """An environment and random transitions."""
-    env = torch_panda.make(env_id, num_envs=4, seed=0)
-    return env, play_randomly(env).select(*STORED_KEYS).reshape(-1)
 
 
 def make_batches(env, data, agent, number):

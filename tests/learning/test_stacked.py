@@ -1,15 +1,11 @@
 """Agents that take their gradient steps together learn as each would alone."""
 
-import functools
-
 import pytest
 import torch
 
-import torch_panda
-from tests.learning.episodes import play_randomly
+from tests.learning.episodes import play
 from torch_panda.learning.agents import OFFLINE_AGENTS, make_agent, networks
 from torch_panda.learning.agents.stacked import StackedAgents
-from torch_panda.learning.buffers import STORED_KEYS
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import default_args
 
@@ -21,16 +17,9 @@ def _small(monkeypatch):
     monkeypatch.setattr(networks, "HIDDEN_SIZE", 32)
 
 
-@functools.cache
-def play():
-    """An environment and random transitions."""
-    env = torch_panda.make("PandaPush-v1", num_envs=4, seed=0)
-    return env, play_randomly(env).select(*STORED_KEYS).reshape(-1)
-
-
 def make_learner(algo, seed):
     """An agent, and batches for it."""
-    env, data = play()
+    env, data = play("PandaPush-v1")
     torch.manual_seed(seed)
     agent = make_agent(env, default_args("offline", "PandaPush-v1", algo))
     # So that the statistics of the agents differ.
@@ -59,7 +48,7 @@ def test_agents_learn_together_as_alone(algo):
     ]
     others, _ = make_learners(algo)
     stacked = StackedAgents(others)
-    losses = [stacked.update(rows) for rows in batches[:STEPS]]
+    losses = [stacked.update(rows) for rows in batches]
     stacked.write_back()
 
     close = {"rtol": 1e-3, "atol": 1e-5}

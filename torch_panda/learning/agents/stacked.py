@@ -19,9 +19,9 @@ from torch_panda.learning.agents.base import Agent
 class StackedAgents:
     """Agents that take their gradient steps together.
 
-    Each agent learns from its own batches, and what it learns differs from what it
-    would learn alone by rounding only. The steps change the stacked weights; call
-    `write_back` before an agent is used or saved.
+    Each agent learns from its own batches. Apart from rounding, a step gives an agent
+    the weights that it would have after a step alone. The steps change the stacked
+    weights. Call `write_back` before an agent is used or saved.
 
     Args:
         agents: Agents of the same class with the same hyperparameters, which have taken
