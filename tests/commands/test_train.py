@@ -159,19 +159,19 @@ def test_a_killed_run_goes_on_from_its_last_save(tmp_path, monkeypatch):
     whole.close()
 
     def killed_at(steps, run):
-        learn = run.learn
+        sample = run.sample
 
-        def learn_or_die():
+        def sample_or_die():
             if run.progress.steps == steps:
                 raise Kill
-            return learn()
+            return sample()
 
-        return learn_or_die
+        return sample_or_die
 
     out = tmp_path / "killed"
     out.mkdir()
     killed = Run(args, out)
-    killed.learn = killed_at(200, killed)
+    killed.sample = killed_at(200, killed)
     with pytest.raises(Kill):
         killed.train()
     killed.close()
@@ -239,30 +239,26 @@ def test_the_normaliser_sees_hindsight_goals(tmp_path, monkeypatch):
     assert 0.6 < changed.float().mean() < 0.95
 
 
-def test_a_quarter_of_each_batch_are_demonstrations(tmp_path, monkeypatch, make_demos):
+def test_a_quarter_of_each_batch_are_demonstrations(tmp_path, make_demos):
     demos = TensorDict(torch.load(make_demos("PandaReach-v1"))).auto_batch_size_(1)
     args = Args(num_envs=1, total_steps=50, updates_per_step=0.1, batch_size=64)
     run = Run(args, tmp_path, demos)
     assert run.agent.normalizer.count == len(demos)
     run.source.store(next(iter(run.source.collector)))
     run.close()
-    sizes = []
-    monkeypatch.setattr(
-        run.agent, "update", lambda *x: sizes.append(tuple(map(len, x))) or {}
-    )
     run.progress.steps = 50
-    run.learn()
+    sizes = [(len(batch), len(demos)) for batch, demos in run.sample()]
     assert sizes == [(48, 16)] * 5
 
 
 def test_ctrl_c_saves_the_run(tmp_path, monkeypatch, capsys):
-    learn = Run.learn
+    sample = Run.sample
 
-    def learn_and_interrupt(run):
+    def sample_and_interrupt(run):
         os.kill(os.getpid(), signal.SIGINT)
-        return learn(run)
+        return sample(run)
 
-    monkeypatch.setattr(Run, "learn", learn_and_interrupt)
+    monkeypatch.setattr(Run, "sample", sample_and_interrupt)
     args = Args(num_envs=2, total_steps=100_000, eval_interval=100, out=tmp_path)
     train.main(replace(args, updates_per_step=0.1))
     output = capsys.readouterr().out

@@ -20,7 +20,7 @@ from torch_panda.learning.agents import OFFLINE_AGENTS
 from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.learning.options import default_args
 from torch_panda.learning.sources import draw_batches
-from torch_panda.learning.training import SeveralRuns
+from torch_panda.learning.training import Training
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -127,7 +127,7 @@ def test_resumed_seeds_equal_uninterrupted_ones(tmp_path):
     def make_runs(out, **options):
         args = make_args(out, "hiql", seeds=(0, 3), total_steps=4, **options)
         folders = train.find_folders(args).items()
-        return SeveralRuns([train.make_run(options, out) for out, options in folders])
+        return Training([train.make_run(options, out) for out, options in folders])
 
     whole = make_runs(tmp_path / "whole")
     assert whole.train()

@@ -41,7 +41,7 @@ from torch_panda.learning.options import (
     check,
     default_args,
 )
-from torch_panda.learning.training import Run, SeveralRuns, StopSignal
+from torch_panda.learning.training import Run, StopSignal, Training
 from torch_panda.learning.user_modules import import_modules
 from torch_panda.registry import find_registration
 from torch_panda.testing import check_task
@@ -161,7 +161,7 @@ def main(args: Args) -> None:
         if args.preset == "recipe":
             spaces = runs[0].agent.spaces
             print(describe_recipe(args, spaces, is_declared=is_declared))
-        training = runs[0] if len(runs) == 1 else SeveralRuns(runs)
+        training = Training(runs)
         stop = StopSignal()
         default = default_args(args.preset, args.env_id, args.algo)
         with ExitStack() as locks:

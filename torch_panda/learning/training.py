@@ -12,7 +12,6 @@ by default one.
 import os
 import signal
 import time
-from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
@@ -32,7 +31,7 @@ from torch_panda.learning.evaluation.curve import NUM_ENVS, Curve
 from torch_panda.learning.files.logger import make_logger
 from torch_panda.learning.files.run_files import Checkpoint, Progress
 from torch_panda.learning.options import Args
-from torch_panda.learning.sources import DataSet, Experience
+from torch_panda.learning.sources import Batches, DataSet, Experience
 
 # Steps between two saves, including gradient steps of imitation.
 SAVE_INTERVAL = 20_000
@@ -40,93 +39,7 @@ SAVE_INTERVAL = 20_000
 SOLVED_EVALUATIONS = 3
 
 
-class Training(ABC):
-    """The training loop, of one run or of `SeveralRuns`.
-
-    Attributes:
-        args: Options of the training.
-        progress: Progress of the training; with several runs, of the first one.
-    """
-
-    args: Args
-    progress: Progress
-
-    def train(self, stop: object = False) -> bool:
-        """Train until the last step, or until ``stop`` is true after an iteration.
-
-        Args:
-            stop: Object that becomes true to end the training early, such as
-                `StopSignal`.
-
-        Returns:
-            Whether the training reached the last step.
-
-        Raises:
-            OSError: A file cannot be written.
-        """
-        args, progress = self.args, self.progress
-        self.begin()
-        bar = tqdm(
-            desc=f"{args.env_id} {args.algo}",
-            initial=progress.iterated,
-            total=args.pretrain_updates + args.total_steps,
-            unit="step",
-        )
-        finished = stopped = self.is_finished()
-        while not stopped:
-            started, before = time.perf_counter(), progress.iterated
-            is_row = self.iterate()
-            self.add_time(time.perf_counter() - started)
-            bar.update(progress.iterated - before)
-            if is_row:
-                self.evaluate()
-            finished = self.is_finished()
-            bar.set_postfix(success=self.success)
-            stopped = finished or bool(stop)
-            if stopped or crossed(SAVE_INTERVAL, before, progress.iterated):
-                self.save()
-        bar.close()
-        return finished
-
-    @property
-    @abstractmethod
-    def success(self) -> str:
-        """The last success rate as text."""
-
-    @abstractmethod
-    def begin(self) -> None:
-        """Evaluate the policy of a new run."""
-
-    @abstractmethod
-    def iterate(self) -> bool:
-        """Take the steps of one iteration.
-
-        Returns:
-            Whether the policy is to be evaluated.
-        """
-
-    @abstractmethod
-    def add_time(self, seconds: float) -> None:
-        """Add the time of an iteration [s]."""
-
-    @abstractmethod
-    def evaluate(self) -> None:
-        """Evaluate the policy, and write the results."""
-
-    @abstractmethod
-    def is_finished(self) -> bool:
-        """Whether the last step was taken, or the task is solved."""
-
-    @abstractmethod
-    def save(self) -> None:
-        """Write the state from which the training can be resumed."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the environments."""
-
-
-class Run(Training):
+class Run:
     """A training with its environments, its agent and the source of its batches.
 
     Args:
@@ -193,7 +106,7 @@ class Run(Training):
         )
         if args.resume:
             self.checkpoint.load()
-        self.random_state = torch.get_rng_state()  # for `SeveralRuns`
+        self.random_state = torch.get_rng_state()
 
     def _make_env(self) -> GoalEnv:
         """Make the environments of the options, for training."""
@@ -213,21 +126,21 @@ class Run(Training):
             **options,
         )
 
-    @property
-    def success(self) -> str:
-        """The last success rate as text."""
-        return self.progress.success
-
-    def begin(self) -> None:
-        """Evaluate the policy of a new run."""
-        self.curve.begin(self.checkpoint)
+    def train(self, stop: object = False) -> bool:
+        """Train this run alone; see `Training.train`."""
+        return Training([self]).train(stop)
 
     def iterate(self) -> bool:
-        """Imitate, or else get steps from the source and learn from them."""
+        """Imitate, or else get steps from the source and learn from them.
+
+        Returns:
+            Whether the policy is to be evaluated.
+        """
         if self.progress.pretrained < self.args.pretrain_updates:
             return self.imitate()
         steps = self.collect()
-        self.add_losses(self.learn(), steps)
+        losses = [self.agent.update(batch, demos) for batch, demos in self.sample()]
+        self.add_losses(losses, steps)
         return self.has_row(steps)
 
     def imitate(self) -> bool:
@@ -252,15 +165,10 @@ class Run(Training):
         self.progress.steps += steps
         return steps
 
-    def learn(self) -> list[dict[str, Tensor]]:
-        """Take the gradient steps that are due, and return the losses of each."""
-        batches = self.source.sample(self.args.batch_size, self.num_due())
-        return [self.agent.update(batch, demos) for batch, demos in batches]
-
-    def num_due(self) -> int:
-        """Number of gradient steps that are due after the steps so far."""
+    def sample(self) -> Batches:
+        """Draw the batches of the gradient steps that are due."""
         due = int(self.progress.steps * self.args.updates_per_step) - self.agent.updates
-        return due if len(self.source) else 0
+        return self.source.sample(self.args.batch_size, due if len(self.source) else 0)
 
     def add_losses(self, losses: Sequence[dict[str, Tensor]], steps: int) -> None:
         """Add the losses of an iteration, which took ``steps`` steps.
@@ -286,10 +194,6 @@ class Run(Training):
         is_last = after >= args.total_steps
         return is_last or crossed(args.eval_interval, after - steps, after)
 
-    def add_time(self, seconds: float) -> None:
-        """Add the time of an iteration [s]."""
-        self.progress.seconds += seconds
-
     def evaluate(self) -> None:
         """Evaluate the policy, and write the results."""
         progress = self.progress
@@ -311,20 +215,17 @@ class Run(Training):
         )
         return is_last or (args.stop_when_solved and is_solved)
 
-    def save(self) -> None:
-        """Write the state from which the run can be resumed."""
-        self.checkpoint.save()
-
     def close(self) -> None:
         """Close the environments."""
         self.source.close()
         self.curve.close()
 
 
-class SeveralRuns(Training):
-    """Runs with a data set that differ in their seeds, and learn together.
+class Training:
+    """The training loop, of one run or of several that learn together.
 
-    Each run has its files and its random numbers, as if it learned alone.
+    Runs that learn together learn from a data set, and differ in their seeds. Each has
+    its files and its random numbers, as if it learned alone.
 
     Args:
         runs: The runs.
@@ -335,70 +236,98 @@ class SeveralRuns(Training):
 
     def __init__(self, runs: Sequence[Run]) -> None:
         self.runs = runs
-        self.args, self.progress = runs[0].args, runs[0].progress
         steps = [run.progress.steps for run in runs]
         if len(set(steps)) > 1:
             raise ValueError(
                 f"runs that learn together must have taken the same number of steps, "
                 f"got {', '.join(map(str, steps))}: continue each alone, with --seed"
             )
-        self.agents = StackedAgents([run.agent for run in runs])
+        self.stacked: StackedAgents | None = None
+        if len(runs) > 1:
+            self.stacked = StackedAgents([run.agent for run in runs])
         self._random_states = [run.random_state for run in runs]
 
-    def each(self) -> Iterator[Run]:
-        """Go through the runs, each with its state of torch's random generator."""
-        for i, run in enumerate(self.runs):
-            torch.set_rng_state(self._random_states[i])
-            yield run
-            self._random_states[i] = torch.get_rng_state()
+    def train(self, stop: object = False) -> bool:
+        """Train until the last step, or until ``stop`` is true after an iteration.
 
-    @property
-    def success(self) -> str:
-        """The last success rate of each run as text."""
-        return " ".join(run.success for run in self.runs)
+        Args:
+            stop: Object that becomes true to end the training early, such as
+                `StopSignal`.
 
-    def begin(self) -> None:
-        """Evaluate the policies of new runs."""
-        for run in self.each():
-            run.begin()
+        Returns:
+            Whether the training reached the last step.
 
-    def iterate(self) -> bool:
-        """Take gradient steps, each on a batch of every run."""
-        drawn, steps = [], 0
-        for run in self.each():
-            steps = run.collect()
-            batches = run.source.sample(self.args.batch_size, run.num_due())
-            drawn.append([batch for batch, _ in batches])
-        losses = [self.agents.update(batches) for batches in zip(*drawn, strict=True)]
-        for i, run in enumerate(self.runs):
-            run.add_losses([step[i] for step in losses], steps)
-        return self.runs[0].has_row(steps)
-
-    def add_time(self, seconds: float) -> None:
-        """Add the time of an iteration [s], which the runs share."""
-        for run in self.runs:
-            run.add_time(seconds)
-
-    def evaluate(self) -> None:
-        """Evaluate the policies, and write the results."""
-        self.agents.write_back()
-        for run in self.each():
-            run.evaluate()
-
-    def is_finished(self) -> bool:
-        """Whether all runs are finished."""
-        return all(run.is_finished() for run in self.runs)
-
-    def save(self) -> None:
-        """Write the states from which the runs can be resumed."""
-        self.agents.write_back()
-        for run in self.each():
-            run.save()
+        Raises:
+            OSError: A file cannot be written.
+        """
+        # All runs have taken the same number of steps, with the same options.
+        args, progress = self.runs[0].args, self.runs[0].progress
+        for run in self._each():
+            run.curve.begin(run.checkpoint)
+        bar = tqdm(
+            desc=f"{args.env_id} {args.algo}",
+            initial=progress.iterated,
+            total=args.pretrain_updates + args.total_steps,
+            unit="step",
+        )
+        finished = stopped = all(run.is_finished() for run in self.runs)
+        while not stopped:
+            started, before = time.perf_counter(), progress.iterated
+            is_row = self._iterate()
+            seconds = time.perf_counter() - started
+            bar.update(progress.iterated - before)
+            for run in self.runs:
+                run.progress.seconds += seconds
+            if is_row:
+                self._write_back()
+                for run in self._each():
+                    run.evaluate()
+            finished = all(run.is_finished() for run in self.runs)
+            bar.set_postfix(success=" ".join(run.progress.success for run in self.runs))
+            stopped = finished or bool(stop)
+            if stopped or crossed(SAVE_INTERVAL, before, progress.iterated):
+                self._write_back()
+                for run in self._each():
+                    run.checkpoint.save()
+        bar.close()
+        return finished
 
     def close(self) -> None:
         """Close the environments."""
         for run in self.runs:
             run.close()
+
+    def _each(self) -> Iterator[Run]:
+        """Go through the runs, each with its state of torch's random generator."""
+        if self.stacked is None:
+            yield from self.runs
+            return
+        for i, run in enumerate(self.runs):
+            torch.set_rng_state(self._random_states[i])
+            yield run
+            self._random_states[i] = torch.get_rng_state()
+
+    def _write_back(self) -> None:
+        """Copy stacked weights to the agents of the runs."""
+        if self.stacked is not None:
+            self.stacked.write_back()
+
+    def _iterate(self) -> bool:
+        """Take the steps of one iteration.
+
+        Returns:
+            Whether the policies are to be evaluated.
+        """
+        if self.stacked is None:
+            return self.runs[0].iterate()
+        drawn, steps = [], 0
+        for run in self._each():
+            steps = run.collect()
+            drawn.append([batch for batch, _ in run.sample()])
+        losses = [self.stacked.update(batches) for batches in zip(*drawn, strict=True)]
+        for i, run in enumerate(self.runs):
+            run.add_losses([step[i] for step in losses], steps)
+        return self.runs[0].has_row(steps)
 
 
 def crossed(interval: int, before: int, after: int) -> bool:
