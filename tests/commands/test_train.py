@@ -251,6 +251,26 @@ def test_a_quarter_of_each_batch_are_demonstrations(tmp_path, make_demos):
     assert sizes == [(48, 16)] * 5
 
 
+def test_critics_of_parts_learn_from_rewards_of_parts(tmp_path, make_demos):
+    path = make_demos("PandaStack-v1", episodes=1)
+    demos = TensorDict(torch.load(path)).auto_batch_size_(1)
+    args = default_args("recipe", "PandaStack-v1")
+    assert args.critics == "parts"
+    args = replace(args, num_envs=1, updates_per_step=0.01, keep_unmoved=1.0)
+    run = Run(args, tmp_path, demos)
+    run.iterate()
+    [(batch, demonstrated)] = run.source.sample(args.batch_size, 1)
+    run.close()
+    for rows in (batch, demonstrated):
+        assert rows["next", "reward"].shape == (len(rows), 2)
+    assert run.agent.updates == 1
+
+
+@pytest.mark.parametrize("algo", ["td3", "sac"])
+def test_only_ddpg_has_critics_of_parts(algo):
+    assert parse(["--algo", algo, "--env-id", "PandaStack-v1"]).critics == "whole"
+
+
 def test_ctrl_c_saves_the_run(tmp_path, monkeypatch, capsys):
     sample = Run.sample
 
@@ -377,6 +397,7 @@ def test_help_separates_what_one_may_change_from_what_research_varies(capsys):
 def test_crl_draws_geometric_goals_in_every_preset(preset, env_id):
     args = parse(["--algo", "crl", "--preset", preset, "--env-id", env_id])
     recipe = default_args(preset, env_id)
-    assert args == replace(recipe, algo="crl", her="geometric", desired_ratio=0.0)
+    changes = {"her": "geometric", "desired_ratio": 0.0, "critics": "whole"}
+    assert args == replace(recipe, algo="crl", **changes)
     check(args)
     assert parse(["--algo", "crl", "--her", "relabel"]).her == "relabel"

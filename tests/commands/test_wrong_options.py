@@ -30,6 +30,12 @@ DEMOS = ["--demos", "nofile.pt"]
         ),
         ("train", ["--algo", "crl", *DEMOS], "algo crl cannot use demonstrations"),
         ("train", ["--her", "parts"], "--her parts needs goals of several objects"),
+        ("train", ["--critics", "parts"], 'critics "parts" needs goals of several obj'),
+        (
+            "train",
+            ["--env-id", "PandaStack-v1", "--critics", "parts", "--algo", "td3"],
+            "critics parts needs algo ddpg, got td3: pass --critics whole",
+        ),
         ("train", ["--start-at-object", "0.5"], "needs end-effector control"),
         ("train", ["--task-options", "goal", "1"], "unexpected keyword .* 'goal'"),
         (

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import torch_panda
 from tests.learning.episodes import play_randomly
@@ -37,6 +38,19 @@ def test_each_kind_of_hindsight_has_its_strategy_and_ratio(stack, options, expec
     batch = buffer.sample(256)
     goals = batch["next", "achieved_goal"], batch["desired_goal"]
     assert torch.equal(batch["next", "reward"], stack.compute_reward(*goals))
+
+
+def test_the_reward_of_a_part_ignores_the_other_parts(stack):
+    achieved = torch.zeros(4, 6)
+    goal = achieved.clone()
+    goal[1, 0] = goal[2, 3] = goal[3, 0] = goal[3, 5] = 0.3
+    transitions = {
+        "desired_goal": goal,
+        "next": {"achieved_goal": achieved, "reward": torch.full((4, 1), -1.0)},
+    }
+    rewards = buffers.PartRewards(stack.compute_reward)(TensorDict(transitions, [4]))
+    expected = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [0.0, -1.0], [-1.0, -1.0]])
+    assert torch.equal(rewards["next", "reward"], expected)
 
 
 def test_her_none_keeps_the_goals(stack):

@@ -80,6 +80,21 @@ def test_differences_lead_from_hand_to_object_and_object_to_goal(task):
         torch.testing.assert_close(result, expected)
 
 
+def test_numbers_of_a_stack_belong_to_their_cubes():
+    with torch_panda.make("PandaStack-v1", num_envs=1) as env:
+        inputs, offsets = read_geometry(env).owners()
+    # Hand and fingers, two cubes, and two goals. The cubes are at 7 and at 19.
+    first, second = 7, 19
+    goals = [first] * 3 + [second] * 3
+    assert inputs == [None] * 7 + [first] * 12 + [second] * 12 + goals
+    assert offsets == goals * 2  # from the hand to the cubes, from the cubes to goals
+
+
+def test_numbers_of_reach_belong_to_no_object():
+    with torch_panda.make("PandaReach-v1", num_envs=1) as env:
+        assert read_geometry(env).owners() == ([None] * 9, [None] * 3)
+
+
 def test_rotations_are_the_same_for_the_24_orientations_that_look_alike():
     generator = torch.Generator().manual_seed(0)
     with torch_panda.make("PandaFlip-v1", seed=0) as env:

@@ -4,11 +4,13 @@ Rewards are -1 or 0 and gamma is 0.75, so returns lie between -4 and 0.
 """
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.learning import gradient_steps
 from tests.learning.gradient_steps import (
     SPACES,
     Expected,
@@ -19,6 +21,7 @@ from tests.learning.gradient_steps import (
     parameters_of,
 )
 from torch_panda.learning.agents import AGENTS, Hyperparameters
+from torch_panda.learning.agents.normalizer import Normalizer
 
 LEARNING_RATE = 1e-3
 GAMMA = 0.75
@@ -31,25 +34,25 @@ ENDS = [False, False, False, False, False, False, True, True]
 def make_agent(algo, seed=0, **options):
     torch.manual_seed(seed)
     hp = Hyperparameters(algo=algo, gamma=GAMMA, **options)
-    agent = AGENTS[algo](SPACES, hp)
+    agent = AGENTS[algo](gradient_steps.SPACES, hp)
     fill_normalizer(agent)
     return agent
 
 
 def make_rows(rewards=REWARDS, ends=ENDS):
     n = len(rewards)
-    goal = torch.randn(n, SPACES.goal_size)
+    goal = torch.randn(n, gradient_steps.SPACES.goal_size)
     after = {
-        "observation": torch.randn(n, SPACES.observation_size),
+        "observation": torch.randn(n, gradient_steps.SPACES.observation_size),
         "desired_goal": goal,
         "reward": torch.tensor(rewards).unsqueeze(-1),
         "terminated": torch.tensor(ends).unsqueeze(-1),
     }
     after["done"] = after["terminated"]
     rows = {
-        "observation": torch.randn(n, SPACES.observation_size),
+        "observation": torch.randn(n, gradient_steps.SPACES.observation_size),
         "desired_goal": goal,
-        "action": 2 * torch.rand(n, SPACES.action_size) - 1,
+        "action": 2 * torch.rand(n, gradient_steps.SPACES.action_size) - 1,
         "next": after,
     }
     return TensorDict(rows, [n])
@@ -63,10 +66,10 @@ def states(agent, rows):
     )
 
 
-def target_values(next_values, lowest=-4.0, highest=0.0):
+def target_values(next_values, lowest=-4.0, highest=0.0, rewards=REWARDS):
     """The value that the critics learn for each row, (n,)."""
     targets = []
-    for reward, ends, value in zip(REWARDS, ENDS, next_values.tolist(), strict=True):
+    for reward, ends, value in zip(rewards, ENDS, next_values.tolist(), strict=True):
         if ends:
             # A failure counts as if the goal were never reached: -1 - 0.75 - ... = -4.
             targets.append(0.0 if reward == 0 else -4.0)
@@ -111,6 +114,36 @@ def test_ddpg_takes_the_calculated_step():
     actor_loss = penalty - critic(state, action).mean()
     expected = {
         "critic_loss": Expected(critic_loss, parameters_of(critic), LEARNING_RATE),
+        "actor_loss": Expected(actor_loss, parameters_of(agent.actor), LEARNING_RATE),
+    }
+    check_step(agent, lambda: agent.update(rows), expected, target_networks(agent), TAU)
+
+
+def test_ddpg_learns_a_critic_for_each_part(monkeypatch):
+    """Each critic has its rewards and weights, and the actor maximises their mean."""
+    monkeypatch.setattr(gradient_steps, "SPACES", replace(SPACES, goal_size=6))
+    weights = torch.stack((torch.ones(11), torch.linspace(0.1, 1.1, 11)))
+    monkeypatch.setattr(Normalizer, "part_weights", lambda _: weights)
+    agent = make_dispersed("ddpg", critics="parts")
+    rows = make_rows()
+    others = torch.tensor([0.0, -1.0, -1.0, 0.0, -1.0, -1.0, 0.0, 0.0])
+    rewards = torch.stack((torch.tensor(REWARDS), others), 1)
+    rows["next", "reward"] = rewards
+    state, next_state = states(agent, rows)
+    next_action = agent.target_actor(next_state)
+    action, actor_loss = actor_terms(agent, state)
+    critic_loss = 0.0
+    for k, (critic, target_critic) in enumerate(
+        zip(agent.critics, agent.target_critics, strict=True)
+    ):
+        next_value = target_critic(next_state * weights[k], next_action)[:, 0]
+        target = target_values(next_value, rewards=rewards[:, k].tolist())
+        value = critic(state * weights[k], rows["action"])[:, 0]
+        critic_loss = critic_loss + ((value - target) ** 2).mean()
+        actor_loss = actor_loss - critic(state * weights[k], action).mean() / 2
+    critics = parameters_of(agent.critics)
+    expected = {
+        "critic_loss": Expected(critic_loss, critics, LEARNING_RATE),
         "actor_loss": Expected(actor_loss, parameters_of(agent.actor), LEARNING_RATE),
     }
     check_step(agent, lambda: agent.update(rows), expected, target_networks(agent), TAU)

@@ -34,6 +34,18 @@ def test_relative_inputs_append_differences():
     torch.testing.assert_close(fine, torch.cat((coarse, clipped), -1))
 
 
+def test_a_critic_of_a_part_sees_little_of_other_objects():
+    with torch_panda.make("PandaStack-v1", num_envs=1) as env:
+        first, second = make(env, "fine").part_weights()
+        plain, _ = make(env).part_weights()
+    # Each cube has 12 numbers, 3 of the goal, and two offsets, coarse and fine.
+    goals_and_offsets = [1.0] * 3 + [0.1] * 3
+    expected = [1.0] * 7 + [1.0] * 12 + [0.1] * 12 + goals_and_offsets * 5
+    torch.testing.assert_close(first, torch.tensor(expected))
+    torch.testing.assert_close(plain, first[:37])
+    assert ((first == 0.1) != (second == 0.1)).sum() == 2 * (12 + 15)
+
+
 def test_agents_see_the_offsets_that_their_options_name():
     """Reach has one offset, from the hand to the goal. It is an input twice, "fine"."""
     with torch_panda.make("PandaReach-v1", num_envs=3, seed=0) as env:

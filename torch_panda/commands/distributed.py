@@ -32,7 +32,7 @@ from tyro.conf import Suppress
 
 import torch_panda
 from torch_panda.learning.agents import Hyperparameters, make_agent
-from torch_panda.learning.agents.hyperparameters import ActorGoal, OnlineAlgo
+from torch_panda.learning.agents.hyperparameters import ActorGoal, Critics, OnlineAlgo
 from torch_panda.learning.buffers import STORED_KEYS, make_buffer
 from torch_panda.learning.evaluation.curve import Curve, draw_seed
 from torch_panda.learning.files.run_files import (
@@ -56,7 +56,9 @@ class Args(Hyperparameters):
     algo: OnlineAlgo = "ddpg"
     """algorithm: DDPG, TD3, SAC or CRL"""
     # The workers step environments, so the options of offline agents have no effect.
+    # The buffer has no rewards for critics of parts.
     offline: Suppress[bool] = False
+    critics: Suppress[Critics] = "whole"
     actor_goal: Suppress[ActorGoal] = "future"
     alpha: Suppress[float | None] = None
 

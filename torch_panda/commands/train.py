@@ -223,6 +223,7 @@ def describe_recipe(args: Args, spaces: Spaces, *, is_declared: bool) -> str:
         f"{num_objects} objects and {num_goals} goal positions "
         f"({'declared' if is_declared else 'found'})",
         f"hindsight {args.her!r} with {args.desired_ratio:.0%} desired goals",
+        f"critics {args.critics!r}",
         f"inputs {args.relative_inputs!r}",
         f"augmentation {args.augmentation!r}",
     ]

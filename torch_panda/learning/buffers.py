@@ -6,8 +6,10 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, pad
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Transform
 
 from torch_panda.learning.environments import GoalEnv
+from torch_panda.tasks.base import RewardFunction
 from torch_panda.transforms import HindsightRelabel
 
 Hindsight = Literal["relabel", "parts", "geometric", "none"]
@@ -48,6 +50,32 @@ class ResumableReplayBuffer(TensorDictReplayBuffer):
             padded = pad(rows, [0, self.storage.max_size - len(rows)])
             storage = {**storage, "_storage": padded.state_dict()}
         super().load_state_dict({**state_dict, "_storage": storage})
+
+
+class PartRewards(Transform):
+    """Replaces sampled rewards (n, 1) by those of each part of the goal, (n, parts).
+
+    The reward of a part is that of a goal whose other parts are achieved.
+
+    Args:
+        compute_reward: The reward of achieved and desired goal, (n, 1).
+    """
+
+    def __init__(self, compute_reward: RewardFunction) -> None:
+        super().__init__()
+        self.compute_reward = compute_reward
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the rewards of sampled transitions."""
+        achieved = tensordict["next", "achieved_goal"]
+        goal = tensordict["desired_goal"]
+        rewards = []
+        for start in range(0, goal.shape[-1], POSITION_SIZE):
+            part = slice(start, start + POSITION_SIZE)
+            goal_of_part = achieved.clone()
+            goal_of_part[..., part] = goal[..., part]
+            rewards.append(self.compute_reward(achieved, goal_of_part))
+        return tensordict.set(("next", "reward"), torch.cat(rewards, -1))
 
 
 def make_buffer(

@@ -170,7 +170,7 @@ OWN_OPTIONS = ("task_options", "physics", "start_at_object", "randomize", "demos
 # Options that have an effect only with an environment, or only with --offline.
 ONLINE_OPTIONS = (
     *("double_q", "action_l2", "ema_rate", "noise_eps"),
-    *("random_eps", "exploration", "fine_fingers", "augmentation", "her"),
+    *("random_eps", "exploration", "fine_fingers", "augmentation", "her", "critics"),
     *("desired_ratio", "keep_unmoved", "updates_per_step", "randomize"),
     *("pretrain_updates", "start_at_object", "demos", "workers"),
 )
@@ -255,6 +255,10 @@ def check(args: Args) -> None:
         check_exploration(args, args.num_envs)
         if args.algo == "crl":
             check_crl(args)
+        if args.critics == "parts" and args.algo != "ddpg":
+            raise ValueError(
+                f"critics parts needs algo ddpg, got {args.algo}: pass --critics whole"
+            )
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demonstrations: pass --demos")
     has_demos = args.demos is not None and args.total_steps > 0
@@ -285,6 +289,8 @@ def default_args(preset: Preset, env_id: str, algo: Algo | None = None) -> Args:
         options = find_recipe(env_id)
     if algo is not None:
         options["algo"] = algo
+        if algo != "ddpg":
+            options.pop("critics", None)
     if algo == "crl" and preset != "offline":
         options |= CRL_OPTIONS
     return Args(preset=preset, env_id=env_id, **options)

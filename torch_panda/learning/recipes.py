@@ -35,6 +35,9 @@ RECIPE: dict[str, Any] = {
     "total_steps": 40_000,
     "stop_when_solved": True,
 }
+# If goals have parts for several objects, each object is learned on its own. Otherwise
+# a second object delays the learning of the first one, even if it has no goal.
+EACH_OBJECT = {"her": "parts", "critics": "parts"}
 # The preset "offline", for all algorithms that learn from a data set. As in OGBench,
 # but with smaller networks and batches.
 OFFLINE: dict[str, Any] = {
@@ -71,7 +74,7 @@ def derive_options(registration: Registration) -> dict[str, Any]:
         options["exploration"] = "actions"
     num_objects, rest = divmod(task.goal_dim, 3)
     if num_objects > 1 and not rest:
-        options["her"] = "parts"  # each object on its own
+        options |= EACH_OBJECT
     return options
 
 
@@ -93,7 +96,7 @@ def find_options(env: GoalEnv) -> dict[str, Any]:
     if hand is None:
         options["exploration"] = "actions"
     if len(geometry.goal_positions) > 1:
-        options["her"] = "parts"
+        options |= EACH_OBJECT
     return options
 
 

@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents import Agent
-from torch_panda.learning.buffers import make_buffer, select_sequences
+from torch_panda.learning.buffers import PartRewards, make_buffer, select_sequences
 from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.environments.starts import StartFrom, states_at_objects
 from torch_panda.learning.evaluation.curve import reseed
@@ -93,12 +93,17 @@ class Experience:
             discount=agent.gamma,
             seed=args.seed,
         )
+        has_part_critics = args.critics == "parts"
+        if has_part_critics:
+            self.buffer.append_transform(PartRewards(env.compute_reward))
         self.num_demos = 0  # demonstrated transitions in each batch
         if demos is not None:
             demos = demos.to(env.device)
             agent.normalizer.update(demos["observation"], demos["desired_goal"])
             storage = TensorStorage(demos, device=env.device)
             self.demos = TensorDictReplayBuffer(storage=storage)
+            if has_part_critics:
+                self.demos.append_transform(PartRewards(env.compute_reward))
             self.num_demos = int(DEMO_RATIO * args.batch_size)
         explored: EnvBase = env
         if args.start_at_object:

@@ -239,8 +239,9 @@ class Agent(nn.Module, ABC):
             # A failure that ends an episode gets the return of never reaching the goal.
             # With its reward of -1, an agent would fail on purpose, to avoid the
             # rewards of -1 in the steps that follow.
-            failed = b.ends & (b.r < 0)
-            b = b._replace(r=b.r.masked_fill(failed, self.min_return))
+            rewards = b.r.movedim(-1, 0)  # (n,), or (parts, n)
+            rewards = rewards.masked_fill(b.ends & (rewards < 0), self.min_return)
+            b = b._replace(r=rewards.movedim(0, -1))
         if self.hp.fine_fingers:
             b = b._replace(a=to_fine(b.a))
         return b
@@ -294,6 +295,11 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
         raise ValueError(
             'exploration "points" needs the control type "ee" or "joints": for another '
             "one pass --exploration actions"
+        )
+    if hp.critics == "parts" and (spaces.goal_size < 6 or spaces.goal_size % 3):
+        raise ValueError(
+            'critics "parts" needs goals of several objects, such as those of Stack: '
+            "pass --critics whole"
         )
     uses_layout = (hp.relative_inputs, hp.augmentation) != ("none", "none")
     if uses_layout and spaces.geometry is None:

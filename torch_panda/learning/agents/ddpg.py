@@ -13,7 +13,7 @@ from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.exploration import make_noise
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
-from torch_panda.learning.agents.networks import Ensemble, make_mlp
+from torch_panda.learning.agents.networks import Ensemble, PartCritics, make_mlp
 from torch_panda.learning.environments.spaces import Spaces
 
 # Weight of the squared inputs of the actor's tanh in its loss. Without this penalty the
@@ -36,7 +36,12 @@ class DDPG(Agent):
         super().__init__(spaces, hp)
         inputs, action_size = self.state_size, spaces.action_size
         self.actor = nn.Sequential(make_mlp(inputs, action_size, hp.network), nn.Tanh())
-        self.critics = Ensemble(inputs + action_size, hp.network, self.num_critics)
+        self.has_part_critics = hp.critics == "parts"
+        if self.has_part_critics:
+            weights = self.normalizer.part_weights()
+            self.critics: Ensemble = PartCritics(weights, action_size, hp.network)
+        else:
+            self.critics = Ensemble(inputs + action_size, hp.network, self.num_critics)
         self.target_actor = self.make_target(self.actor)
         self.target_critics = self.make_target(self.critics)
         actor = TensorDictModule(self.actor, ["normalized"], ["action"])
@@ -59,19 +64,28 @@ class DDPG(Agent):
         with torch.no_grad():
             next_state = self.normalizer(b.s_next, b.g)
             next_action = self.target_action(next_state)
-            next_value = self.target_critics(next_state, next_action).amin(0)
-            target = b.r + self.gamma * next_value * ~b.ends
+            next_value = self.target_critics(next_state, next_action)
+            if not self.has_part_critics:
+                next_value = next_value.amin(0)
+            # Of one row for all critics, or of one for each part.
+            target = b.r.movedim(-1, 0) + self.gamma * next_value * ~b.ends
             if self.min_return is not None:
                 target.clamp_(self.min_return, 0.0)
         values = self.critics(state, b.a)
-        squared_errors = [nn.functional.mse_loss(value, target) for value in values]
+        squared_errors = [
+            nn.functional.mse_loss(value, row)
+            for value, row in zip(values, target.expand_as(values), strict=True)
+        ]
         losses = {"critic_loss": torch.stack(squared_errors).sum()}
         if self.updates % self.actor_interval == 0:
-            losses["actor_loss"] = self.actor_loss(b, state, values[0].detach())
+            value = values.mean(0) if self.has_part_critics else values[0]
+            losses["actor_loss"] = self.actor_loss(b, state, value.detach())
         return losses
 
     def actor_loss(self, b: Batch, state: Tensor, demo_value: Tensor) -> Tensor:
-        """Maximise the first critic's value, and imitate demonstrations.
+        """Maximise the value, and imitate demonstrations.
+
+        The value is that of the first critic, or the mean over the parts of the goal.
 
         Args:
             b: The batch.
@@ -81,7 +95,10 @@ class DDPG(Agent):
         before_tanh = self.actor[0](state)
         action = before_tanh.tanh()
         with hold_out_net(self.critics):
-            value = self.critics[0](state, action).squeeze(-1)
+            if self.has_part_critics:
+                value = self.critics(state, action).mean(0)
+            else:
+                value = self.critics[0](state, action).squeeze(-1)
         penalty = action_penalty(before_tanh, action, self.hp.action_l2)
         loss = penalty - value.mean()
         if b.num_demos:

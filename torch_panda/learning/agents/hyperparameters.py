@@ -16,6 +16,7 @@ RelativeInputs = Literal["none", "coarse", "fine"]
 Exploration = Literal["actions", "points"]
 Network = Literal["paper", "layer-norm", "wide", "gelu"]
 AugmentationKind = Literal["none", "mirror", "mirror-shift"]
+Critics = Literal["whole", "parts"]
 
 
 @dataclass
@@ -29,6 +30,11 @@ class Hyperparameters:
     """learn from a data set instead of an environment"""
     double_q: bool = True
     """TD3, SAC: learn two critics, and use the smaller value as target"""
+    critics: Critics = "whole"
+    """DDPG: what the critic learns from. "whole" learns one critic from the rewards of
+    the task. "parts" learns a critic for each object's part of the goal, from rewards
+    for this part alone, and the policy maximises their mean. The numbers of the other
+    objects are a tenth as large in its inputs, so that it soon ignores them"""
     gamma: Discount | None = None
     """discount factor; None means 1 - 1 / (steps of an episode), as in OpenAI
     Baselines"""

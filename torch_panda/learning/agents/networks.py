@@ -52,6 +52,31 @@ class Ensemble(nn.ModuleList):
         return torch.stack([net(*inputs).squeeze(-1) for net in self])
 
 
+class PartCritics(Ensemble):
+    """A value function Q(s, a) for each part of the goal.
+
+    Args:
+        weights: Weights of the state's numbers for each part, (parts, state size).
+        action_size: Size of an action.
+        network: Hidden layers; see `Hyperparameters.network`.
+    """
+
+    weights: Tensor
+
+    def __init__(self, weights: Tensor, action_size: int, network: Network) -> None:
+        parts, state_size = weights.shape
+        super().__init__(state_size + action_size, network, parts)
+        self.register_buffer("weights", weights)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The values of states and actions, (parts, n)."""
+        state, action = inputs
+        states = state * self.weights.unsqueeze(1)
+        return torch.stack(
+            [net(x, action).squeeze(-1) for net, x in zip(self, states, strict=True)]
+        )
+
+
 def freeze(network: nn.Module) -> Callable[..., Tensor]:
     """Return the function of a network, through which a loss does not train it.
 

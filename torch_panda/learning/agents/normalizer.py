@@ -8,6 +8,7 @@ from torch_panda.learning.environments.spaces import Spaces
 
 CLIP_OBSERVATION = 200.0  # from the panda-gym paper
 CLIP_NORMALIZED = 5.0  # from the HER of OpenAI Baselines
+OTHERS = 0.1  # weight of the numbers of other objects in `part_weights`
 FINE_LIMIT = 0.03  # "fine" inputs are offsets, clipped to this distance per axis [m]
 
 
@@ -98,6 +99,30 @@ class Normalizer(nn.Module):
         columns = self.goal_columns
         normalized = (goal - self.mean[columns]) / self.std[columns]
         return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
+
+    def part_weights(self) -> Tensor:
+        """Weights of a state for the critics of the parts of a goal.
+
+        A part is a position, three numbers of the goal. The numbers of its object have
+        the weight 1, and so have those of no object, such as the hand's. The numbers of
+        other objects have the weight `OTHERS`.
+
+        Returns:
+            ``(parts, state size)``.
+        """
+        parts = range(self.goal_columns.start, self.goal_columns.stop, 3)
+        weights = torch.ones(len(parts), len(self.mean))
+        if self.geometry is None:
+            return weights
+        inputs, offsets = self.geometry.owners()
+        owners = [*inputs]
+        while len(owners) < len(self.mean):
+            owners += offsets
+        for part, row in zip(parts, weights, strict=True):
+            for column, owner in enumerate(owners):
+                if owner not in (None, owners[part]):
+                    row[column] = OTHERS
+        return weights
 
     def _inputs(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Concatenate observation, goal and relative inputs, (..., state size)."""

@@ -111,6 +111,29 @@ class Geometry:
         ]
         return torch.cat((*differences, inputs[..., :0]), -1)
 
+    def owners(self) -> tuple[list[int | None], list[int | None]]:
+        """The objects to which the numbers of observation and goal belong.
+
+        An observation has the numbers of an object from its position up to the position
+        of the next object. Its part of the goal, and the offsets that lead to it or
+        from it, belong to it, too.
+
+        Returns:
+            For each number of the concatenation of observation and goal, and for each
+            coordinate of `differences`: the first column of the object's position, or
+            None if the number belongs to no object.
+        """
+        size = len(self.observation)
+        inputs: list[int | None] = [None] * (size + len(self.goal))
+        for start in sorted(self.positions[1:]):
+            inputs[start:size] = [start] * (size - start)
+        offsets: list[int | None] = []
+        for point, origin in zip(self.points, self.origins, strict=True):
+            if point >= size:
+                inputs[point] = inputs[origin]
+            offsets.append(inputs[point])
+        return inputs, offsets
+
     def rotations(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
         """Express the orientations of cube and goal as inputs of the networks.
 
