@@ -1,6 +1,7 @@
 """Layout and symmetry that agents assume hold in the physics of the tasks."""
 
 import re
+from dataclasses import replace
 
 import pytest
 import torch
@@ -82,12 +83,16 @@ def test_differences_lead_from_hand_to_object_and_object_to_goal(task):
 
 def test_numbers_of_a_stack_belong_to_their_cubes():
     with torch_panda.make("PandaStack-v1", num_envs=1) as env:
-        inputs, offsets = read_geometry(env).owners()
+        geometry = read_geometry(env)
+    inputs, offsets = geometry.owners()
     # Hand and fingers, two cubes, and two goals. The cubes are at 7 and at 19.
     first, second = 7, 19
     goals = [first] * 3 + [second] * 3
     assert inputs == [None] * 7 + [first] * 12 + [second] * 12 + goals
     assert offsets == goals * 2  # from the hand to the cubes, from the cubes to goals
+    # If an object comes first, then the hand, and then another object:
+    inputs, _ = replace(geometry, positions=(7, 0, 19)).owners()
+    assert inputs[:31] == [0] * 7 + [None] * 12 + [19] * 12
 
 
 def test_numbers_of_reach_belong_to_no_object():

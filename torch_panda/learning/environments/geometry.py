@@ -114,9 +114,10 @@ class Geometry:
     def owners(self) -> tuple[list[int | None], list[int | None]]:
         """The objects to which the numbers of observation and goal belong.
 
-        An observation has the numbers of an object from its position up to the position
-        of the next object. Its part of the goal, and the offsets that lead to it or
-        from it, belong to it, too.
+        An observation has the numbers of an object from its position up to the next
+        position, of another object or of the hand. Its part of the goal belongs to it,
+        too, and so do the offsets that lead to it or from it. If the hand is unknown,
+        those of the first object count as belonging to none.
 
         Returns:
             For each number of the concatenation of observation and goal, and for each
@@ -125,8 +126,9 @@ class Geometry:
         """
         size = len(self.observation)
         inputs: list[int | None] = [None] * (size + len(self.goal))
-        for start in sorted(self.positions[1:]):
-            inputs[start:size] = [start] * (size - start)
+        for start in sorted(self.positions):
+            owner = None if start == self.positions[0] else start
+            inputs[start:size] = [owner] * (size - start)
         offsets: list[int | None] = []
         for point, origin in zip(self.points, self.origins, strict=True):
             if point >= size:
