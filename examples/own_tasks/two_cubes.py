@@ -2,6 +2,9 @@
 
 python -m torch_panda train --import examples/own_tasks/two_cubes.py \
         --env-id TwoCubes-v0
+
+The class declares what its observations and goals contain, so data are also mirrored
+and shifted over the table.
 """
 
 from collections.abc import Sequence
@@ -12,7 +15,13 @@ from torch import Tensor
 
 import torch_panda
 from torch_panda.bullet import Box, PhysicsClient, VectorSimulation
-from torch_panda.tasks import Bodies, create_table, object_observation
+from torch_panda.tasks import (
+    OBJECT_LAYOUT,
+    Bodies,
+    GoalEntries,
+    create_table,
+    object_observation,
+)
 
 HALF = 0.02  # half of a cube's edge [m]
 
@@ -22,6 +31,9 @@ class TwoCubes(torch_panda.Task):
 
     goal_dim, observation_dim = 6, 24
     max_episode_steps = 80
+    observation_layout = OBJECT_LAYOUT * 2
+    # The goals are the positions in the observation: its numbers 0 to 2 and 12 to 14.
+    goal_entries = GoalEntries("task", (0, 1, 2, 12, 13, 14))
 
     def build(self, client: PhysicsClient) -> Bodies:
         """Build the table, the cubes, and the markers that show the goals."""
