@@ -87,9 +87,9 @@ class RunOptions:
     seed: Seed = 0
     """seed of the environments, the generated data, the networks and the sampling"""
     seeds: tuple[Seed, ...] = ()
-    """with --offline, seeds of several runs whose gradient steps are taken together,
-    which is meant for a GPU. Each run has its own folder. Apart from rounding, it gives
-    the same policy as a run with this seed alone"""
+    """with --offline, seeds of several runs that take their gradient steps together, to
+    make use of a GPU. Each run writes its own folder. Apart from rounding, its policy
+    is that of a run with this seed alone"""
     total_steps: Count = 4_000
     """environment steps, summed over all environments; 0 stops after the
     `pretrain_updates`. With --offline, gradient steps"""

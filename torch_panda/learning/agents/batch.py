@@ -13,8 +13,8 @@ class Batch(NamedTuple):
     Attributes:
         s: Observations before the step, (n, observation size).
         a: Actions, (n, action size).
-        r: Rewards for the goal ``g``, (n,). With a critic for each part of the goal,
-            those for the parts, (n, parts).
+        r: Rewards for the goal ``g``, (n,). If each part of the goal has a critic of
+            its own, a row has a reward for each part, (n, parts).
         ends: Whether the return ends with this step, (n,) bool. Targets of critics then
             have no next value. With an environment, an episode ends for another reason
             than its step limit. With a data set, ``s_next`` reaches the goal ``g``.

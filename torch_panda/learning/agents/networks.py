@@ -66,7 +66,7 @@ class PartCritics(Ensemble):
     def __init__(self, weights: Tensor, action_size: int, network: Network) -> None:
         parts, state_size = weights.shape
         super().__init__(state_size + action_size, network, parts)
-        self.register_buffer("weights", weights)
+        self.register_buffer("weights", weights, persistent=False)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """The values of states and actions, (parts, n)."""

@@ -23,6 +23,7 @@ class Normalizer(nn.Module):
     Attributes:
         goal_columns: Columns of the inputs that hold the goal.
         state_columns: Columns of the inputs that do not depend on the goal.
+        num_copies: Number of copies of the offsets among the inputs.
         mean: Mean of each input, (state size,).
         std: Standard deviation of each input, at least 0.01, (state size,).
     """
@@ -38,14 +39,15 @@ class Normalizer(nn.Module):
         super().__init__()
         geometry = spaces.geometry
         size = spaces.observation_size + spaces.goal_size
+        self.num_copies = 0
         state_columns = [*range(spaces.observation_size)]
         self.goal_columns = slice(spaces.observation_size, size)
         if geometry is not None:
-            num_parts = ("none", "coarse", "fine").index(relative_inputs)
-            if num_parts and geometry.orientation is not None:
+            self.num_copies = ("none", "coarse", "fine").index(relative_inputs)
+            if self.num_copies and geometry.orientation is not None:
                 # The matrix and the similarities of `Geometry.rotations`.
                 size += 9 + 24
-            for _ in range(num_parts):
+            for _ in range(self.num_copies):
                 state_columns += [
                     size + column
                     for column, point in enumerate(geometry.points)
@@ -101,11 +103,12 @@ class Normalizer(nn.Module):
         return normalized.clamp(-CLIP_NORMALIZED, CLIP_NORMALIZED)
 
     def part_weights(self) -> Tensor:
-        """Weights of a state for the critics of the parts of a goal.
+        """Weights of a state's numbers for the critic of each part of a goal.
 
-        A part is a position, three numbers of the goal. The numbers of its object have
-        the weight 1, and so have those of no object, such as the hand's. The numbers of
-        other objects have the weight `OTHERS`.
+        A part of a goal is three numbers, the position of an object. Numbers of this
+        object have the weight 1. Numbers that belong to no object, such as the hand's
+        position, have the weight 1, too. Numbers of other objects have the weight
+        `OTHERS`.
 
         Returns:
             ``(parts, state size)``.
@@ -115,9 +118,7 @@ class Normalizer(nn.Module):
         if self.geometry is None:
             return weights
         inputs, offsets = self.geometry.owners()
-        owners = [*inputs]
-        while len(owners) < len(self.mean):
-            owners += offsets
+        owners = inputs + self.num_copies * offsets
         for part, row in zip(parts, weights, strict=True):
             for column, owner in enumerate(owners):
                 if owner not in (None, owners[part]):

@@ -117,7 +117,7 @@ class Geometry:
         An observation has the numbers of an object from its position up to the next
         position, of another object or of the hand. Its part of the goal belongs to it,
         too, and so do the offsets that lead to it or from it. If the hand is unknown,
-        those of the first object count as belonging to none.
+        the numbers of the first object are treated as numbers of no object.
 
         Returns:
             For each number of the concatenation of observation and goal, and for each
