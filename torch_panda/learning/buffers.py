@@ -9,6 +9,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Transform
 
 from torch_panda.learning.environments import GoalEnv
+from torch_panda.learning.environments.geometry import AXES, split_goal
 from torch_panda.tasks.base import RewardFunction
 from torch_panda.transforms import HindsightRelabel
 
@@ -23,7 +24,6 @@ SETTLING_STEPS = 4
 # An achieved goal has moved if one of its numbers changed by more than this: [m] for
 # positions, without unit for quaternions.
 MIN_MOTION = 0.01
-POSITION_SIZE = 3  # each object takes this many numbers of a goal
 STORED_KEYS: list[NestedKey] = [
     "observation",
     "desired_goal",
@@ -70,8 +70,7 @@ class PartRewards(Transform):
         achieved = tensordict["next", "achieved_goal"]
         goal = tensordict["desired_goal"]
         rewards = []
-        for start in range(0, goal.shape[-1], POSITION_SIZE):
-            part = slice(start, start + POSITION_SIZE)
+        for part in split_goal(goal.shape[-1]):
             goal_of_part = achieved.clone()
             goal_of_part[..., part] = goal[..., part]
             rewards.append(self.compute_reward(achieved, goal_of_part))
@@ -112,8 +111,8 @@ def make_buffer(
     transform = None
     if her != "none":
         goal_size = env.observation_spec["desired_goal"].shape[-1]
-        num_objects, rest = divmod(goal_size, POSITION_SIZE)
-        if her == "parts" and (rest or num_objects < 2):
+        num_parts = len(split_goal(goal_size))
+        if her == "parts" and num_parts < 2:
             raise ValueError(
                 "--her parts needs goals of several objects, such as those of Stack: "
                 "pass --her relabel"
@@ -124,7 +123,7 @@ def make_buffer(
             her_ratio=1.0 if her == "geometric" else K / (K + 1),
             strategy=strategy,
             discount=discount,
-            goal_parts=(POSITION_SIZE,) * num_objects if her == "parts" else None,
+            goal_parts=(AXES,) * num_parts if her == "parts" else None,
             seed=seed,
         )
     storage = LazyTensorStorage(min(capacity, BUFFER_SIZE), device=env.device or "cpu")

@@ -11,7 +11,11 @@ from dataclasses import asdict
 from typing import Any
 
 from torch_panda.learning.environments import GoalEnv, is_from_gymnasium
-from torch_panda.learning.environments.geometry import declares_layout, find_layout
+from torch_panda.learning.environments.geometry import (
+    declares_layout,
+    find_layout,
+    split_goal,
+)
 from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
 from torch_panda.registry import Registration, find_registration
 
@@ -72,8 +76,7 @@ def derive_options(registration: Registration) -> dict[str, Any]:
         options["augmentation"] = "mirror-shift"
     if robot.control_type not in ("ee", "joints"):
         options["exploration"] = "actions"
-    num_objects, rest = divmod(task.goal_dim, 3)
-    if num_objects > 1 and not rest:
+    if len(split_goal(task.goal_dim)) > 1:
         options |= EACH_OBJECT
     return options
 

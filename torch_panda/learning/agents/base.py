@@ -17,6 +17,7 @@ from torch_panda.learning.agents.batch import Batch
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
 from torch_panda.learning.agents.normalizer import Normalizer
 from torch_panda.learning.agents.recorded_step import RecordedStep, Step
+from torch_panda.learning.environments.geometry import split_goal
 from torch_panda.learning.environments.spaces import Spaces
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.transforms.strategies import StrategyOption
@@ -296,7 +297,7 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
             'exploration "points" needs the control type "ee" or "joints": for another '
             "one pass --exploration actions"
         )
-    if hp.critics == "parts" and (spaces.goal_size < 6 or spaces.goal_size % 3):
+    if hp.critics == "parts" and len(split_goal(spaces.goal_size)) < 2:
         raise ValueError(
             'critics "parts" needs goals of several objects, such as those of Stack: '
             "pass --critics whole"

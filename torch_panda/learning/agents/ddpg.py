@@ -36,8 +36,7 @@ class DDPG(Agent):
         super().__init__(spaces, hp)
         inputs, action_size = self.state_size, spaces.action_size
         self.actor = nn.Sequential(make_mlp(inputs, action_size, hp.network), nn.Tanh())
-        self.has_part_critics = hp.critics == "parts"
-        if self.has_part_critics:
+        if hp.critics == "parts":
             weights = self.normalizer.part_weights()
             self.critics: Ensemble = PartCritics(weights, action_size, hp.network)
         else:
@@ -64,9 +63,7 @@ class DDPG(Agent):
         with torch.no_grad():
             next_state = self.normalizer(b.s_next, b.g)
             next_action = self.target_action(next_state)
-            next_value = self.target_critics(next_state, next_action)
-            if not self.has_part_critics:
-                next_value = next_value.amin(0)
+            next_value = self.target_critics.target_value(next_state, next_action)
             # Of one row for all critics, or of one for each part.
             target = b.r.movedim(-1, 0) + self.gamma * next_value * ~b.ends
             if self.min_return is not None:
@@ -78,34 +75,30 @@ class DDPG(Agent):
         ]
         losses = {"critic_loss": torch.stack(squared_errors).sum()}
         if self.updates % self.actor_interval == 0:
-            value = values.mean(0) if self.has_part_critics else values[0]
-            losses["actor_loss"] = self.actor_loss(b, state, value.detach())
+            losses["actor_loss"] = self.actor_loss(b, state)
         return losses
 
-    def actor_loss(self, b: Batch, state: Tensor, demo_value: Tensor) -> Tensor:
+    def actor_loss(self, b: Batch, state: Tensor) -> Tensor:
         """Maximise the value, and imitate demonstrations.
-
-        The value is that of the first critic, or the mean over the parts of the goal.
 
         Args:
             b: The batch.
             state: States before the environment's step, (n, state size).
-            demo_value: Values of the actions of the batch, (n,).
         """
         before_tanh = self.actor[0](state)
         action = before_tanh.tanh()
         with hold_out_net(self.critics):
-            if self.has_part_critics:
-                value = self.critics(state, action).mean(0)
-            else:
-                value = self.critics[0](state, action).squeeze(-1)
+            value = self.critics.policy_value(state, action)
         penalty = action_penalty(before_tanh, action, self.hp.action_l2)
         loss = penalty - value.mean()
         if b.num_demos:
             # Imitate only demonstrated actions that the critic prefers (the Q filter).
-            is_preferred = (demo_value > value)[-b.num_demos :].unsqueeze(-1)
-            difference = (action - b.a)[-b.num_demos :]
-            imitation_loss = (difference.square() * is_preferred).mean()
+            demos = slice(-b.num_demos, None)
+            with torch.no_grad():
+                demo_value = self.critics.policy_value(state[demos], b.a[demos])
+            is_preferred = (demo_value > value[demos]).unsqueeze(-1)
+            squared_errors = (action - b.a)[demos].square()
+            imitation_loss = (squared_errors * is_preferred).mean()
             loss = loss + BC_WEIGHT * imitation_loss
         return loss
 

@@ -51,6 +51,14 @@ class Ensemble(nn.ModuleList):
         """The values, (number, n)."""
         return torch.stack([net(*inputs).squeeze(-1) for net in self])
 
+    def target_value(self, *inputs: Tensor) -> Tensor:
+        """The value from which all functions learn: the smallest one, (n,)."""
+        return self(*inputs).amin(0)
+
+    def policy_value(self, *inputs: Tensor) -> Tensor:
+        """The value that a policy maximises: that of the first function, (n,)."""
+        return self[0](*inputs).squeeze(-1)
+
 
 class PartCritics(Ensemble):
     """A value function Q(s, a) for each part of the goal.
@@ -75,6 +83,14 @@ class PartCritics(Ensemble):
         return torch.stack(
             [net(x, action).squeeze(-1) for net, x in zip(self, states, strict=True)]
         )
+
+    def target_value(self, *inputs: Tensor) -> Tensor:
+        """The value of each part, from which its function learns, (parts, n)."""
+        return self(*inputs)
+
+    def policy_value(self, *inputs: Tensor) -> Tensor:
+        """The mean over the parts, (n,)."""
+        return self(*inputs).mean(0)
 
 
 def freeze(network: nn.Module) -> Callable[..., Tensor]:

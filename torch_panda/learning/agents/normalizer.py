@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_panda.learning.agents.hyperparameters import RelativeInputs
+from torch_panda.learning.environments.geometry import split_goal
 from torch_panda.learning.environments.spaces import Spaces
 
 CLIP_OBSERVATION = 200.0  # from the panda-gym paper
@@ -105,15 +106,14 @@ class Normalizer(nn.Module):
     def part_weights(self) -> Tensor:
         """Weights of a state's numbers for the critic of each part of a goal.
 
-        A part of a goal is three numbers, the position of an object. Numbers of this
-        object have the weight 1. Numbers that belong to no object, such as the hand's
-        position, have the weight 1, too. Numbers of other objects have the weight
-        `OTHERS`.
+        Numbers of the object of the part, and numbers of no object, such as the hand's
+        position, have the weight 1. Numbers of other objects have the weight `OTHERS`.
 
         Returns:
             ``(parts, state size)``.
         """
-        parts = range(self.goal_columns.start, self.goal_columns.stop, 3)
+        first = self.goal_columns.start
+        parts = split_goal(self.goal_columns.stop - first)
         weights = torch.ones(len(parts), len(self.mean))
         if self.geometry is None:
             return weights
@@ -121,7 +121,7 @@ class Normalizer(nn.Module):
         owners = inputs + self.num_copies * offsets
         for part, row in zip(parts, weights, strict=True):
             for column, owner in enumerate(owners):
-                if owner not in (None, owners[part]):
+                if owner not in (None, owners[first + part.start]):
                     row[column] = OTHERS
         return weights
 

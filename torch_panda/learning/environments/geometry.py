@@ -34,13 +34,13 @@ _MIRROR: dict[Quantity, tuple[float, ...]] = {
     "number": (1.0,),
 }
 
+AXES = 3  # numbers of a position
 WIDTH: Quantity = "number"  # the distance between the fingers is one number
 
 
 # Rollouts, and steps of each, with which `find_geometry` looks at a task.
 _PROBE_ROLLOUTS, _PROBE_STEPS = 4, 30
 _SAME = 1e-5  # largest difference of equal numbers
-_AXES = 3
 # Steps over which the change of a position is compared with the actions, and the least
 # correlation of the two along each axis.
 _PROBE_WINDOW = 10
@@ -104,9 +104,9 @@ class Geometry:
         """Offsets from the hand to objects and from objects to goals, (..., n) [m]."""
         inputs = torch.cat((observation, goal), -1)
         # The three coordinates of a position follow each other.
-        starts = zip(self.points[::_AXES], self.origins[::_AXES], strict=True)
+        starts = zip(self.points[::AXES], self.origins[::AXES], strict=True)
         differences = [
-            inputs[..., point : point + _AXES] - inputs[..., origin : origin + _AXES]
+            inputs[..., point : point + AXES] - inputs[..., origin : origin + AXES]
             for point, origin in starts
         ]
         return torch.cat((*differences, inputs[..., :0]), -1)
@@ -164,6 +164,15 @@ class Geometry:
         straight = straight_orientations(goal.dtype, goal.device)
         similarity = (straight_to_goal @ straight.T).square()
         return observation, to_goal, to_matrix(to_goal).flatten(-2), similarity
+
+
+def split_goal(size: int) -> list[slice]:
+    """The parts of a goal: the position of each object, or the whole goal.
+
+    A goal is a whole if its size is not a multiple of the three numbers of a position.
+    """
+    width = size if size % AXES else AXES
+    return [slice(start, start + width) for start in range(0, size, width)]
 
 
 def declares_layout(task: Task) -> bool:
@@ -255,10 +264,10 @@ def find_hand(rollouts: TensorDict) -> Hand | None:
         None if no three numbers follow the actions.
     """
     action, observation = rollouts["action"], rollouts["observation"]
-    if action.shape[-1] < _AXES:
+    if action.shape[-1] < AXES:
         return None
     window = _PROBE_WINDOW
-    sums = action[..., :_AXES].unfold(1, window, 1).sum(-1)[:, :-1]
+    sums = action[..., :AXES].unfold(1, window, 1).sum(-1)[:, :-1]
     change = observation[:, window:] - observation[:, :-window]
     ends = rollouts["next", "done"].squeeze(-1).unfold(1, window, 1)[:, :-1]
     in_episode = ~ends.any(-1)
@@ -269,8 +278,8 @@ def find_hand(rollouts: TensorDict) -> Hand | None:
     correlations = (change.T @ sums) / norms.clamp(min=_SAME**2)
     best = Hand(0, 0.0)
     least = _FOLLOWS
-    for column in range(observation.shape[-1] - _AXES + 1):
-        rows = slice(column, column + _AXES)
+    for column in range(observation.shape[-1] - AXES + 1):
+        rows = slice(column, column + AXES)
         if correlations[rows].diagonal().min() > least:
             least = float(correlations[rows].diagonal().min())
             best = Hand(column, float(slopes[rows].diagonal().mean()))
