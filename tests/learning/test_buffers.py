@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from pytest import approx
 from tensordict import TensorDict
 
 import torch_panda
@@ -24,7 +25,12 @@ FUTURE = {"future": 1.0}
     [
         ({}, (FUTURE, 0.8, None)),
         ({"desired_ratio": 0.5}, ({"future": 0.5, "desired": 0.5}, 0.8, None)),
-        ({"her": "parts"}, (FUTURE, 0.8, (3, 3))),
+        # All parts are relabelled with probability 0.8. Of these, all get future goals
+        # with probability 0.64.
+        (
+            {"her": "parts", "desired_ratio": 0.36},
+            (approx({"future": 0.8, "desired": 0.2}), approx(0.8**0.5), (3, 3)),
+        ),
         ({"her": "geometric"}, ({"geometric": 1.0}, 1.0, None)),
     ],
 )

@@ -93,37 +93,42 @@ def make_buffer(
         capacity: Number of transitions. A number above `BUFFER_SIZE` is reduced to it.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
-            the goal is relabelled. "geometric" gives every sampled transition the goal
-            achieved k steps later in its episode, with probability proportional to
-            discount**k. "none" keeps the original goals.
+            the goal is relabelled, and relabels all parts of as many transitions.
+            "geometric" gives every sampled transition the goal achieved k steps later
+            in its episode, with probability proportional to discount**k. "none" keeps
+            the original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of random
-            transitions. The rest are goals achieved later in the same episode.
+            transitions, or with "parts" contain a part of one. The rest are goals
+            achieved later in the same episode.
         discount: Discount of "geometric".
         seed: Seed of the choice of goals.
 
     Raises:
         ValueError: ``her`` does not fit the task.
     """
+    parts = split_goal(env.observation_spec["desired_goal"].shape[-1])
+    if her == "parts" and len(parts) < 2:
+        raise ValueError(
+            "--her parts needs goals of several objects, such as those of Stack: pass "
+            "--her relabel"
+        )
+    # Parts are drawn independently. Because of these roots, all parts of a transition
+    # together have the same ratios as a whole goal.
+    root = 1 / len(parts) if her == "parts" else 1.0
+    later_ratio = (1 - desired_ratio) ** root
     later = "geometric" if her == "geometric" else "future"
-    weights = {later: 1 - desired_ratio, "desired": desired_ratio}
+    weights = {later: later_ratio, "desired": 1 - later_ratio}
     strategy = {name: weight for name, weight in weights.items() if weight}
     # `success_fn` is None below, because success is not stored (see `STORED_KEYS`).
     transform = None
     if her != "none":
-        goal_size = env.observation_spec["desired_goal"].shape[-1]
-        num_parts = len(split_goal(goal_size))
-        if her == "parts" and num_parts < 2:
-            raise ValueError(
-                "--her parts needs goals of several objects, such as those of Stack: "
-                "pass --her relabel"
-            )
         transform = HindsightRelabel.from_env(
             env,
             success_fn=None,
-            her_ratio=1.0 if her == "geometric" else K / (K + 1),
+            her_ratio=1.0 if her == "geometric" else (K / (K + 1)) ** root,
             strategy=strategy,
             discount=discount,
-            goal_parts=(AXES,) * num_parts if her == "parts" else None,
+            goal_parts=(AXES,) * len(parts) if her == "parts" else None,
             seed=seed,
         )
     storage = LazyTensorStorage(min(capacity, BUFFER_SIZE), device=env.device or "cpu")
