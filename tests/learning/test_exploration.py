@@ -7,10 +7,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
 from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
-from torch_panda.learning.agents.exploration import (
-    RandomPointModule,
-    make_random_points,
-)
+from torch_panda.learning.agents.exploration import RandomPointModule
+from torch_panda.learning.environments.geometry import Geometry
+from torch_panda.learning.environments.spaces import Spaces
 
 NUM_ENVS = 64
 
@@ -18,14 +17,30 @@ NUM_ENVS = 64
 def make_module(
     eps, *, num_envs=NUM_ENVS, moves_joints=False, action_size=4, object_columns=()
 ):
-    return RandomPointModule(
-        torch.as_tensor(eps).expand(num_envs).clone(),
+    geometry = Geometry(
+        points=(),
+        origins=(),
+        observation=(),
+        goal=(),
+        action=None,
+        positions=(0, *object_columns),
+        goal_positions=(),
+        goal_height=None,
+        orientation=None,
+    )
+    spaces = Spaces(
+        observation_size=9,
+        goal_size=3,
         action_size=action_size,
+        num_envs=num_envs,
+        max_episode_steps=50,
+        has_free_gripper=action_size in (4, 8),
+        has_sparse_reward=True,
+        geometry=geometry,
         action_scale=0.05,
         moves_joints=moves_joints,
-        num_arm_actions=7 if moves_joints else 3,
-        object_columns=object_columns,
     )
+    return RandomPointModule(spaces, Hyperparameters(random_eps=(eps, eps)))
 
 
 def explore(module, steps, action_size=4):
@@ -161,7 +176,7 @@ def test_half_of_the_points_are_near_one_of_the_objects():
 def test_agents_know_where_observations_have_objects(env_id, objects):
     with torch_panda.make(env_id, num_envs=2) as env:
         agent = make_agent(env, Hyperparameters(exploration="points"))
-        columns = make_random_points(agent.spaces, agent.hp).position_columns
+        columns = RandomPointModule(agent.spaces, agent.hp).position_columns
         assert columns[:, 0].tolist() == objects
         td = env.reset()
     for start in objects:

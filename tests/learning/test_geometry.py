@@ -15,13 +15,14 @@ from torch_panda.experts.cube_orientations import (
     straighten,
     to_matrix,
 )
-from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.environments.geometry import (
+    declares_layout,
     find_geometry,
     probe,
     read_geometry,
 )
 from torch_panda.rotations import rotation_distance
+from torch_panda.tasks import OBJECT_LAYOUT, GoalEntries
 
 MIRROR_POSE = torch.tensor([1, -1, 1, -1, 1, -1, 1], dtype=torch.float64)
 MIRROR_VELOCITY = torch.tensor([1, -1, 1, -1, 1, -1], dtype=torch.float64)
@@ -128,29 +129,40 @@ def test_rotations_are_the_same_for_the_24_orientations_that_look_alike():
         torch.testing.assert_close(again, expected, atol=1e-5, rtol=0)
 
 
-class PushAndTell(torch_panda.Push):
-    """Observes one more number than its layout has."""
+class Reversed(torch_panda.Push):
+    """Observes the numbers of the inherited layout in another order."""
+
+    def observation(self, simulation):
+        return super().observation(simulation).flip(-1)
+
+
+class Planar(torch_panda.Push):
+    """Goals are two of the three numbers of a position."""
+
+    goal_dim = 2
+    goal_entries = GoalEntries("task", (0, 1))
+
+    def achieved_goal(self, simulation):
+        return super().achieved_goal(simulation)[:, :2]
+
+
+class OneNumberMore(torch_panda.Push):
+    """Observes one more number than the layout has that it declares."""
 
     observation_dim = 13
+    observation_layout = OBJECT_LAYOUT
+    goal_entries = GoalEntries("task", (0, 1, 2))
 
     def observation(self, simulation):
         height = simulation.object_pose[:, 0, 2:3]
         return torch.cat((super().observation(simulation), height), 1)
 
 
-def test_a_layout_that_is_not_declared_is_found():
-    scene = {"robot": torch_panda.Panda(block_gripper=True), "task": PushAndTell()}
-    with torch_panda.RobotTaskEnv(**scene, num_envs=2, seed=0) as env:
-        agent = make_agent(env, Hyperparameters(relative_inputs="fine"))
-        found = agent.spaces.geometry
-        assert (found.positions, found.goal_positions) == ((0, 6), (0,))
-        assert env.rollout(2, agent.policy)["action"].shape == (2, 2, 3)
-        for augmentation in ("mirror", "mirror-shift"):
-            with pytest.raises(ValueError, match="otherwise pass --augmentation none"):
-                make_agent(
-                    env,
-                    Hyperparameters(relative_inputs="fine", augmentation=augmentation),
-                )
+@pytest.mark.parametrize("task", [Reversed, Planar, OneNumberMore])
+def test_a_declared_layout_must_fit(task):
+    robot = torch_panda.Panda(block_gripper=True)
+    assert declares_layout(robot, torch_panda.Push())
+    assert not declares_layout(robot, task())
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from tests.learning.hand_env import HIGH, LOW, MAX_STEPS, NEAR, SPEED, HandEnv, 
 from torch_panda.commands import evaluate, main, train, watch
 from torch_panda.commands.train import parse
 from torch_panda.datasets import generate, sha256
+from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.environments import is_from_gymnasium, make_env
 from torch_panda.learning.environments.geometry import find_geometry, find_hand, probe
 from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
@@ -346,6 +347,20 @@ def test_an_environment_that_cannot_be_used_is_refused(attributes, message):
         GymGoalEnv(env_id)
 
 
+def test_an_environment_need_not_take_a_render_mode():
+    class Plain(HandEnv):
+        def __init__(self):
+            super().__init__()
+
+    with GymGoalEnv(register(Plain)) as env:
+        assert env.rollout(2).batch_size == (1, 2)
+
+
+def test_our_own_environments_need_no_processes():
+    with pytest.raises(ValueError, match=r"got workers=2: drop --workers"):
+        make_env("PandaReach-v1", workers=2)
+
+
 def test_an_unknown_id_is_refused():
     with pytest.raises(ValueError, match=r"^Gymnasium cannot make 'Nothing-v0': "):
         GymGoalEnv("Nothing-v0")
@@ -409,12 +424,15 @@ def test_a_goal_of_the_hand_is_the_hands_position(make):
 
 
 def test_no_hand_is_found_if_nothing_follows_the_actions(make):
-    rollouts = probe(make(num_envs=4, follows=False))
+    env = make(num_envs=4, follows=False)
+    rollouts = probe(env)
     assert find_hand(rollouts) is None
     geometry = find_geometry(rollouts, None)
-    assert geometry.positions == (OBJECT,)  # that of the object alone
+    assert geometry.positions == ()
     assert geometry.points == (14, 15, 16)
     assert geometry.origins == (OBJECT, OBJECT + 1, OBJECT + 2)
+    with pytest.raises(ValueError, match='exploration "points" needs the hand'):
+        make_agent(env, Hyperparameters(exploration="points"))
 
 
 def test_two_actions_move_no_hand():

@@ -155,8 +155,9 @@ def main(args: Args) -> None:
         if args.offline or not is_from_gymnasium(args.env_id):
             registration = find_registration(args.env_id)
             task = registration.make_task(args.task_options)
-            check_task(task, robot=registration.make_robot())
-            is_declared = declares_layout(task)
+            robot = registration.make_robot()
+            check_task(task, robot=robot)
+            is_declared = declares_layout(robot, task)
         runs = [make_run(options, out) for out, options in folders.items()]
         if args.preset == "recipe":
             spaces = runs[0].agent.spaces
@@ -216,7 +217,7 @@ def describe_recipe(args: Args, spaces: Spaces, *, is_declared: bool) -> str:
     geometry = spaces.geometry
     num_objects = num_goals = 0
     if geometry is not None:
-        num_objects = len(geometry.positions) - 1
+        num_objects = max(len(geometry.positions) - 1, 0)
         num_goals = len(geometry.goal_positions)
     parts = [
         f"discount {args.gamma} for {spaces.max_episode_steps} steps",

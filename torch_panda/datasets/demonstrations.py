@@ -50,9 +50,7 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
             recorded_id = data_format.read_env_id(path)
         else:
             keys = STORED_KEYS
-            content = files.read(
-                path, "demonstrations", keys, finite=keys, map_location="cpu"
-            )
+            content = files.read(path, "demonstrations", keys, finite=keys)
             # The batch shape is (n,), or [episodes, steps] for the data of `generate`.
             demos = TensorDict(content, content["action"].shape[:-1])
         demos = demos.select(*STORED_KEYS)

@@ -63,7 +63,8 @@ HORIZON = 0.4
 # summarizes.
 UNPLOTTED_OPTIONS = {
     *("algo", "seed", "total_steps", "eval_interval"),
-    *("out", "resume", "device", "video", "logger", "imports", "stop_when_solved"),
+    *("out", "resume", "device", "workers", "video", "logger", "imports"),
+    "stop_when_solved",
 }
 
 
@@ -72,7 +73,7 @@ def derive_options(registration: Registration) -> dict[str, Any]:
     task, robot = registration.make_task(), registration.make_robot()
     steps = registration.max_episode_steps or task.max_episode_steps
     options: dict[str, Any] = {"gamma": round(1 - 1 / (HORIZON * steps), 4)}
-    if declares_layout(task) and robot.control_type == "ee":
+    if declares_layout(robot, task) and robot.control_type == "ee":
         options["augmentation"] = "mirror-shift"
     if robot.control_type not in ("ee", "joints"):
         options["exploration"] = "actions"

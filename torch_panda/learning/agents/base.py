@@ -290,6 +290,12 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
             "fine_fingers needs a task whose actions move the fingers, such as "
             "PickAndPlace, Stack or Flip: pass --no-fine-fingers"
         )
+    has_hand = spaces.geometry is None or bool(spaces.geometry.positions)
+    if hp.exploration == "points" and not (has_hand or spaces.moves_joints):
+        raise ValueError(
+            'exploration "points" needs the hand, but no three observed numbers follow '
+            "the first three actions: pass --exploration actions"
+        )
     # Under end-effector control, three entries of an action displace the hand.
     follows_points = spaces.moves_joints or spaces.num_arm_actions == 3
     if hp.exploration == "points" and not follows_points:

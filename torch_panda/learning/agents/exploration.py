@@ -8,8 +8,6 @@ that the hand pushes it on its way. If all actions explore, the cube of Push mov
 23 % if the actions are random.
 """
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -44,27 +42,11 @@ def make_noise(spaces: Spaces, hp: Hyperparameters) -> list[TensorDictModuleBase
         action_spec, sigma_init=hp.noise_eps, sigma_end=hp.noise_eps
     )
     if hp.exploration == "points":
-        return [noise, make_random_points(spaces, hp)]
+        return [noise, RandomPointModule(spaces, hp)]
     random_action = EGreedyModule(action_spec)
     # A probability for each environment, (num_envs,).
     random_action.eps = torch.linspace(*hp.random_eps, spaces.num_envs)
     return [noise, random_action]
-
-
-def make_random_points(spaces: Spaces, hp: Hyperparameters) -> "RandomPointModule":
-    """Make the module of the exploration "points"."""
-    geometry = spaces.geometry
-    return RandomPointModule(
-        torch.linspace(*hp.random_eps, spaces.num_envs),
-        action_size=spaces.action_size,
-        action_scale=spaces.action_scale,
-        moves_joints=spaces.moves_joints,
-        num_arm_actions=spaces.num_arm_actions,
-        # The first position of an observation is the hand's.
-        object_columns=() if geometry is None else geometry.positions[1:],
-        hand_column=0 if geometry is None else geometry.positions[0],
-        box=BOX if geometry is None or geometry.box is None else geometry.box,
-    )
 
 
 class RandomPointModule(TensorDictModuleBase):
@@ -80,21 +62,10 @@ class RandomPointModule(TensorDictModuleBase):
     Its state is part of ``state_dict``.
 
     Args:
-        eps: Fraction of the steps after the warm-up in which each environment moves to
-            a point, (num_envs,), from 0 to 1.
-        action_size: Size of an action.
-        action_scale: Displacement that an action of 1 causes in one step, [m] for the
-            end-effector and [rad] for joints.
-        moves_joints: Whether the actions are displacements of joints. Otherwise the
-            first three entries of an action displace the end-effector.
-        num_arm_actions: Number of entries of an action that move the arm. They come
-            first.
-        object_columns: For each object, the first of the three columns of
-            ``observation`` with its position [m]. Without objects, all points are
-            anywhere in the box.
-        hand_column: The first of the three columns of ``observation`` with the position
-            of the end-effector [m].
-        box: Lowest and highest (x, y, z) of the points, in the world frame [m].
+        spaces: Sizes and layout of observations and actions. If the layout has no
+            objects, all points are anywhere in the box.
+        hp: Hyperparameters. After the warm-up, `random_eps` is the fraction of the
+            steps in which the first and the last environment move to points.
     """
 
     steps_left: Tensor
@@ -104,22 +75,13 @@ class RandomPointModule(TensorDictModuleBase):
     warm_up_left: Tensor
     position_columns: Tensor
 
-    def __init__(
-        self,
-        eps: Tensor,
-        *,
-        action_size: int,
-        action_scale: float,
-        moves_joints: bool,
-        num_arm_actions: int,
-        object_columns: Sequence[int],
-        hand_column: int = 0,
-        box: tuple[Sequence[float], Sequence[float]] = BOX,
-    ) -> None:
+    def __init__(self, spaces: Spaces, hp: Hyperparameters) -> None:
         super().__init__()
         self.in_keys = ["observation", "action"]
         self.out_keys = ["action"]  # type: ignore[misc]  # it has a setter
-        num_envs = len(eps)
+        num_envs, geometry = spaces.num_envs, spaces.geometry
+        hand_column, *object_columns = geometry.positions if geometry else (0,)
+        eps = torch.linspace(*hp.random_eps, num_envs)
         # A move lasts d steps on average. If it starts with probability p per step, the
         # pause before it lasts (1 - p) / p steps. Choose p so that d / (d + pause) is
         # eps.
@@ -127,13 +89,13 @@ class RandomPointModule(TensorDictModuleBase):
         self.register_buffer(
             "start_probability", eps / (eps + mean_duration * (1 - eps))
         )
-        self.action_scale = action_scale
-        self.moves_joints = moves_joints
+        self.action_scale = spaces.action_scale
+        self.moves_joints = spaces.moves_joints
         self.hand = slice(hand_column, hand_column + 3)
-        self.box = box
+        self.box = geometry.box if geometry and geometry.box else BOX
         self.num_objects = len(object_columns)
         # Columns of the three coordinates of each object, (num_objects, 3).
-        x_columns = torch.tensor(tuple(object_columns), dtype=torch.int64).unsqueeze(-1)
+        x_columns = torch.tensor(object_columns, dtype=torch.int64).unsqueeze(-1)
         self.register_buffer(
             "position_columns", x_columns + torch.arange(3), persistent=False
         )
@@ -141,8 +103,8 @@ class RandomPointModule(TensorDictModuleBase):
         warm_up = WARM_UP if self.num_objects else 0
         self.register_buffer("warm_up_left", torch.tensor(warm_up))
         self.register_buffer("steps_left", torch.zeros(num_envs, dtype=torch.int64))
-        self.register_buffer("point", torch.zeros(num_envs, num_arm_actions))
-        gripper_size = action_size - num_arm_actions
+        self.register_buffer("point", torch.zeros(num_envs, spaces.num_arm_actions))
+        gripper_size = spaces.action_size - spaces.num_arm_actions
         self.register_buffer("gripper", torch.zeros(num_envs, gripper_size))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -9,7 +9,7 @@ from torchrl.objectives import SACLoss
 
 from torch_panda.learning.agents.base import Agent
 from torch_panda.learning.agents.batch import Batch
-from torch_panda.learning.agents.exploration import make_random_points
+from torch_panda.learning.agents.exploration import RandomPointModule
 from torch_panda.learning.agents.hyperparameters import Hyperparameters
 from torch_panda.learning.agents.networks import make_mlp
 from torch_panda.learning.environments.spaces import Spaces
@@ -55,7 +55,7 @@ class SAC(Agent):
         for key in online.keys(True, True):
             self._online.append(online[key])
             self._targets.append(targets[key])
-        noise = [make_random_points(spaces, hp)] if hp.exploration == "points" else []
+        noise = [RandomPointModule(spaces, hp)] if hp.exploration == "points" else []
         self.assemble(actor, noise)
 
     def losses(self, b: Batch) -> dict[str, Tensor]:

@@ -66,6 +66,11 @@ def make_env(
         TypeError: An argument is unknown.
     """
     if not is_from_gymnasium(env_id):
+        if workers != 1:
+            raise ValueError(
+                f"{env_id} is stepped by threads and needs no processes, got "
+                f"workers={workers}: drop --workers"
+            )
         return make(env_id, **options)
     accepted = {
         name: options.pop(name)

@@ -1,6 +1,5 @@
 """Geometry of a task: where its observations hold positions, and how to mirror them."""
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torch_panda.envs import RobotTaskEnv
+from torch_panda.envs.goal_observation import find_goal_indices
 from torch_panda.experts.cube_orientations import (
     compose,
     inverse,
@@ -18,10 +18,9 @@ from torch_panda.experts.cube_orientations import (
     straighten,
     to_matrix,
 )
+from torch_panda.robots import Robot
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import Quantity
-
-OBSERVED = ("observation", "desired_goal")
 
 # Factors that mirror a quantity across the plane y = 0, about which robot and table are
 # symmetric.
@@ -78,7 +77,7 @@ class Geometry:
         goal: Factors that mirror a goal, (goal size,).
         action: Factors that mirror an action, (action size,); None for joint control.
         positions: First column of each position in an observation. The first one is
-            the hand's, unless the hand is unknown.
+            the hand's. If the hand is unknown, there are none.
         goal_positions: First column of each position in a goal.
         goal_height: Height of all goals that the task draws [m]. Networks that see
             differences of positions get this height for all goals, because achieved
@@ -117,7 +116,7 @@ class Geometry:
         An observation has the numbers of an object from its position up to the next
         position, of another object or of the hand. Its part of the goal belongs to it,
         too, and so do the offsets that lead to it or from it. If the hand is unknown,
-        the numbers of the first object are treated as numbers of no object.
+        no number belongs to an object.
 
         Returns:
             For each number of the concatenation of observation and goal, and for each
@@ -175,33 +174,53 @@ def split_goal(size: int) -> list[slice]:
     return [slice(start, start + width) for start in range(0, size, width)]
 
 
-def declares_layout(task: Task) -> bool:
+def declares_layout(robot: Robot, task: Task) -> bool:
     """Whether a task declares a layout that fits its observations and goals."""
-    if task.observation_layout is None or task.goal_entries is None:
-        return False
-    size = sum(len(_MIRROR[quantity]) for quantity in task.observation_layout)
-    sizes = size, len(task.goal_entries.indices)
-    return sizes == (task.observation_dim, task.goal_dim)
+    return find_parts(robot, task) is not None
+
+
+def find_parts(
+    robot: Robot, task: Task
+) -> tuple[list[Part], list[tuple[Part, int]]] | None:
+    """Find the quantities in the observations and goals of a task that declares them.
+
+    Returns:
+        Each quantity of an observation, and each of a goal: as a part of the
+        observation, with its first column in the goal. None if the task does not
+        declare ``observation_layout`` and ``goal_entries``, if they do not fit, or if a
+        subclass has changed the functions that they describe.
+    """
+    indices, layout = find_goal_indices(robot, task), task.observation_layout
+    if indices is None or layout is None:
+        return None
+    fingers = (WIDTH,) * (robot.observation_dim - 6)
+    parts, start = [], 0
+    for quantity in ("position", "velocity", *fingers, *layout):
+        parts.append(Part(quantity, start))
+        start += len(_MIRROR[quantity])
+    goals = [(x, indices.index(x.start)) for x in parts if x.start in indices]
+    columns = [
+        x.start + k
+        for x, _ in sorted(goals, key=lambda goal: goal[1])
+        for k in range(len(_MIRROR[x.quantity]))
+    ]
+    fits = start == robot.observation_dim + task.observation_dim
+    return (parts, goals) if fits and tuple(columns) == indices else None
 
 
 def read_geometry(env: RobotTaskEnv) -> Geometry | None:
-    """Return the geometry of an environment.
+    """Return the geometry of an environment; None if its task declares none that fits.
 
-    Returns:
-        None if the task does not declare ``observation_layout`` and ``goal_entries``,
-        or if they do not fit its observations and goals.
+    See `find_parts`.
     """
     robot, task = env.robot, env.task
-    if task.observation_layout is None or task.goal_entries is None:
+    found = find_parts(robot, task)
+    if found is None:
         return None
-    fingers = (WIDTH,) * (robot.observation_dim - 6)
-    parts = locate(("position", "velocity", *fingers, *task.observation_layout))
+    parts, goals = found
     size = sum(len(_MIRROR[part.quantity]) for part in parts)
-    goals = locate_goals(parts, task, first=robot.observation_dim)
-    goal_size = sum(len(_MIRROR[part.quantity]) for part, _ in goals)
-    sizes = tuple(env.observation_spec[key].shape[-1] for key in OBSERVED)
-    if (size, goal_size) != sizes:  # a subclass changed its observation or its goals
-        return None
+    if env.observation_spec["desired_goal"].shape[-1] != task.goal_dim:
+        return None  # goals are full observations
 
     _, *objects = (part.start for part in parts if part.quantity == "position")
     positions = [goal for goal in goals if goal[0].quantity == "position"]
@@ -215,7 +234,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
         origins=tuple(origin + axis for origin, _ in pairs for axis in range(3)),
         observation=tuple(x for part in parts for x in _MIRROR[part.quantity]),
         goal=tuple(x for part, _ in goals for x in _MIRROR[part.quantity]),
-        action=(*_MIRROR["position"], *(1.0 for _ in fingers))
+        action=(*_MIRROR["position"], *(1.0,) * (robot.observation_dim - 6))
         if robot.control_type == "ee"
         else None,
         positions=(0, *objects),
@@ -345,7 +364,7 @@ def find_geometry(rollouts: TensorDict, hand: int | None = 0) -> Geometry:
         observation=(1.0,) * size,
         goal=(1.0,) * goal_size,
         action=None,  # whether the task is symmetric is unknown
-        positions=tuple(objects) if hand is None else (hand, *objects),
+        positions=() if hand is None else (hand, *objects),
         goal_positions=tuple(goals),
         goal_height=None,
         orientation=None,
@@ -364,34 +383,3 @@ def _find_columns(observation: Tensor, achieved: Tensor) -> list[int | None]:
         following = [k for k in equal if follows and k - 1 == columns[-1]]
         columns.append(next(iter(following or equal), None))
     return columns
-
-
-def locate(layout: Sequence[Quantity]) -> list[Part]:
-    """Return the quantities of an observation with their first columns."""
-    parts, start = [], 0
-    for quantity in layout:
-        parts.append(Part(quantity, start))
-        start += len(_MIRROR[quantity])
-    return parts
-
-
-def locate_goals(
-    parts: Iterable[Part], task: Task, first: int
-) -> list[tuple[Part, int]]:
-    """Return the quantities of a goal.
-
-    Args:
-        parts: Quantities of the observation.
-        task: The task.
-        first: First column of the task's part of an observation.
-
-    Returns:
-        Each quantity of the goal as a part of the observation, and its first column in
-        a goal.
-    """
-    assert task.goal_entries is not None
-    offset = first if task.goal_entries.part == "task" else 0
-    entries = [offset + index for index in task.goal_entries.indices]
-    return [
-        (part, entries.index(part.start)) for part in parts if part.start in entries
-    ]

@@ -87,12 +87,14 @@ class GymGoalEnv(EnvBase):
             self._single.close()
             raise ValueError(f"{env_id} cannot be used: {'; '.join(problems)}")
         self.max_episode_steps = int(spec.max_episode_steps or 0)
+        # Not every environment takes this argument.
+        rendering: dict[str, Any] = {"render_mode": "rgb_array"} if renders else {}
         self._vector: VectorEnv[Any, Any, Any] = gymnasium.make_vec(
             env_id,
             num_envs=num_envs,
             vectorization_mode="sync" if workers == 1 else "async",
             vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
-            render_mode="rgb_array" if renders else None,
+            **rendering,
         )
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.is_closed = False

@@ -78,16 +78,14 @@ def read(
     keys: Iterable[NestedKey],
     *,
     finite: Iterable[NestedKey] = (),
-    **options: Any,  # noqa: ANN401 (options of torch.load)
 ) -> Any:  # noqa: ANN401 (the content)
-    """Read a file that `save` wrote. Code in the file is not run.
+    """Read a file that `save` wrote, onto the CPU. Code in the file is not run.
 
     Args:
         path: The file.
         content_name: Name of the expected content for the error, such as "a policy".
         keys: Keys that the content must have.
         finite: Keys under which all numbers must be finite.
-        **options: Options of `torch.load`.
 
     Raises:
         ValueError: The file is missing or damaged, or lacks a key.
@@ -96,7 +94,7 @@ def read(
         raise ValueError(f"there is no file {path}")
     try:
         check_archive(path)
-        content = torch.load(path, weights_only=True, **options)
+        content = torch.load(path, weights_only=True, map_location="cpu")
         for key in keys:
             get(content, key)
         for key in finite:

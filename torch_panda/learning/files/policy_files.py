@@ -95,7 +95,7 @@ class SavedPolicy:
             path = path / "checkpoint.pt"
         finite = ("hyperparameters", "policy")
         keys = ("env_id", ("spaces", "geometry"), *finite)
-        content = files.read(path, "a policy", keys, finite=finite, map_location="cpu")
+        content = files.read(path, "a policy", keys, finite=finite)
         hp = _read_hyperparameters(path, content["hyperparameters"])
         try:
             spaces = Spaces.from_dict(content["spaces"])

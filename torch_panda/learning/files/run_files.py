@@ -123,9 +123,7 @@ class Checkpoint:
         finite = ("agent", "optimizer")
         path = self.out / STATE
         # The run may go on on another device.
-        state = files.read(
-            path, "the state of a run", keys, finite=finite, map_location="cpu"
-        )
+        state = files.read(path, "the state of a run", keys, finite=finite)
         options = fixed_options(self.args)
         # The run may be older than an option.
         saved = {**options, **state["args"]}
