@@ -524,9 +524,6 @@ class Hindsight(envs.Transform):
         super().set_container(container)
         self.empty_cache()
 
-    def _call(self, next_tensordict: TensorDictBase | None) -> TensorDictBase:
-        raise ValueError(ENVIRONMENT_ERROR)
-
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the memory and the generator, for `state_dict` and `dumps`."""
         with self._lock:

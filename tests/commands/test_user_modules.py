@@ -55,7 +55,7 @@ def test_a_registered_task_is_trained_evaluated_watched_and_plotted(folder, caps
     assert "success at the end" in capsys.readouterr().out
     watch = ["--policy", "run", "--num-envs", "1", "--out", "watch.gif"]
     main(["watch", "--import", module, *watch])
-    main(["plot", ".", "--import", module])
+    main(["plot", "."])
     assert (folder / "watch.gif").stat().st_size
     assert (folder / "curves.png").stat().st_size
 
@@ -96,7 +96,7 @@ def test_an_error_inside_the_module_is_shown(folder):
         main(["evaluate", "run", "--import", "broken"])
 
 
-@pytest.mark.parametrize("command", ["evaluate", "plot", "refine", "train"])
+@pytest.mark.parametrize("command", ["evaluate", "refine", "train"])
 def test_ctrl_c_ends_a_command_without_a_traceback(folder, monkeypatch, command):
     (folder / "interrupts.py").write_text("raise KeyboardInterrupt")
     monkeypatch.delitem(sys.modules, "interrupts", raising=False)

@@ -162,9 +162,8 @@ def test_environments_explore_differently():
     agent, td = make_explorer("ddpg", 4, noise_eps=0.0, random_eps=(0.0, 1.0))
     rounds = [(deviations(agent, td) != 0).any(-1) for _ in range(99)]
     share = torch.stack(rounds).double().mean(0)
-    assert share[0] == 0
-    assert share[-1] == 1
-    assert 0.1 < share[1] < share[2] < 0.9
+    assert share[[0, -1]].tolist() == [0.0, 1.0]
+    assert share.tolist() == pytest.approx([0.0, 1 / 3, 2 / 3, 1.0], abs=0.12)
 
 
 @pytest.mark.parametrize("algo", ALGOS)

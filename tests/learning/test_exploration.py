@@ -55,33 +55,6 @@ def explore(module, steps, action_size=4):
     return torch.stack(actions)
 
 
-def explore_from_one_state(options, steps=200, num_envs=5):
-    """Actions of an untrained agent (steps, num_envs, 3), minus those of its policy."""
-    torch.manual_seed(0)
-    with torch_panda.make("PandaPush-v1", num_envs=num_envs, seed=0) as env:
-        agent = make_agent(env, Hyperparameters(**options))
-        start = env.reset()
-    with torch.no_grad():
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            expected = agent.policy(start.clone())["action"]
-        with set_exploration_type(ExplorationType.RANDOM):
-            actions = [agent.explore(start.clone())["action"] for _ in range(steps)]
-    return torch.stack(actions) - expected
-
-
-def test_actions_have_noise():
-    change = explore_from_one_state({"random_eps": (0.0, 0.0), "noise_eps": 0.3})
-    assert change.std() == pytest.approx(0.3, abs=0.03)
-    assert change.mean() == pytest.approx(0.0, abs=0.03)
-
-
-def test_random_actions_are_spread_over_the_environments():
-    change = explore_from_one_state({"random_eps": (0.0, 1.0), "noise_eps": 0.0})
-    share = (change.abs() > 1e-5).any(-1).float().mean(0)
-    assert share[[0, -1]].tolist() == [0.0, 1.0]
-    assert share.tolist() == pytest.approx([0.0, 0.25, 0.5, 0.75, 1.0], abs=0.1)
-
-
 def test_actions_towards_a_point_have_noise():
     torch.manual_seed(0)
     module = make_module(1.0)

@@ -11,7 +11,6 @@ from typing import Annotated
 import tyro
 
 from torch_panda.learning.plots import Metric, plot_panels, read_runs
-from torch_panda.learning.user_modules import Imports, import_modules
 
 
 @dataclass
@@ -24,15 +23,12 @@ class Args:
     """column of the curves to draw"""
     out: Path = Path("curves.png")
     """picture to write"""
-    imports: Imports = ()
-    """module or .py file to import first, which registers ids of your own"""
 
 
 def main(args: Args) -> None:
     """Draw the runs."""
     out = args.out.with_suffix(args.out.suffix or ".png")
     try:
-        import_modules(args.imports)
         out.parent.mkdir(parents=True, exist_ok=True)
         plot_panels(read_runs(args.runs), args.metric, out)
     except (ValueError, OSError) as error:

@@ -96,13 +96,13 @@ class SavedPolicy:
         finite = ("hyperparameters", "policy")
         keys = ("env_id", ("spaces", "geometry"), *finite)
         content = files.read(path, "a policy", keys, finite=finite)
-        hp = _read_hyperparameters(path, content["hyperparameters"])
         try:
+            hp = _read_hyperparameters(path, content["hyperparameters"])
             spaces = Spaces.from_dict(content["spaces"])
         except TypeError as error:
             raise ValueError(
-                f"{path} was saved by another version of torch_panda, which describes "
-                f"environments by other entries: {error}"
+                f"{path} was saved by another version of torch_panda, which has other "
+                f"options or describes environments by other entries: {error}"
             ) from None
         return cls(path, content["env_id"], hp, spaces, content["policy"])
 
@@ -144,15 +144,9 @@ def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparamet
     """Make the hyperparameters that a file holds.
 
     Raises:
-        ValueError: This version of torch_panda does not know one of their names or
-            values.
+        ValueError: This version of torch_panda does not know one of their values.
+        TypeError: It does not know one of their names.
     """
-    accepted = {field.name for field in fields(Hyperparameters)}
-    if unknown := values.keys() - accepted:
-        raise ValueError(
-            f"{path} was saved by another version of torch_panda, with options that "
-            f"this version does not have: {', '.join(sorted(unknown))}"
-        )
     for name, hint in get_type_hints(Hyperparameters).items():
         choices = get_args(hint) if get_origin(hint) is Literal else ()
         if choices and name in values and values[name] not in choices:

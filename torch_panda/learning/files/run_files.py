@@ -16,7 +16,7 @@ import io
 import json
 import os
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -130,7 +130,16 @@ class Checkpoint:
         steps = options.get("total_steps", 0)
         if steps > saved.get("total_steps", steps):
             saved["total_steps"] = steps
-        check_same(self.out, saved, options)
+        differing = [
+            f"{key} was {saved.get(key)!r} and is now {value!r}"
+            for key, value in options.items()
+            if saved.get(key) != value
+        ]
+        if differing:
+            raise ValueError(
+                f"cannot resume {self.out} with other options "
+                f"({'; '.join(differing)}): repeat the former options"
+            )
         data_hash = state["data_hash"]
         if data_hash != self.data_hash:
             raise ValueError(
@@ -181,26 +190,6 @@ def fixed_options(args: Any) -> dict[str, Any]:  # noqa: ANN401 (a dataclass)
     return {key: value for key, value in options.items() if key not in FREE_OPTIONS}
 
 
-def check_same(
-    folder: Path, saved: Mapping[str, object], options: Mapping[str, object]
-) -> None:
-    """Check that a run or a data set is continued with the options of its start.
-
-    Raises:
-        ValueError: An option differs from the saved one.
-    """
-    differing = [
-        f"{key} was {saved.get(key)!r} and is now {value!r}"
-        for key, value in options.items()
-        if saved.get(key) != value
-    ]
-    if differing:
-        raise ValueError(
-            f"cannot resume {folder} with other options ({'; '.join(differing)}): "
-            "repeat the former options"
-        )
-
-
 def write_options(
     out: Path,
     args: Any,  # noqa: ANN401 (a dataclass)
@@ -213,8 +202,7 @@ def write_options(
 
     Its entry ``changed`` has the options that differ from ``default``, for the legends
     of plots. The entries ``more`` are written too. If a run is resumed, its file keeps
-    its entries, such as a label, and gets the new value of ``total_steps``. Call
-    `check_same` first, which checks that the other options are the same.
+    its entries, such as a label, and gets the new value of ``total_steps``.
 
     Raises:
         OSError: The file cannot be written.
