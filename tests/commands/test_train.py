@@ -226,31 +226,6 @@ def test_a_tenth_of_the_episodes_in_which_nothing_moves_is_stored(tmp_path):
         assert low <= len(run.source.buffer) / 50 <= high
 
 
-def test_the_normaliser_sees_hindsight_goals(tmp_path, monkeypatch):
-    run = Run(Args(num_envs=2, total_steps=100), tmp_path)
-    data = next(iter(run.source.collector))
-    seen = []
-    monkeypatch.setattr(run.agent.normalizer, "update", lambda *x: seen.append(x))
-    run.source.store(data)
-    run.close()
-    ((observations, goals),) = seen
-    assert torch.equal(observations, data["observation"].flatten(0, 1))
-    changed = (goals != data["desired_goal"].flatten(0, 1)).any(-1)
-    assert 0.6 < changed.float().mean() < 0.95
-
-
-def test_a_quarter_of_each_batch_are_demonstrations(tmp_path, make_demos):
-    demos = TensorDict(torch.load(make_demos("PandaReach-v1"))).auto_batch_size_(1)
-    args = Args(num_envs=1, total_steps=50, updates_per_step=0.1, batch_size=64)
-    run = Run(args, tmp_path, demos)
-    assert run.agent.normalizer.count == len(demos)
-    run.source.store(next(iter(run.source.collector)))
-    run.close()
-    run.progress.steps = 50
-    sizes = [(len(batch), len(demos)) for batch, demos in run.sample()]
-    assert sizes == [(48, 16)] * 5
-
-
 def test_critics_of_parts_learn_from_rewards_of_parts(tmp_path, make_demos):
     path = make_demos("PandaStack-v1", episodes=1)
     demos = TensorDict(torch.load(path)).auto_batch_size_(1)

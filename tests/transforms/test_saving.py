@@ -64,11 +64,3 @@ def test_an_empty_buffer_is_loaded_under_any_strategy(tmp_path):
     new.transform[0].set_extra_state(rb.transform[0].get_extra_state())
     new.extend(play())
     check(new, "desired")
-
-
-@HOW
-def test_goals_of_a_goal_sampler_are_drawn_by_hindsight_relabel(how, tmp_path):
-    rb, new = make(GoalSampler, "desired"), make(HindsightRelabel, MIXTURE)
-    rb.extend(play())
-    reload(rb, new, how, tmp_path)
-    assert new.sample()["desired_goal"].isfinite().all()
