@@ -17,25 +17,10 @@ MAX_WEIGHT = 100.0  # largest weight of a row in advantage-weighted regression
 OGBENCH_RATES = (3e-4, 0.005)
 
 
-class ClippedMean(nn.Module):
-    """The mean of a Gaussian policy with unit variance, clipped to [-1, 1].
-
-    Args:
-        actor: Module from the state to the mean action, (..., action size).
-    """
-
-    def __init__(self, actor: nn.Module) -> None:
-        super().__init__()
-        self.actor = actor
-
-    def forward(self, state: Tensor) -> Tensor:
-        """The action, (..., action size)."""
-        return self.actor(state).clamp(-1.0, 1.0)
-
-
 def make_mean_policy(actor: nn.Module) -> TensorDictModule:
-    """Make the deterministic policy of an actor that outputs a mean action."""
-    return TensorDictModule(ClippedMean(actor), ["normalized"], ["action"])
+    """Make the policy of an actor that outputs a mean action, clipped to [-1, 1]."""
+    clipped = nn.Sequential(actor, nn.Hardtanh())
+    return TensorDictModule(clipped, ["normalized"], ["action"])
 
 
 def log_prob(mean: Tensor, x: Tensor) -> Tensor:
