@@ -93,10 +93,10 @@ def make_buffer(
         capacity: Number of transitions. A number above `BUFFER_SIZE` is reduced to it.
         her: "relabel" gives a fraction K / (K + 1) of the sampled transitions a
             hindsight goal. "parts" draws for each object separately whether its part of
-            the goal is relabelled, and relabels all parts of as many transitions.
-            "geometric" gives every sampled transition the goal achieved k steps later
-            in its episode, with probability proportional to discount**k. "none" keeps
-            the original goals.
+            the goal is relabelled. The same fraction of transitions has all parts
+            relabelled. "geometric" gives every sampled transition the goal achieved k
+            steps later in its episode, with probability proportional to discount**k.
+            "none" keeps the original goals.
         desired_ratio: Fraction of the hindsight goals that are desired goals of random
             transitions, or with "parts" contain a part of one. The rest are goals
             achieved later in the same episode.
@@ -112,8 +112,8 @@ def make_buffer(
             "--her parts needs goals of several objects, such as those of Stack: pass "
             "--her relabel"
         )
-    # Parts are drawn independently. Because of these roots, all parts of a transition
-    # together have the same ratios as a whole goal.
+    # Each part is drawn on its own. The roots make it as likely for all parts together
+    # to be relabelled, and to be achieved later, as for a whole goal.
     root = 1 / len(parts) if her == "parts" else 1.0
     later_ratio = (1 - desired_ratio) ** root
     later = "geometric" if her == "geometric" else "future"

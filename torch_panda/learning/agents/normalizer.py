@@ -106,8 +106,9 @@ class Normalizer(nn.Module):
     def part_weights(self) -> Tensor:
         """Weights of a state's numbers for the critic of each part of a goal.
 
-        Numbers of the object of the part, and numbers of no object, such as the hand's
-        position, have the weight 1. Numbers of other objects have the weight `OTHERS`.
+        The numbers of the part's own object have the weight 1, and so have numbers that
+        describe no object, such as the hand's position. The numbers of the other
+        objects have the weight `OTHERS`.
 
         Returns:
             ``(parts, state size)``.

@@ -218,7 +218,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
     if found is None:
         return None
     parts, goals = found
-    size = sum(len(_MIRROR[part.quantity]) for part in parts)
+    size = robot.observation_dim + task.observation_dim
     if env.observation_spec["desired_goal"].shape[-1] != task.goal_dim:
         return None  # goals are full observations
 
@@ -336,16 +336,15 @@ def find_geometry(rollouts: TensorDict, hand: int | None = 0) -> Geometry:
     pairs: list[tuple[int, int]] = []  # of origin and point
     objects: list[int] = []
     goals: list[int] = []
-    # Goals of another size are no positions alone, such as the quaternions of Flip.
-    for start in range(0, goal_size if goal_size % 3 == 0 else 0, 3):
-        column, *others = columns[start : start + 3]
+    for part in split_goal(goal_size):
+        column, *others = columns[part]
         if column is None or others != [column + 1, column + 2]:
             continue
-        goals.append(start)
+        goals.append(part.start)
         if column not in (hand, *objects):
             objects.append(column)
             pairs += [] if hand is None else [(hand, column)]
-        pairs.append((column, size + start))
+        pairs.append((column, size + part.start))
     # Points are drawn around the starts of the objects, or of the goals of the hand.
     centres = [rollouts["observation"][:, 0, k : k + 3] for k in objects]
     if not objects:
