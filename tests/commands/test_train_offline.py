@@ -13,7 +13,7 @@ from tests.commands.runs import After, points, read_curve, weights
 from tests.devices import DEVICES
 from tests.learning.gradient_steps import SPACES, fill_normalizer
 from torch_panda.bullet import FAST
-from torch_panda.commands import plot, refine, train
+from torch_panda.commands import plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import sources
 from torch_panda.learning.agents import OFFLINE_AGENTS
@@ -50,8 +50,6 @@ def test_the_run_writes_its_files_and_its_policy_can_be_used(tmp_path, capsys):
     result = torch_panda.evaluate(policy, "PandaReach-v1", episodes=2)
     assert len(result.success) == 2
     assert list(plot.read_runs([tmp_path])) == ["PandaReach-v1, offline"]
-    with pytest.raises(SystemExit, match="was learned offline by gcbc, but refine"):
-        refine.main(refine.Args(policy=out, out=tmp_path / "refined", num_envs=2))
 
 
 def test_the_normaliser_knows_the_data_before_the_first_step(tmp_path):

@@ -76,12 +76,6 @@ DEMOS = ["--demos", "nofile.pt"]
         ("bench", ["--plot", "/dev/null/speed.png"], "File exists"),
         ("bench", ["--others", "slow"], "others must be some of torch_panda, fast, .*"),
         ("bench", ["--plot", "a.xyz"], "plot must end in one of .*, got 'a.xyz'"),
-        ("refine", ["missing.pt", "--out", "new"], "there is no file"),
-        (
-            "refine",
-            ["missing.pt", "--out", "new", "--updates", "0"],
-            "updates must be positive",
-        ),
         ("plot", ["nowhere"], "there is no run below nowhere: a run is"),
         ("trian", [], r"unknown command 'trian'(.|\n)*evaluate"),
     ],

@@ -20,7 +20,7 @@ def numbers(hint):
 
 
 @pytest.mark.parametrize(
-    "script", ["train", "evaluate", "record", "refine", "watch", "bench", "distributed"]
+    "script", ["train", "evaluate", "record", "watch", "bench", "distributed"]
 )
 def test_every_number_has_a_limit(script):
     if script == "distributed":

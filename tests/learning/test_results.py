@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from torch_panda.commands import refine
 from torch_panda.commands.train import parse
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.files.run_files import fixed_options
@@ -101,15 +100,6 @@ def test_every_run_has_a_command_with_its_options(commands, runs):
     for name, args in runs.items():
         assert name.startswith(f"{args['env_id']}-{args['algo']}-")
         assert name.endswith(f"-{args['seed']}")
-
-
-def test_refinements_have_the_default_options():
-    default = fixed_options(refine.Args(Path("policy"), Path("out")))
-    for number in (0, 1):
-        folder = RUNS / f"PandaSlide-v1-ddpg-refined-{number}"
-        args = json.loads((folder / "args.json").read_text())
-        for key in ("steps", "updates", "batch_size", "num_envs"):
-            assert args[key] == default[key]
 
 
 FOLDER = r"`(Panda\w+-v\d-[\w-]+-)S`"

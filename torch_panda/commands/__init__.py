@@ -19,7 +19,6 @@ COMMANDS = {
     "watch": "record a policy as a video, or show it in a window or browser",
     "record": "record demonstrations of a scripted expert",
     "plot": "draw the success curves of runs",
-    "refine": "let a policy imitate its own episodes with the goals that they achieved",
     "distributed": "train on the machines of a Ray cluster",
     "bench": "compare the speed with other environments",
     "info": "print versions, environments, threads and renderers",

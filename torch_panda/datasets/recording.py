@@ -65,20 +65,18 @@ def add_noise(
 
 
 def play(
-    env: torch_panda.RobotTaskEnv,
-    expert: TensorDictModuleBase,
-    # mypy takes the members of this enum for strings.
-    exploration: ExplorationType = ExplorationType.RANDOM,  # type: ignore[assignment]
+    env: torch_panda.RobotTaskEnv, expert: TensorDictModuleBase
 ) -> list[TensorDictBase]:
     """Play one new episode in every environment.
 
     Args:
         env: Batched environment.
-        expert: Policy that writes ``action``.
-        exploration: torchrl's exploration type; RANDOM lets the policy add noise.
+        expert: Policy that writes ``action``. It may add noise.
 
     Returns:
         The episodes, each with its transitions (steps,).
     """
-    rollout, lengths = play_episodes(env, expert, exploration)
+    # mypy takes the members of this enum for strings.
+    exploration = ExplorationType.RANDOM
+    rollout, lengths = play_episodes(env, expert, exploration)  # type: ignore[arg-type]
     return [row[:length] for row, length in zip(rollout, lengths.tolist(), strict=True)]

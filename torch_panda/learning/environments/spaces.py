@@ -54,11 +54,6 @@ class Spaces:
     moves_joints: bool
 
     @property
-    def sizes(self) -> tuple[int, int, int]:
-        """Sizes of observation, goal and action."""
-        return self.observation_size, self.goal_size, self.action_size
-
-    @property
     def num_arm_actions(self) -> int:
         """Number of entries of an action that move the arm. They come first."""
         return self.action_size - int(self.has_free_gripper)

@@ -1,21 +1,18 @@
 """Files of trained policies: their weights, and the numbers to build the networks."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from typing_extensions import Self
 
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent, Hyperparameters, find_agent
-from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.environments.spaces import Spaces, read_spaces
+from torch_panda.learning.environments.spaces import Spaces
 from torch_panda.policies import shipped_policies
 
 
@@ -62,82 +59,36 @@ class Policy(TensorDictModuleBase):
         return tensordict.set("action", action)
 
 
-@dataclass(frozen=True)
-class SavedPolicy:
-    """The content of a policy's file.
+def _read_policy(path: Path) -> Policy:
+    """Read a file of `save_policy` onto the CPU. Code in the file is not run.
 
-    Attributes:
-        path: The file.
-        env_id: Id of the environment that the policy was trained on.
-        hp: Hyperparameters of the agent.
-        spaces: Sizes and layout of observations, goals and actions.
-        weights: State dict of each of `Agent.policy_parts`, by name.
+    Raises:
+        ValueError: There is no file, it holds no policy, or another version of
+            torch_panda wrote it.
     """
-
-    path: Path
-    env_id: str
-    hp: Hyperparameters
-    spaces: Spaces
-    weights: Mapping[str, Mapping[str, Tensor]]
-
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """Read a file of `save_policy` onto the CPU. Code in the file is not run.
-
-        Args:
-            path: The file, or the folder of a run.
-
-        Raises:
-            ValueError: There is no file, it holds no policy, or another version of
-                torch_panda wrote it.
-        """
-        if path.is_dir():
-            path = path / "checkpoint.pt"
-        finite = ("hyperparameters", "policy")
-        keys = ("env_id", ("spaces", "geometry"), *finite)
-        content = files.read(path, "a policy", keys, finite=finite)
-        try:
-            hp = _read_hyperparameters(path, content["hyperparameters"])
-            spaces = Spaces.from_dict(content["spaces"])
-        except TypeError as error:
-            raise ValueError(
-                f"{path} was saved by another version of torch_panda, which has other "
-                f"options or describes environments by other entries: {error}"
-            ) from None
-        return cls(path, content["env_id"], hp, spaces, content["policy"])
-
-    def make_agent(self, env: GoalEnv | None = None) -> Agent:
-        """Make an agent with this policy, and with untrained critics.
-
-        Args:
-            env: Environments in which the agent will explore. None means as many
-                environments as in the training.
-
-        Raises:
-            ValueError: The environments' spaces have other sizes than in the training,
-                or the weights do not fit the hyperparameters.
-        """
-        spaces = self.spaces
-        if env is not None:
-            sizes = read_spaces(env).sizes
-            if sizes != spaces.sizes:
-                raise ValueError(
-                    f"{self.path} was trained on {self.env_id}, where the sizes of "
-                    f"observation, goal and action are {spaces.sizes}, got {sizes}: "
-                    "choose a task with the same spaces"
-                )
-            spaces = replace(spaces, num_envs=env.batch_size.numel())
-        with torch.device("cpu"):
-            agent = find_agent(self.hp)(spaces, self.hp)
-        try:
-            for name, part in agent.policy_parts.items():
-                part.load_state_dict(self.weights[name])
-        except (KeyError, RuntimeError):
-            raise ValueError(
-                f"{self.path} does not hold a policy, or is damaged: its weights do "
-                "not fit its hyperparameters"
-            ) from None
-        return agent
+    finite = ("hyperparameters", "policy")
+    keys = ("env_id", ("spaces", "geometry"), *finite)
+    content = files.read(path, "a policy", keys, finite=finite)
+    try:
+        hp = _read_hyperparameters(path, content["hyperparameters"])
+        spaces = Spaces.from_dict(content["spaces"])
+    except TypeError as error:
+        raise ValueError(
+            f"{path} was saved by another version of torch_panda, which has other "
+            f"options or describes environments by other entries: {error}"
+        ) from None
+    # New networks draw random weights.
+    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+        agent = find_agent(hp)(spaces, hp)
+    try:
+        for name, part in agent.policy_parts.items():
+            part.load_state_dict(content["policy"][name])
+    except (KeyError, RuntimeError):
+        raise ValueError(
+            f"{path} does not hold a policy, or is damaged: its weights do not fit its "
+            "hyperparameters"
+        ) from None
+    return Policy(agent.policy, content["env_id"], spaces)
 
 
 def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparameters:
@@ -203,7 +154,4 @@ def load_policy(id_or_path: str | Path) -> Policy:
             f"no policy {str(id_or_path)!r}: pass the folder of a run, a .pt file, or "
             f"one of the ids that have a policy, {', '.join(shipped)}"
         )
-    saved = SavedPolicy.read(path)
-    with torch.random.fork_rng(devices=[]):  # new networks draw random weights
-        module = saved.make_agent().policy
-    return Policy(module, saved.env_id, saved.spaces)
+    return _read_policy(path / "checkpoint.pt" if path.is_dir() else path)

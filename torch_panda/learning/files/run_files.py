@@ -49,8 +49,7 @@ class Progress:
     Attributes:
         steps: Environment steps so far, or gradient steps of an offline run.
         pretrained: Gradient steps of imitation so far.
-        seconds: Time spent on stepping and learning, without evaluations. In ``refine``
-            only the time of the imitation.
+        seconds: Time spent on stepping and learning, without evaluations.
         curve: One row for each evaluation.
         loss_sums: Each loss of the last iteration. In offline learning, the sum of the
             losses since the last evaluation.
