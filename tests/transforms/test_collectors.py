@@ -14,9 +14,6 @@ COLLECTORS = {
     "ParallelEnv": functools.partial(Collector, toy.make_parallel),
     "synchronous": functools.partial(MultiSyncCollector, WORKERS),
     "asynchronous": functools.partial(MultiAsyncCollector, WORKERS),
-    "asynchronous ParallelEnv": functools.partial(
-        MultiAsyncCollector, [toy.make_parallel, toy.make_third_in_parallel]
-    ),
 }
 
 
@@ -49,23 +46,6 @@ def test_batches_of_a_single_process_are_relabelled(ndim, steps, reset_at_each_i
     check(SINGLE, 3 * steps, 20, ndim=ndim, reset_at_each_iter=reset_at_each_iter)
 
 
-@pytest.mark.parametrize(
-    "collector",
-    [
-        "ParallelEnv",
-        "synchronous",
-        "asynchronous",
-        pytest.param("asynchronous ParallelEnv", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("collector", COLLECTORS)
 def test_batches_of_worker_processes_are_relabelled(collector):
     check(COLLECTORS[collector], 6 * 4, 20)
-
-
-def test_collectors_in_turn_do_not_mix_their_trajectories():
-    """Each numbers its trajectories from 0 and leaves some unfinished."""
-    rb = buffer(HindsightRelabel(reward_fn), capacity=5000, batch_size=256)
-    for make in (*WORKERS, toy.make_env):
-        for data in collect(functools.partial(Collector, make), 3 * 5, 3 * 5 * 4):
-            rb.extend(data.reshape(-1))
-    check_batch(rb.sample(), rb.storage[:], "future")

@@ -2,14 +2,9 @@
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from torchrl.data import (
-    LazyMemmapStorage,
     LazyTensorStorage,
-    ReplayBuffer,
     SliceSampler,
-    TensorDictReplayBuffer,
 )
 
 from tests.devices import DEVICES
@@ -21,7 +16,7 @@ from tests.transforms.identifiable import (
     reward_fn,
     terminated_fn,
 )
-from tests.transforms.pipelines import PHASES, buffer
+from tests.transforms.pipelines import buffer
 from torch_panda.transforms import GoalSampler, HindsightRelabel
 from torch_panda.transforms.strategies import NAMES
 
@@ -36,54 +31,6 @@ def check_sample(batch, stored):
         check_goals(batch[key], achieved, stored, strategy)
     first = batch[next(iter(ALL))]
     assert torch.equal(batch["next", "reward"], reward_fn(achieved, first))
-
-
-@settings(
-    max_examples=15,
-    deadline=None,
-    phases=PHASES,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-@given(
-    num_envs=st.integers(1, 5),
-    lengths=st.lists(st.integers(1, 30), min_size=1, max_size=3),
-    steps=st.integers(2, 12),
-    capacity=st.integers(60, 200),
-    layout=st.sampled_from(["flat", "time first", "two-dimensional", "no ids"]),
-)
-def test_each_key_has_goals_that_its_strategy_may_draw(
-    num_envs, lengths, steps, capacity, layout
-):
-    ndim = 1 if layout in ("flat", "time first") else 2
-    rb = buffer(GoalSampler(ALL, reward_fn), capacity=capacity, ndim=ndim)
-    envs = Envs(num_envs, lengths)
-    for _ in range(20):
-        data = name_goals(envs.chunk(steps))
-        if layout == "no ids":
-            data = data.exclude("collector")
-        if layout == "time first":
-            data = data.transpose(0, 1)
-        rb.extend(data.reshape(-1) if ndim == 1 else data)
-        check_sample(rb.sample(), rb.storage[:])
-
-
-@pytest.mark.parametrize("cls", [ReplayBuffer, TensorDictReplayBuffer])
-@pytest.mark.parametrize("prefetch", [None, 2])
-def test_goals_are_right_on_disk_and_with_prefetching(cls, prefetch, tmp_path):
-    rb = cls(
-        storage=LazyMemmapStorage(60, scratch_dir=tmp_path),
-        transform=GoalSampler(ALL, reward_fn),
-        batch_size=32,
-        prefetch=prefetch,
-    )
-    envs = Envs(3, [5, 9])
-    for _ in range(2):
-        rb.extend(name_goals(envs.chunk(10)).reshape(-1))
-    before = rb.storage[:].clone()
-    for _ in range(5):
-        check_sample(rb.sample(), before)
-    check_sample(rb[:], before)
-    assert (rb.storage[:] == before).all(), "the storage was written into"
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -13,7 +13,6 @@ from torchrl.data import (
     ReplayBufferEnsemble,
     SliceSampler,
     TensorDictMaxValueWriter,
-    TensorDictReplayBuffer,
     TensorStorage,
 )
 from torchrl.envs import (
@@ -244,14 +243,6 @@ def test_adding_several_steps_as_one_is_refused():
         rb.add(Envs(2, [4]).chunk(8).reshape(-1))
 
 
-@pytest.mark.parametrize("cls", [TensorDictReplayBuffer, ReplayBuffer])
-def test_a_max_value_writer_is_refused(cls):
-    writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
-    rb = buffer(HindsightRelabel(reward_fn), cls=cls, writer=writer)
-    with pytest.raises(RuntimeError, match=r"round-robin.*TensorDictMaxValueWriter"):
-        rb.extend(Envs(2, [4]).chunk(8).reshape(-1))
-
-
 def test_a_transform_that_moves_to_another_buffer_goes_by_that_one():
     chain = Compose(HindsightRelabel(reward_fn, strategy="episode"))
     first = buffer(chain)
@@ -415,25 +406,6 @@ def test_random_goals_are_drawn_uniformly_from_stored_transitions():
     drawn_goals, counts = drawn.unique(dim=0, return_counts=True)
     assert torch.equal(drawn_goals, goals)
     check_counts(counts, torch.full((len(goals),), len(drawn) / len(goals)))
-
-
-def test_parts_of_slices_are_relabelled_on_their_own():
-    transform = HindsightRelabel(
-        reward_fn, goal_parts=(2, 1), her_ratio=0.6, unit="slice", seed=0
-    )
-    rb, data = buffer(transform, sampler=slices()), goals_data()
-    rb.extend(data)
-    batch = rb.sample(40_000)
-    goal, achieved = batch["desired_goal"], batch["next", "achieved_goal"]
-    own = data["desired_goal"][batch["index"][:, 0]]
-    first, second = (goal[:, :2] != own[:, :2]).all(1), goal[:, 2] != own[:, 2]
-    assert (goal[first][:, :2] == achieved[first][:, :2]).all()
-    assert (goal[second][:, 2] >= achieved[second][:, 2]).all()
-    assert (goal[~first][:, :2] == own[~first][:, :2]).all()
-    for part, share in ((first, 0.6), (second, 0.6), (first & second, 0.36)):
-        assert abs(part.float().mean() - share) < 0.02  # independently
-    assert (batch["next", "desired_goal"] == goal).all()
-    assert (batch["next", "reward"] == reward_fn(achieved, goal)).all()
 
 
 @pytest.mark.parametrize("parts", [(3, 3), (2,)])

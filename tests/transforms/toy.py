@@ -60,12 +60,7 @@ def make_env(worker: int = 0) -> ToyEnv:
 
 make_first = functools.partial(make_env, 1)
 make_second = functools.partial(make_env, 2)
-make_third = functools.partial(make_env, 3)
 
 
 def make_parallel() -> ParallelEnv:
     return ParallelEnv(2, [make_first, make_second])
-
-
-def make_third_in_parallel() -> ParallelEnv:
-    return ParallelEnv(1, make_third)
