@@ -5,7 +5,6 @@ import warnings
 
 import pytest
 import torch
-from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import MultiStep, TensorStorage, Unbounded
 from torchrl.envs import (
@@ -19,13 +18,11 @@ from torchrl.envs import (
     StepCounter,
     Transform,
     TransformedEnv,
-    UnaryTransform,
     VecNorm,
     VecNormV2,
 )
 
 import torch_panda
-from tests.transforms import toy
 from tests.transforms.identifiable import (
     Envs,
     check_batch,
@@ -72,12 +69,6 @@ def cat_goal():
     return cat("observation", "desired_goal")
 
 
-def test_copies_of_the_goal_are_refused():
-    env = TransformedEnv(make(), cat_goal())
-    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
-        store(env, HindsightRelabel.from_env(env))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("shape", [(40, 7), (40, 1, 7)])
 def test_copies_that_are_less_precise_are_refused(dtype, shape):
@@ -99,7 +90,7 @@ def test_copies_made_in_the_buffer_before_hindsight_are_refused():
     env = make()
     rb = buffer(Compose(cat_goal(), HindsightRelabel.from_env(env)))
     rb.extend(next(iter(collect(env))).reshape(-1))
-    with pytest.raises(ValueError, match=r"policy_input.*copy"):
+    with pytest.raises(ValueError, match=r"policy_input.*copy.*after this transform"):
         rb.sample()
 
 
@@ -153,14 +144,8 @@ def normalise(key, out):
     return ObservationNorm(0.3, 2.0, in_keys=[key], out_keys=[out])
 
 
-def cut(goal):
-    return goal[..., :2]
-
-
 COMPUTED = {
-    "normalised": lambda: normalise("desired_goal", "normalised"),
     "difference": GoalDifference,
-    "slice": lambda: UnaryTransform(["desired_goal"], ["slice"], fn=cut),
     "policy_input": lambda: Compose(
         normalise("desired_goal", "normalised"),
         CatTensors(["observation", "normalised"], "policy_input"),
@@ -231,6 +216,7 @@ PASSING = {
     "computed from the achieved goal": lambda: TransformedEnv(
         make_short("PandaReach-v1"), normalise("achieved_goal", "normalised")
     ),
+    "dense rewards": lambda: make_short("PandaStackDense-v1"),
 }
 
 
@@ -325,31 +311,15 @@ def test_rewards_that_frame_skipping_added_up_are_refused():
         store(env, HindsightRelabel.from_env(env))
 
 
-@pytest.mark.parametrize("env_id", ["PandaPush-v1", "PandaStackDense-v1"])
-def test_right_rewards_are_taken_in_silence(env_id):
-    env = make(env_id)
-    messages = get_warnings(lambda: store(env, HindsightRelabel.from_env(env)))
-    assert not [message for message in messages if "reward_fn" in message]
-
-
-def test_other_rewards_warn_once():
-    env = make("PandaPushDense-v1")
-    other = torch_panda.make("PandaPush-v1").compute_reward
-    transform = HindsightRelabel.from_env(env, reward_fn=other)
-    messages = get_warnings(lambda: store(env, transform))
-    assert len([m for m in messages if "reward_fn gives other rewards" in m]) == 1
-
-
 # -- ends that are not the episode's --------------------------------------------------
 
 
-@pytest.mark.parametrize("at", [0, 9, 19])
-def test_ends_that_are_not_the_episodes_are_refused(at):
+def test_ends_that_are_not_the_episodes_are_refused():
     """torchrl's GymEnv(num_envs=...) has zeros in `next` at the end of an episode."""
     data = name_goals(Envs(2, [10]).chunk(10)).reshape(-1)
     for key in ("achieved_goal", "desired_goal"):
-        data["next", key][at] = 0
-    data["next", "reward"][at] = 0
+        data["next", key][9] = 0
+    data["next", "reward"][9] = 0
     message = r"differ in 1 of 20 rows.*\[0, 0, 0\].*GymEnv\(num_envs=.*ParallelEnv"
     with pytest.raises(ValueError, match=message):
         buffer(HindsightRelabel(reward_fn)).extend(data)
@@ -446,13 +416,3 @@ def test_a_mask_without_padding_changes_nothing():
     rb = buffer(HindsightRelabel(reward_fn), ndim=2)
     rb.extend(data)
     assert len(rb) == 30
-
-
-def test_split_trajectories_of_a_collector_are_relabelled():
-    rb = buffer(HindsightRelabel(reward_fn, her_ratio=1.0))
-    for data in Collector(
-        toy.make_env, frames_per_batch=60, total_frames=240, split_trajs=True
-    ):
-        rb.extend(data.reshape(-1))
-        check_batch(rb.sample(), rb.storage[:], "future", her_ratio=1.0)
-    assert len(rb) == 240
