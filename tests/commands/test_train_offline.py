@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -11,13 +10,10 @@ from tensordict import TensorDict
 import torch_panda
 from tests.commands.runs import After, points, read_curve, weights
 from tests.devices import DEVICES
-from tests.learning.gradient_steps import SPACES, fill_normalizer
 from torch_panda.bullet import FAST
 from torch_panda.commands import plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import sources
-from torch_panda.learning.agents import OFFLINE_AGENTS
-from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.learning.options import default_args
 from torch_panda.learning.sources import draw_batches
 from torch_panda.learning.training import Training
@@ -181,25 +177,6 @@ def test_batches_drawn_at_once_have_their_size():
         sizes.clear()
 
 
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("algo", OFFLINE_AGENTS)
-def test_the_saved_policy_acts_as_the_agent(tmp_path, algo, device):
-    torch.manual_seed(0)
-    with torch.device(device):
-        args = make_args(tmp_path, algo, relative_inputs="none")
-        agent = OFFLINE_AGENTS[algo](SPACES, args)
-        fill_normalizer(agent)
-    save_policy(tmp_path / "checkpoint.pt", agent, "PandaReach-v1")
-    random_state = torch.get_rng_state()
-    policy = torch_panda.load_policy(tmp_path)
-    assert torch.equal(random_state, torch.get_rng_state())
-    rows = {"observation": torch.randn(4, 5), "desired_goal": torch.randn(4, 2)}
-    td = TensorDict(rows, [4])
-    with torch.no_grad():
-        expected = agent.policy.cpu()(td.clone())["action"]
-    assert torch.equal(policy(td.clone())["action"], expected)
-
-
 def test_a_file_trains_as_its_data_do_and_a_changed_file_is_refused(tmp_path):
     first = make_args(tmp_path / "first", total_steps=2)
     train.main(first)
@@ -233,20 +210,6 @@ def test_physics_and_options_of_the_task_hold_in_data_and_evaluations(tmp_path):
     for env in (run.env, run.curve.env):
         assert env.physics == FAST
         assert env.task.distance_threshold == 10.0
-
-
-class Bare(torch_panda.Reach):
-    observation_layout = None
-
-
-def test_the_layout_of_a_task_that_declares_none_is_found(tmp_path, make_demos):
-    robot = partial(torch_panda.Panda, block_gripper=True)
-    torch_panda.register("Bare-v0", robot=robot, task=Bare)
-    args = make_args(tmp_path, env_id="Bare-v0", data=str(make_demos("Bare-v0")))
-    run = train.make_run(args, tmp_path)
-    run.close()
-    assert run.agent.spaces.geometry.points == (6, 7, 8)  # the goal
-    assert run.agent.normalizer.relative_inputs == "fine"
 
 
 def test_the_command_line_sets_the_options():

@@ -13,8 +13,15 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torch_panda
+from tests.devices import DEVICES
 from tests.learning.transitions import make_transitions
-from torch_panda.learning.agents import AGENTS, Hyperparameters, make_agent
+from torch_panda.learning.agents import (
+    AGENTS,
+    OFFLINE_AGENTS,
+    Hyperparameters,
+    find_agent,
+    make_agent,
+)
 from torch_panda.learning.environments.spaces import read_spaces
 from torch_panda.learning.files.policy_files import save_policy
 from torch_panda.policies import shipped_policies
@@ -28,13 +35,16 @@ def env():
         yield env
 
 
-def save(env, path, **options):
+def save(env, path, device="cpu", **options):
     """Write the policy of a new agent, and return the agent."""
     torch.manual_seed(0)
-    agent = make_agent(env, Hyperparameters(**options))
-    rows = inputs(agent.spaces, 50)
-    agent.normalizer.update(rows["observation"], rows["desired_goal"])
-    agent.update(make_transitions(env, 16))
+    hp = Hyperparameters(**options)
+    with torch.device(device):
+        agent = find_agent(hp)(read_spaces(env), hp)
+        rows = inputs(agent.spaces, 50)
+        agent.normalizer.update(rows["observation"], rows["desired_goal"])
+    if not hp.offline:
+        agent.update(make_transitions(env, 16).to(device))
     save_policy(path, agent, "PandaPickAndPlace-v1")
     return agent
 
@@ -46,27 +56,30 @@ def inputs(spaces, *batch_size):
     return td.auto_batch_size_(len(batch_size))
 
 
-@pytest.mark.parametrize("algo", AGENTS)
+RECIPE = {
+    **{"relative_inputs": "fine", "fine_fingers": True},
+    **{"network": "layer-norm", "ema_rate": 0.1},
+}
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     "options",
     [
-        {},
-        {
-            **{"relative_inputs": "fine", "fine_fingers": True},
-            **{"network": "layer-norm", "ema_rate": 0.1},
-        },
+        *({"algo": algo, **more} for algo in AGENTS for more in ({}, RECIPE)),
+        *({"algo": algo, "offline": True} for algo in OFFLINE_AGENTS),
     ],
-    ids=["paper", "recipe"],
+    ids=lambda options: "-".join(map(str, options.values())),
 )
-def test_a_loaded_policy_acts_as_the_saved_agent(env, tmp_path, algo, options):
-    agent = save(env, tmp_path / "checkpoint.pt", algo=algo, **options)
+def test_a_loaded_policy_acts_as_the_saved_agent(env, tmp_path, device, options):
+    agent = save(env, tmp_path / "checkpoint.pt", device, **options)
     state = torch.get_rng_state()
     policy = torch_panda.load_policy(tmp_path)
     assert torch.equal(state, torch.get_rng_state())
     assert policy.env_id == "PandaPickAndPlace-v1"
     td = inputs(policy.spaces, 16)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        expected = agent.policy(td.clone())["action"]
+        expected = agent.policy.cpu()(td.clone())["action"]
     result = policy(td)
     assert torch.equal(result["action"], expected)
     assert set(result.keys()) == {"observation", "desired_goal", "action"}
@@ -84,10 +97,8 @@ def test_actions_are_the_same_under_any_exploration_type(env, tmp_path):
         assert not result.requires_grad
 
 
-@pytest.mark.parametrize("env_id", shipped_policies())
-def test_shipped_policies_act_on_batches_of_any_shape(env_id):
-    policy = torch_panda.load_policy(env_id)
-    assert policy.env_id == env_id
+def test_shipped_policies_act_on_batches_of_any_shape():
+    policy = torch_panda.load_policy("PandaStack-v1")
     # In double precision: sums of another batch size round differently.
     policy, td = policy.double(), inputs(policy.spaces, 6).double()
     actions = policy(td.clone())["action"]
@@ -99,9 +110,10 @@ def test_shipped_policies_act_on_batches_of_any_shape(env_id):
 
 @pytest.mark.parametrize("env_id", shipped_policies())
 def test_shipped_policies_have_the_spaces_of_their_environment(env_id):
-    spaces = torch_panda.load_policy(env_id).spaces
+    policy = torch_panda.load_policy(env_id)
+    assert policy.env_id == env_id
     with torch_panda.make(env_id, num_envs=1) as env:
-        assert replace(spaces, num_envs=1) == read_spaces(env)
+        assert replace(policy.spaces, num_envs=1) == read_spaces(env)
 
 
 def test_a_policy_of_an_unregistered_id_loads(tmp_path):
@@ -144,12 +156,6 @@ def test_loading_and_evaluating_need_no_extra():
     assert done.stdout == "1.0\n"
 
 
-def test_ids_without_a_policy_name_those_with_one():
-    message = r"no policy 'PandaPushJoints-v3': .* PandaPush-v1"
-    with pytest.raises(ValueError, match=message):
-        torch_panda.load_policy("PandaPushJoints-v3")
-
-
 def test_a_folder_without_a_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"there is no file .*checkpoint\.pt"):
         torch_panda.load_policy(tmp_path)
@@ -172,10 +178,3 @@ def test_policy_files_of_other_versions_are_refused(tmp_path, change, message):
     torch.save(content, path)
     with pytest.raises(ValueError, match=f"^{path} .*{message}"):
         torch_panda.load_policy(path)
-
-
-def test_observations_of_another_task_are_refused():
-    policy = torch_panda.load_policy("PandaPush-v1")
-    td = TensorDict(observation=torch.zeros(2, 6), desired_goal=torch.zeros(2, 3))
-    with pytest.raises(ValueError, match="observation has size 18, got 6"):
-        policy(td.auto_batch_size_(1))
