@@ -9,8 +9,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.envs.utils import RandomPolicy, check_env_specs, step_mdp
+from torchrl.envs.utils import check_env_specs, step_mdp
 
 from tests.commands.runs import read_curve, weights
 from tests.learning.hand_env import HIGH, LOW, MAX_STEPS, NEAR, SPEED, HandEnv, register
@@ -71,23 +70,6 @@ def test_the_last_observation_of_an_episode_is_the_true_one(make, workers):
     ends = data["next", "done"].squeeze(-1)
     assert ends.nonzero()[:, 1].tolist() == [MAX_STEPS - 1] * 2
     assert torch.equal(data["next", "truncated"].squeeze(-1), ends)
-
-
-def test_the_last_observation_is_the_true_one_in_a_batch_of_a_collector(make):
-    env = make(num_envs=3)
-    steps = MAX_STEPS + 2
-    collector = Collector(
-        env,
-        RandomPolicy(env.action_spec),
-        frames_per_batch=3 * steps,
-        total_frames=6 * steps,
-        reset_at_each_iter=True,
-    )
-    for data in collector:
-        assert data["observation"][1, :, TIME].tolist() == [*range(MAX_STEPS), 0, 1]
-        last = data["next", "observation"][1, MAX_STEPS - 1 :, TIME].tolist()
-        assert last == [MAX_STEPS, 1, 2]
-    collector.shutdown()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -195,10 +177,16 @@ def test_a_simulator_that_cannot_render_is_an_os_error():
 # ---- rewards and success -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("goals", ["several", "raises", "norm", "indices"])
-@pytest.mark.parametrize("rewards", ["sparse", "binary", "dense"])
+@pytest.mark.parametrize(
+    ("goals", "rewards"),
+    [
+        *(("several", rewards) for rewards in ("sparse", "binary", "dense")),
+        *(("raises", "sparse"), ("norm", "binary"), ("indices", "dense")),
+    ],
+)
 def test_rewards_are_computed_for_goals_of_any_batch_shape(make, goals, rewards):
     env = make(num_envs=1, goals=goals, rewards=rewards)
+    assert env.has_sparse_reward == (rewards == "sparse")
     for shape in ((), (1,), (3,), (2, 4), (2, 0)):
         achieved, desired = torch.randn(2, *shape, 3) / 2
         distance = (achieved - desired).norm(dim=-1, keepdim=True)
@@ -238,11 +226,6 @@ def test_coordinates_are_not_taken_for_goals_of_a_batch(make):
     achieved, desired = torch.randn(2, 5, 2)
     is_far = (achieved - desired).norm(dim=-1, keepdim=True) > NEAR
     assert torch.equal(env.compute_reward(achieved, desired), -is_far.float())
-
-
-@pytest.mark.parametrize("rewards", ["sparse", "binary", "dense"])
-def test_only_rewards_of_minus_one_and_zero_are_sparse(make, rewards):
-    assert make(rewards=rewards).has_sparse_reward == (rewards == "sparse")
 
 
 @pytest.mark.parametrize("workers", [1, 2])

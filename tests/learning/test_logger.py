@@ -56,14 +56,6 @@ def read_curve(out):
     ]
 
 
-def test_the_log_is_the_curve(tmp_path, loggers):
-    out = tmp_path / "run"
-    train.main(make_args(out, logger="tensorboard"))
-    (logger,) = loggers
-    assert logger.values == read_curve(out)
-    assert logger.is_closed
-
-
 def test_a_resumed_run_continues_its_log(tmp_path, loggers):
     out = tmp_path / "run"
     args = make_args(out, logger="wandb")
@@ -72,6 +64,7 @@ def test_a_resumed_run_continues_its_log(tmp_path, loggers):
     run.close()
     train.main(make_args(out, logger="wandb", resume=True))
     first, second = loggers
+    assert first.is_closed and second.is_closed
     assert first.values
     assert first.values + second.values == read_curve(out)
     assert first.options["id"] == second.options["id"]

@@ -86,15 +86,9 @@ def test_geometric_goals_lie_ahead_by_the_horizon_of_the_discount(env):
 
 @pytest.mark.parametrize("actor_goal", ["future", "geometric"])
 def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, actor_goal):
-    """Each row has its episode and step as its observation and goal."""
-    lengths = [7, 30, 1, 12]
-    episode = torch.cat([torch.full((n,), i) for i, n in enumerate(lengths)])
-    step = torch.cat([torch.arange(n) for n in lengths])
-    names = torch.stack([episode, step], -1).float()
-    rows = torch.zeros(50, 1)
     hp = Hyperparameters(algo="hiql", offline=True, gamma=0.99, actor_goal=actor_goal)
     agent = HIQL(read_spaces(env), hp, subgoal_steps=5)
-    named = named_transitions(env, episode, names, rows)
+    lengths, episode, step, names, named = name_episodes(env)
     data = OfflineData(named, env, agent.goal_strategies, discount=0.9)
     batch = agent.extend(data.sample(5_000), data)
     t = batch["index"]
@@ -116,14 +110,9 @@ def test_waypoints_of_hiql_stay_within_the_episode_and_before_the_goal(env, acto
 
 
 def test_n_step_rows_stop_at_the_goal_and_at_the_end_of_the_episode(env):
-    """Each row has its episode and step as its observation and goal."""
-    lengths = [7, 30, 1, 12]
-    episode = torch.cat([torch.full((n,), i) for i, n in enumerate(lengths)])
-    step = torch.cat([torch.arange(n) for n in lengths])
-    names = torch.stack([episode, step], -1).float()
     hp = Hyperparameters(algo="gciql-nstep", offline=True, gamma=0.9)
     agent = NStepGCIQL(read_spaces(env), hp, num_steps=5)
-    named = named_transitions(env, episode, names, torch.zeros(50, 1))
+    lengths, episode, step, names, named = name_episodes(env)
     data = OfflineData(named, env, agent.goal_strategies, discount=0.9)
     torch.manual_seed(0)
     batch = agent.extend(data.sample(2_000), data)
@@ -146,6 +135,19 @@ def test_n_step_rows_stop_at_the_goal_and_at_the_end_of_the_episode(env):
     # Shorter rows reach the goal, end the episode, or both. Rows of five steps may also
     # do neither.
     assert len(kinds) == 4 * 3 + 4
+
+
+def name_episodes(env):
+    """Lengths of episodes; the episode, step and name of each row; and the rows.
+
+    Each row has its name, which is its episode and step, as its observation and goal.
+    """
+    lengths = [7, 30, 1, 12]
+    episode = torch.cat([torch.full((n,), i) for i, n in enumerate(lengths)])
+    step = torch.cat([torch.arange(n) for n in lengths])
+    names = torch.stack([episode, step], -1).float()
+    named = named_transitions(env, episode, names, torch.zeros(50, 1))
+    return lengths, episode, step, names, named
 
 
 def named_transitions(env, episode, names, rows):

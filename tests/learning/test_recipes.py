@@ -13,9 +13,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 import torch_panda
+from tests.learning.test_geometry import OneNumberMore
 from torch_panda.learning.agents import make_agent
 from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args, default_args
@@ -103,26 +103,16 @@ def test_three_full_evaluations_in_a_row_end_a_training(tmp_path):
     run.close()
 
 
-class PushAndTell(torch_panda.Push):
-    """Observes one more number than the layout that it inherits."""
-
-    observation_dim = 13
-
-    def observation(self, simulation):
-        height = simulation.object_pose[:, 0, 2:3]
-        return torch.cat((super().observation(simulation), height), 1)
-
-
 @pytest.mark.parametrize(
     ("control_type", "exploration"),
     [("ee", "points"), ("joints", "points"), ("joint_velocity", "actions")],
 )
 def test_the_recipe_fits_tasks_and_robots_of_users(control_type, exploration):
     robot = partial(torch_panda.Panda, control_type=control_type, block_gripper=True)
-    torch_panda.register("PushAndTell-v0", robot=robot, task=PushAndTell)
-    args = default_args("recipe", "PushAndTell-v0")
+    torch_panda.register("OneNumberMore-v0", robot=robot, task=OneNumberMore)
+    args = default_args("recipe", "OneNumberMore-v0")
     assert (args.augmentation, args.exploration) == ("none", exploration)
-    with torch_panda.make("PushAndTell-v0", num_envs=args.num_envs, seed=0) as env:
+    with torch_panda.make("OneNumberMore-v0", num_envs=args.num_envs, seed=0) as env:
         agent = make_agent(env, args)
         assert agent.spaces.geometry.positions == (0, 6)
         env.rollout(2, agent.explore)

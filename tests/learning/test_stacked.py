@@ -57,28 +57,3 @@ def test_agents_learn_together_as_alone(algo):
     torch.testing.assert_close(states(others), states(agents), **close)
     first, second = losses[0][:2]
     assert all(first[key] != second[key] for key in first if key != "multiplier_loss")
-
-
-@pytest.mark.parametrize("algo", ["hiql", "qrl"])
-def test_agents_continue_alone_and_together_bit_for_bit(algo):
-    """`write_back` and the constructor lose nothing."""
-    agents, batches = make_learners(algo)
-    stacked = StackedAgents(agents)
-    for rows in batches:
-        stacked.update(rows)
-    stacked.write_back()
-    expected = states(agents)
-
-    others, _ = make_learners(algo)
-    stacked = StackedAgents(others)
-    for rows in batches[:5]:
-        stacked.update(rows)
-    stacked.write_back()
-    stacked = StackedAgents(others)
-    for rows in batches[5:]:
-        stacked.update(rows)
-    stacked.write_back()
-    torch.testing.assert_close(states(others), expected, rtol=0, atol=0)
-    for agent, batch in zip(others, batches[0], strict=True):
-        agent.update(batch)
-    assert [agent.updates for agent in others] == [STEPS + 1] * SEEDS
