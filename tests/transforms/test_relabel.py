@@ -333,7 +333,7 @@ def test_done_ends_a_trajectory_whose_id_stays():
     rb = make_buffer(trajectory_key="env", strategy="final")
     envs = Envs(3, [4, 2])
     for _ in range(5):
-        data = envs.chunk(5).exclude("collector").reshape(-1)
+        data = envs.chunk(5).exclude("collector", "achieved_goal").reshape(-1)
         data["env"] = torch.arange(3).repeat_interleave(5)[:, None]
         rb.extend(data)
     check_batch(rb.sample(), rb.storage[:], "final")
