@@ -2,6 +2,19 @@
 
 import csv
 
+# A file of a user, which registers an id.
+MODULE = """
+import torch_panda
+from torch_panda import Panda, Reach
+
+torch_panda.register(
+    "Near-v0",
+    robot=lambda: Panda(block_gripper=True),
+    task=lambda: Reach(goal_range=0.1),
+    max_episode_steps=10,
+)
+"""
+
 
 class After:
     """A stop signal that becomes true when it is asked for the n-th time."""

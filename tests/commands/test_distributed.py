@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from tests.commands.runs import read_curve
+from tests.commands.runs import MODULE, read_curve
 from torch_panda import registry
 from torch_panda.commands import plot
 from torch_panda.learning.agents.exploration import WARM_UP
@@ -16,14 +16,6 @@ ray = pytest.importorskip("ray")
 distributed = pytest.importorskip("torch_panda.commands.distributed")
 
 IDS = ("collector", "traj_ids")
-TASK = """
-import torch_panda
-from torch_panda import Panda, Reach
-
-torch_panda.register(
-    "Far-v0", robot=Panda, task=lambda: Reach(goal_range=0.1), max_episode_steps=10
-)
-"""
 # Ray's workers are nice by default: on a busy machine they would hardly run.
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -160,32 +152,22 @@ def test_another_run_is_not_overwritten(tmp_path, monkeypatch):
     assert (tmp_path / "curve.csv").read_text() == "theirs"
 
 
-def few_steps(address, folder, **options):
-    """Options of a run of 40 steps."""
-    options |= {"steps_per_batch": 5, "total_steps": 40, "updates_per_step": 0.25}
-    return distributed.Args(address=address, num_envs=4, out=folder / "run", **options)
-
-
 @pytest.mark.usefixtures("quick")
-def test_plot_draws_a_distributed_run(address, tmp_path):
-    args = few_steps(address, tmp_path)
-    distributed.main(args)
-    written = json.loads((args.out / "args.json").read_text())
-    assert (written["env_id"], written["total_steps"]) == ("PandaReach-v1", 40)
-    runs = plot.read_runs([tmp_path])
-    ((line, (drawn,)),) = runs["PandaReach-v1"].items()
+def test_workers_know_the_task_of_a_users_file(address, tmp_path, monkeypatch):
+    """Also, `plot` draws the run."""
+    # Not in the current folder, from which workers on the same machine could import it.
+    file = tmp_path / "far_task.py"
+    file.write_text(MODULE)
+    known = dict(registry._REGISTRATIONS)
+    monkeypatch.setattr(registry, "_REGISTRATIONS", known)
+    out, sizes = tmp_path / "run", {"num_envs": 4, "steps_per_batch": 5}
+    options = {**sizes, "total_steps": 40, "updates_per_step": 0.25, "out": out}
+    user = {"env_id": "Near-v0", "imports": (str(file),)}
+    distributed.main(distributed.Args(address=address, **options, **user))
+    assert [row["step"] for row in read_curve(out)] == ["0", "40"]
+    written = json.loads((out / "args.json").read_text())
+    assert (written["env_id"], written["total_steps"]) == ("Near-v0", 40)
+    ((line, (drawn,)),) = plot.read_runs([tmp_path])["Near-v0"].items()
     label = "distributed, num envs 4, steps per batch 5, updates per step 0.25"
     assert line == f"DDPG, {label}"
     assert [row["step"] for row in drawn] == [0, 40]
-
-
-@pytest.mark.usefixtures("quick")
-def test_workers_know_the_task_of_a_users_file(address, tmp_path, monkeypatch):
-    # Not in the current folder, from which workers on the same machine could import it.
-    file = tmp_path / "far_task.py"
-    file.write_text(TASK)
-    known = dict(registry._REGISTRATIONS)
-    monkeypatch.setattr(registry, "_REGISTRATIONS", known)
-    args = few_steps(address, tmp_path, env_id="Far-v0", imports=(str(file),))
-    distributed.main(args)
-    assert [row["step"] for row in read_curve(args.out)] == ["0", "40"]

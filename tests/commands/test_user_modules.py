@@ -5,21 +5,10 @@ import sys
 import pytest
 
 import torch_panda
+from tests.commands.runs import MODULE
 from torch_panda import registry
 from torch_panda.commands import main, plot
 from torch_panda.learning.user_modules import import_modules
-
-MODULE = """
-import torch_panda
-from torch_panda import Panda, Reach
-
-torch_panda.register(
-    "Near-v0",
-    robot=lambda: Panda(block_gripper=True),
-    task=lambda: Reach(goal_range=0.1),
-    max_episode_steps=10,
-)
-"""
 
 
 @pytest.fixture
@@ -94,15 +83,6 @@ def test_an_error_inside_the_module_is_shown(folder):
     (folder / "broken.py").write_text("import there_is_no_such_library")
     with pytest.raises(ModuleNotFoundError, match="there_is_no_such_library"):
         main(["evaluate", "run", "--import", "broken"])
-
-
-@pytest.mark.parametrize("command", ["evaluate", "train"])
-def test_ctrl_c_ends_a_command_without_a_traceback(folder, monkeypatch, command):
-    (folder / "interrupts.py").write_text("raise KeyboardInterrupt")
-    monkeypatch.delitem(sys.modules, "interrupts", raising=False)
-    options = ["run"] if command == "evaluate" else []
-    with pytest.raises(SystemExit, match=r"^interrupted$"):
-        main([command, *options, "--import", "interrupts.py"])
 
 
 def test_a_missing_extra_is_one_error_with_its_command(monkeypatch):
