@@ -218,29 +218,3 @@ def test_the_command_line_sets_the_options():
     default = default_args("offline", "PandaReach-v1", "hiql")
     assert args == replace(default, alpha=7.0, data="play")
     assert parse(["--offline"]).algo == "gcivl"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--offline --algo ddpg", "--offline learns by gcbc, .* got --algo ddpg"),
-        ("--algo hiql", "^hiql learns offline: add --offline$"),
-        ("--offline --data nofile.pt", "data must be one of noisy, play, random"),
-        ("--offline --alpha -1", "alpha must be at least 0 and finite"),
-        ("--offline --algo gcbc --alpha 1", "algo gcbc has no alpha: drop --alpha"),
-        ("--offline --noise-eps 0", "noise_eps has no effect with --offline: drop --n"),
-        ("--offline --seeds 1 1", "seeds must differ, got 1, 1"),
-        ("--offline --seeds 1 2 --seed 3", "seed has no effect with --seeds"),
-        ("--seeds 1 2", "seeds has no effect without --offline: drop --seeds"),
-        ("--alpha 1", "alpha has no effect without --offline: drop --alpha"),
-        ("--offline --env-id PandaFly-v1", "unknown environment id"),
-        ("--offline --resume", "there is no run to resume"),
-    ],
-)
-def test_bad_options_of_offline_training_end_with_one_line(
-    tmp_path, monkeypatch, arguments, message
-):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=message) as stop:
-        train.run(arguments.split())
-    assert "\n" not in str(stop.value)

@@ -5,7 +5,7 @@ from itertools import product
 
 import pytest
 
-from torch_panda.commands import main, record
+from torch_panda.commands import record
 
 SIZES = ("1000", "100000", "1000000")
 TASKS = ("Reach", "Push", "Slide", "PickAndPlace", "Stack", "Flip")
@@ -54,19 +54,3 @@ def test_verify_fails_if_a_hash_differs(tmp_path, monkeypatch):
     monkeypatch.setattr(record, "PUBLISHED", path)
     with pytest.raises(SystemExit, match="differs from the published one: random"):
         verify("PandaReach-v1", "random")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["--env-id", "PandaDrawer-v1"],
-            "no hashes of 1000 transitions of PandaDrawer",
-        ),
-        (["--transitions", "5"], "the numbers 1000, 100000, 1000000"),
-        (["--seed", "1", "--out", "x.pt"], "verify does not work with out, seed"),
-    ],
-)
-def test_verify_refuses_what_was_not_published(arguments, message):
-    with pytest.raises(SystemExit, match=message):
-        main(["record", "--verify", *arguments])
