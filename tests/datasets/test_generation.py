@@ -6,22 +6,10 @@ import pytest
 import torch
 
 import torch_panda
+from tests.datasets.recording import generate, short_play  # noqa: F401 (a fixture)
 from torch_panda import datasets
-from torch_panda.datasets import generation
 
-KINDS = ["noisy", "play", "random"]
-
-
-@pytest.fixture(autouse=True)
-def short_play(monkeypatch):
-    monkeypatch.setattr(generation, "PLAY_STEPS", 120)
-
-
-def generate(kind, *, env_id="PandaReach-v3", num_envs=3, transitions=130, **options):
-    options = {"seed": 7, **options}
-    return datasets.generate(
-        env_id, kind=kind, transitions=transitions, num_envs=num_envs, **options
-    )
+pytestmark = pytest.mark.usefixtures("short_play")
 
 
 @pytest.mark.parametrize(
@@ -141,7 +129,13 @@ def segments(episode, key="desired_goal"):
 def test_play_stays_at_each_goal():
     """For 10 steps in which the goal is reached; then the next goal comes."""
     data = generate("play", num_envs=2)
+    goals, achieved = data["desired_goal"], data["next", "achieved_goal"]
+    assert torch.equal(goals, data["next", "desired_goal"])
+    reward = torch_panda.Reach().compute_reward(achieved, goals)
+    assert torch.equal(data["next", "reward"], reward)
+    assert data["next", "success"].float().mean() > 0.4
     for episode in data:
+        assert len(episode["desired_goal"].unique(dim=0)) >= 4
         lengths = segments(episode).tolist()
         assert len(lengths) >= 4
         for piece in episode.split(lengths)[:-1]:
@@ -154,18 +148,6 @@ def test_play_gives_up_a_goal_after_the_time_of_an_episode():
     options = {"task_options": {"distance_threshold": 1e-9}}
     for episode in generate("play", num_envs=2, **options):
         assert segments(episode).tolist() == [50, 50, 20]
-
-
-def test_play_pursues_goal_after_goal():
-    data = generate("play", num_envs=2)
-    goals = data["desired_goal"]
-    assert torch.equal(goals, data["next", "desired_goal"])
-    for episode in goals:
-        assert len(episode.unique(dim=0)) >= 4
-    achieved = data["next", "achieved_goal"]
-    env_reward = torch_panda.Reach().compute_reward(achieved, goals)
-    assert torch.equal(data["next", "reward"], env_reward)
-    assert data["next", "success"].float().mean() > 0.4
 
 
 @pytest.mark.parametrize(
