@@ -30,6 +30,7 @@ def test_every_size_task_and_kind_has_a_hash():
     ("env_id", "kind"),
     [
         ("PandaPush-v1", "noisy"),
+        ("PandaSlide-v1", "noisy"),
         ("PandaStack-v1", "random"),
         ("PandaFlip-v1", "noisy"),
     ],
