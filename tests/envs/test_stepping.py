@@ -229,7 +229,7 @@ def test_a_step_is_finished_before_an_interrupt_is_raised():
 
 def test_a_forked_child_has_threads_of_its_own(env):
     env.reset()
-    step(env)
+    first = step(env)["observation"].tolist()
     receiver, sender = multiprocessing.Pipe(duplex=False)
 
     def observe():
@@ -239,12 +239,17 @@ def test_a_forked_child_has_threads_of_its_own(env):
     def child():
         sender.send(observe())
         env.close()
+        with make() as own:
+            own.reset()
+            sender.send(step(own)["observation"].tolist())
 
     process = multiprocessing.get_context("fork").Process(target=child)
     process.start()
     try:
         assert receiver.poll(60)
         theirs = receiver.recv()
+        assert receiver.poll(60)
+        assert receiver.recv() == first
         process.join(60)
         assert process.exitcode == 0
     finally:
