@@ -1,7 +1,5 @@
 """The contract of `RobotTaskEnv` that does not depend on the id."""
 
-import pickle
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -37,42 +35,10 @@ def env():
 # ---- reproducibility ---------------------------------------------------------
 
 
-def test_episodes_do_not_depend_on_the_number_of_environments():
-    few = torch_panda.make("PandaSlide-v1", num_envs=3, seed=4)
-    many = torch_panda.make("PandaSlide-v1", num_envs=8, seed=4)
-    with few, many:
-        for _ in range(2):
-            td, others = few.reset(), many.reset()
-            for key in ("observation", "desired_goal"):
-                assert torch.equal(td[key], others[key][:3])
-            action = torch.rand(8, 3) * 2 - 1
-            td = few.step(td.set("action", action[:3]))
-            others = many.step(others.set("action", action))
-            assert (td["next"] == others["next"][:3]).all()
-
-
-def test_a_seed_restarts_the_episodes(env):
-    env.set_seed(5)
-    first = [env.reset()["desired_goal"] for _ in range(3)]
-    env.set_seed(5)
-    again = [env.reset()["desired_goal"] for _ in range(3)]
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    env.set_seed(6)
-    assert not torch.equal(env.reset()["desired_goal"], first[0])
-
-
 @pytest.mark.parametrize("index", [-1, 3])
 def test_only_environments_that_exist_are_seeded(env, index):
     with pytest.raises(ValueError, match=f"env must be from 0 to 2, got {index}"):
         env.set_env_seed(index, 0)
-
-
-def test_global_random_state_is_untouched(env):
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    env.reset()
-    env.step(TensorDict({"action": torch.zeros(3, 3)}, batch_size=[3]))
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_default_dtype_and_device_change_nothing():
@@ -98,14 +64,6 @@ def test_default_dtype_and_device_change_nothing():
     with torch.device("meta"), torch_panda.make("PandaPush-v1", seed=0) as env:
         start = env._reset()
     assert start["observation"].device.type == "cpu"
-
-
-def test_default_seeds_differ():
-    goals = []
-    for _ in range(2):
-        with torch_panda.make("PandaReach-v1") as env:
-            goals.append(env.reset()["desired_goal"])
-    assert not torch.equal(*goals)
 
 
 # ---- resets and states -------------------------------------------------------
@@ -359,13 +317,6 @@ def test_bad_arguments_of_make_are_refused_by_name(arguments, error):
 def test_a_bad_render_size_is_refused(size):
     with pytest.raises((ValueError, TypeError), match=r"size|width"):
         torch_panda.make("PandaReach-v1", from_pixels=True, render_size=size)
-
-
-def test_reward_functions_pickle_without_the_simulator(env):
-    reward, success = pickle.loads(pickle.dumps((env.compute_reward, env.is_success)))
-    goals = torch.zeros(2, 5, 3), torch.full((2, 5, 3), 0.01)
-    assert torch.equal(reward(*goals), torch.zeros(2, 5, 1))
-    assert success(*goals).all()
 
 
 def test_a_viewer_without_its_extra_is_refused(env, monkeypatch):
