@@ -8,9 +8,8 @@ import pybullet_data
 import pytest
 from pybullet_utils.bullet_client import BulletClient
 
-from tests.solver.solvers import assert_same, needs_packed, solver
+from tests.solver.solvers import needs_packed, solver
 from tests.solver.test_scenes import World
-from tests.solver.test_tasks import environment
 from torch_panda.bullet.solver import self_test
 
 pytestmark = needs_packed
@@ -244,16 +243,3 @@ def test_a_robot_of_more_than_32_joints_is_left_to_bullet(num_joints, ours):
         return [arm.reach() for _ in range(3)]
 
     assert_same_answers(ask, ours=ours, bullet=3 - ours)
-
-
-@pytest.mark.parametrize("control_type", ["ee", "ee_pose"])
-@pytest.mark.parametrize("env_id", ["PandaReach-v3", "PandaPush-v1"])
-def test_environments_with_a_turned_base_step_alike(env_id, control_type):
-    options = {
-        "control_type": control_type,
-        "base_position": (-0.5, 0.1, 0.05),
-        "base_orientation": (0.1, 0.0, 0.3, 0.9),
-    }
-    counts = assert_same(environment(env_id, robot_options=options), 40)
-    assert counts.answers >= 39
-    assert counts.bullet_answers == 1

@@ -158,69 +158,6 @@ def test_extreme_masses_fall_alike(masses):
     assert_same(scene(fill), 200)
 
 
-def test_bodies_sleep_and_wake_alike():
-    def fill(world):
-        world.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
-        world.ground()
-        flag = {"activationState": pybullet.ACTIVATION_STATE_ENABLE_SLEEPING}
-        for i in range(4):
-            world.box(1.0, (0.3 * i, 0, 0.05), **flag)
-        hammer = world.box(1.0, (0.01, 0, 3.0), **flag)
-        world.bodies.append(hammer)
-
-    assert_same(scene(fill), 900)
-
-
-@pytest.mark.parametrize("base_mass", [0.0, 0.2])
-def test_a_chain_of_hinges_moves_alike(base_mass):
-    def fill(world):
-        world.ground()
-        world.box(0.5, (0.1, 0.02, 0.05))
-        chain = world.chain(7, (0, 0, 0.9), base_mass=base_mass)
-        world.client.resetJointState(chain, 0, 1.0)
-        for joint in (2, 4):  # the other motors hold with pybullet's default
-            world.client.setJointMotorControl2(
-                chain, joint, pybullet.VELOCITY_CONTROL, targetVelocity=3, force=0.05
-            )
-        world.client.setJointMotorControl2(
-            chain, 1, pybullet.VELOCITY_CONTROL, force=0.0
-        )
-
-    assert_same(scene(fill), 400)
-
-
-def test_a_box_wedged_between_fingers_moves_alike():
-    def fill(world):
-        client = world.client
-        client.setAdditionalSearchPath(pybullet_data.getDataPath())
-        world.ground()
-        arm = client.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
-        world.bodies.append(arm)
-        neutral = (0, 0.41, 0, -1.85, 0, 2.26, 0.79, 0.04, 0.04)
-        joints = (0, 1, 2, 3, 4, 5, 6, 9, 10)
-        for joint, angle in zip(joints, neutral, strict=True):
-            client.resetJointState(arm, joint, angle)
-        hand = client.getLinkState(arm, 11)[0]
-        world.box(0.3, hand, (0.02, 0.03, 0.02), lateralFriction=2.0)
-
-        def drive(k):
-            turn = 0.4 * math.sin(0.05 * k)
-            targets = (turn, 0.41 + turn, 0, -1.85, 0, 2.26, 0.79, 0.0, 0.0)
-            client.setJointMotorControlArray(
-                arm,
-                joints,
-                pybullet.POSITION_CONTROL,
-                targetPositions=targets,
-                forces=(87,) * 4 + (12, 120, 120, 170, 170),
-            )
-
-        world.drive = drive
-
-    counts = assert_same(scene(fill), 300)
-    # Bullet creates the first rows of a manifold, for which it enlarges its arrays.
-    assert counts.bullet_manifolds < counts.manifolds / 20
-
-
 @pytest.mark.parametrize("last_force", [1e280, math.inf, math.nan])
 def test_a_diverging_simulation_steps_alike(last_force):
     """If numbers become infinite or NaN, Bullet's function takes over."""
@@ -362,22 +299,10 @@ ROBOTS = (
     "aliengo/aliengo.urdf",
     "spherical_joint_limit.urdf",
 )
-MORE_ROBOTS = (
-    "r2d2.urdf",
-    "cartpole.urdf",
-    "laikago/laikago.urdf",
-    "xarm/xarm6_robot.urdf",
-    "pr2_gripper.urdf",
-    "racecar/racecar.urdf",
-    "husky/husky.urdf",
-    "sphere2.urdf",
-    "teddy_vhacd.urdf",
-)
-SLOW_ROBOTS = [pytest.param(robot, marks=pytest.mark.slow) for robot in MORE_ROBOTS]
 
 
 @pytest.mark.parametrize("fixed_base", [False, True])
-@pytest.mark.parametrize("robot", [*ROBOTS, *SLOW_ROBOTS])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_robots_of_pybullet_move_alike(robot, fixed_base):
     """Floating bases, joints of several degrees of freedom, meshes, self-collisions."""
 

@@ -20,16 +20,6 @@ def return_to_snapshot(world):
     world.drive = drive
 
 
-def test_a_snapshot_of_touching_bodies_is_restored():
-    def fill(world):
-        pile(world)
-        world.chain(4, (1, 0, 1))
-        return_to_snapshot(world)
-
-    counts = assert_same(scene(fill), 80)
-    assert (counts.snapshots, counts.bullet_snapshots) == (1, 0)
-
-
 def test_a_snapshot_with_a_rigid_body_is_left_to_bullet():
     def fill(world):
         pile(world)

@@ -78,7 +78,10 @@ def test_fast_physics_step_alike():
 
 @pytest.mark.parametrize("env_id", ["PandaPickAndPlace-v1", "PandaPush-v3"])
 def test_objects_in_the_hand_move_alike(env_id):
-    assert_same(environment(env_id, expert=True), 50)
+    counts = assert_same(environment(env_id, expert=True), 50)
+    # Bullet creates the first rows of a manifold, for which it enlarges its arrays.
+    assert counts.bullet_manifolds < counts.manifolds / 20
+    assert (counts.answers, counts.bullet_answers) == (49, 1)
 
 
 @pytest.mark.parametrize("seed", range(3))
