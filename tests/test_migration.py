@@ -145,12 +145,8 @@ def test_an_episode_continues_from_an_exact_state():
 
 PANDA_GYM_NAMES = {
     "sim": r"use env\.unwrapped\.torch_env, which has get_state\(\)",
-    "task": r"use env\.unwrapped\.torch_env\.task",
-    "robot": r"use env\.unwrapped\.torch_env\.robot",
     "save_state": r"use env\.unwrapped\.torch_env\.get_state\(exact=True\)",
-    "render_width": r"argument render_width .* or .*Camera\(width=\.\.\.\)",
-    "render_target_position": r"Camera\(target=\.\.\.\)",
-    "render_yaw": r"Camera\(yaw=\.\.\.\)",
+    "render_yaw": r"argument render_yaw .* or .*Camera\(yaw=\.\.\.\)",
 }
 
 

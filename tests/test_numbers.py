@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import torch_panda
-from torch_panda import Camera, Gripper, Panda, Push, Robot, tasks
+from tests.envs.test_checks import make_kuka
+from torch_panda import Camera, Gripper, Panda, Push, tasks
 from torch_panda.bullet import Box, Cylinder, PhysicsClient, Sphere
 from torch_panda.rendering import HandCamera
 from torch_panda.robots import XArm6Gripper
@@ -152,15 +153,8 @@ def test_the_offset_of_a_table_is_refused_by_name(client):
 
 def test_the_position_of_a_tool_is_refused_by_name():
     tool = torch_panda.robots.Tool("lbr_iiwa_link_7", (0.0, 0.0, math.nan))
-    robot = Robot(
-        urdf="kuka_iiwa/model.urdf",
-        neutral_joint_position=(0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
-        effort_limits=(200.0,) * 7,
-        ee_link=6,
-        tool=tool,
-    )
     with pytest.raises(ValueError, match="the position of a tool must be three finite"):
-        torch_panda.RobotTaskEnv(robot=robot, task=torch_panda.Reach())
+        torch_panda.RobotTaskEnv(robot=make_kuka(tool=tool), task=torch_panda.Reach())
 
 
 # ---- cameras -------------------------------------------------------------------
@@ -184,10 +178,9 @@ def test_a_camera_refuses_wrong_numbers_by_name(name, values):
 
 
 @pytest.mark.parametrize("name", ["eye", "target", "up"])
-@pytest.mark.parametrize("value", WRONG_POSITIONS)
-def test_a_camera_on_the_hand_refuses_wrong_numbers_by_name(name, value):
+def test_a_camera_on_the_hand_refuses_wrong_numbers_by_name(name):
     with pytest.raises(ValueError, match=f"^{name} must be three finite numbers"):
-        HandCamera(**{name: value})
+        HandCamera(**{name: (0, 0, math.nan)})
 
 
 @pytest.mark.parametrize(

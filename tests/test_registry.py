@@ -88,15 +88,6 @@ def test_make_says_what_to_use_with_an_id_of_a_user(env_id):
         torch_panda.make(env_id, reward_type="dense")
 
 
-def test_options_of_task_and_robot_are_checked():
-    with pytest.raises(
-        TypeError,
-        match="Push got an unexpected keyword argument 'threshold'; did you mean "
-        "'distance_threshold'",
-    ):
-        torch_panda.make("PandaPush-v1", task_options={"threshold": 0.1})
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -60,13 +60,6 @@ DEGREES = (0.0, 30.0, 0.0, -90.0, 0.0, 60.0, 0.0)
         (make_kuka_env, {"finger_links": (3, 99)}, ValueError, "finger_links .*got 99"),
         (make_kuka, {"num_arm_joints": 0}, ValueError, "num_arm_joints must be"),
         (make_kuka, {"num_arm_joints": 8}, ValueError, "num_arm_joints must be"),
-        (make_kuka, {"base_position": (0.0, 0.0)}, ValueError, "base_position must be"),
-        (
-            make_kuka,
-            {"base_position": (0.0, 0.0, float("nan"))},
-            ValueError,
-            "base_position must be",
-        ),
         (
             make_kuka,
             {"neutral_joint_position": (float("nan"),) * 7},

@@ -181,11 +181,6 @@ ID = "PandaReach-v1"
             ValueError,
             "render_mode must be None or one of",
         ),
-        (
-            lambda one, many: GoalEnv(ID, render_width=0),
-            ValueError,
-            "width must be finite and above 0",
-        ),
     ],
 )
 def test_bad_arguments_are_refused(call, error, message):

@@ -150,8 +150,3 @@ def test_an_unknown_task_argument_is_named_with_the_accepted_ones(task_class):
         task_class(threshold=0.02)
     with pytest.raises(TypeError, match="argument 'threshold'"):
         Bonus(threshold=0.02)
-
-
-def test_an_unknown_reward_type_is_refused():
-    with pytest.raises(ValueError, match=r"reward_type must be .* got 'shaped'"):
-        Push(reward_type="shaped")

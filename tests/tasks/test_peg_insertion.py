@@ -76,7 +76,6 @@ def test_only_a_peg_in_the_hole_is_a_success():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"clearance": 0.0}, "clearance must be finite and above 0"),
         ({"clearance": 0.03}, "clearance must be between"),
         ({"depth": 0.06}, "depth must be from distance_threshold"),
         ({"depth": 0.005}, "depth must be from distance_threshold"),
