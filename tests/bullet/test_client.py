@@ -8,10 +8,6 @@ from pybullet_utils.bullet_client import BulletClient
 
 from torch_panda.bullet import BulletError, PhysicsClient, capi, library
 
-JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
-NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
-FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
-
 
 @pytest.fixture
 def reference():
@@ -134,17 +130,6 @@ def test_a_client_that_cannot_be_set_up_is_freed(monkeypatch):
     assert len(freed) == 1
 
 
-def test_masses_equal_those_of_pybullet(reference):
-    with PhysicsClient() as client:
-        panda = client.load_urdf("franka_panda/panda.urdf", fixed_base=True)
-        reference.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
-        cube = create(reference, client, "box", 0.3, (0.0, 0.0, 1.0))
-        for body, link in ((panda, -1), (panda, 4), (cube, -1)):
-            assert client.mass(body, link) == reference.getDynamicsInfo(body, link)[0]
-        assert client.mass(panda) == 0.0  # the base is fixed; in the URDF it has a mass
-        assert client.mass(cube) == 0.3
-
-
 @pytest.mark.parametrize(
     ("group", "mask", "falls"),
     [
@@ -195,33 +180,3 @@ def test_contact_forces_carry_a_box():
     # The forces that Bullet reports balance the weight to 0.3 %.
     np.testing.assert_allclose(on_box, (0, 0, 2.0 * 9.81), atol=0.1)
     np.testing.assert_allclose(on_ground, -on_box)
-
-
-def test_joint_forces_equal_those_of_pybullet(reference):
-    urdf = "franka_panda/panda.urdf"
-    with PhysicsClient() as client:
-        arm = reference.loadURDF(urdf, useFixedBase=True)
-        assert client.load_urdf(urdf, fixed_base=True) == arm
-        reference.enableJointForceTorqueSensor(arm, 8)
-        reference.setPhysicsEngineParameter(
-            jointFeedbackMode=reference.JOINT_FEEDBACK_IN_JOINT_FRAME
-        )
-        client.enable_wrench_sensor(arm, 8)
-        reference.setJointMotorControlArray(
-            arm,
-            JOINTS,
-            pybullet.POSITION_CONTROL,
-            targetPositions=NEUTRAL,
-            forces=FORCES,
-        )
-        client.control_joints(arm, np.array(NEUTRAL), FORCES)
-        for _ in range(20):
-            reference.stepSimulation()
-        client.step(20)
-        ours = client.state(arm)
-        _, _, theirs, _ = reference.getJointState(arm, 8)
-        assert ours.wrenches[8].tolist() == list(theirs)
-        torques = [reference.getJointState(arm, joint)[3] for joint in JOINTS]
-        motors = ours.motor_forces.tolist()
-        assert [motors[joint] for joint in JOINTS] == torques
-        assert max(map(abs, torques)) > 1

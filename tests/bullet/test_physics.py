@@ -96,12 +96,6 @@ def test_parameters_out_of_range_are_refused(arguments, message):
         PhysicsParams(**arguments)
 
 
-@pytest.mark.parametrize("physics", ["fastest", None, 3])
-def test_an_unknown_preset_is_refused(physics):
-    with pytest.raises(ValueError, match=r"one of \('exact', 'fast'\), got"):
-        torch_panda.make("PandaReach-v1", physics=physics)
-
-
 @pytest.mark.parametrize("field", [x.name for x in dataclasses.fields(PhysicsParams)])
 def test_a_parameter_that_is_no_number_is_refused_by_name(field):
     with pytest.raises(TypeError, match=rf"^{field} must be a number, got"):

@@ -3,7 +3,7 @@
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 import pybullet
@@ -150,6 +150,7 @@ def test_a_textured_box_has_the_colours_of_a_picture():
         physics.create_box(box.half_extents, mass=0, position=(0,) * 3, visual=VISUAL)
     mesh = web_bodies.textured_box(box, VISUAL.texture)
     colors = mesh.visual.to_color().vertex_colors[:, :3].astype(float)
+    seen = {}
     with VisualClient(physics.blueprint) as client:
         for face, normal in enumerate(mesh.face_normals):
             axis = int(abs(normal).argmax())
@@ -157,11 +158,16 @@ def test_a_textured_box_has_the_colours_of_a_picture():
             camera = Camera(
                 distance=0.2, yaw=yaw, pitch=pitch, fov=11, width=9, height=9
             )
-            drawn = client.render(camera, shadow=False).rgb[4, 4].astype(float)
+            drawn = client.render(camera, shadow=False).rgb.astype(float)
             shown = colors[mesh.faces[face, 0]]
             # Compare hues, because shading changes the brightness.
-            hues = [color / np.linalg.norm(color) for color in (drawn, shown)]
-            np.testing.assert_allclose(*hues, atol=0.1)
+            whole = drawn.mean((0, 1))
+            hues = [x / np.linalg.norm(x) for x in (drawn[4, 4], shown, whole)]
+            np.testing.assert_allclose(*hues[:2], atol=0.1)
+            seen[yaw, pitch] = hues[2]
+    assert len(seen) == 6
+    for a, b in combinations(seen.values(), 2):
+        assert np.linalg.norm(a - b) > 0.15
 
 
 def test_the_contact_forces_carry_the_weight_of_the_cube():
