@@ -196,45 +196,18 @@ def task_with(name, function):
     return type("Own", (Reach,), {name: function})()
 
 
-@pytest.mark.parametrize(
-    ("name", "function", "message"),
-    [
-        ("compute_reward", lambda s, a, d: 0.0, "compute_reward must return a tensor"),
-        ("is_success", lambda s, a, d: a[:, 0] > 0, r"is_success .*\(2, 1"),
-        ("is_success", lambda s, a, d: a[:, :1], "must return bool"),
-        ("achieved_goal", lambda s, sim: (0, 0, 0), "achieved_goal must return a t"),
-        ("observation", lambda s, sim: sim.ee_position, r"\(2, 0\), got \(2, 3\)"),
-        ("info", lambda s, sim: sim.ee_position, "info must return a dict of tensors"),
-    ],
-)
-def test_wrong_tensors_of_a_task_are_refused(name, function, message):
-    with pytest.raises(ValueError, match=message):
-        make(task_with(name, function), num_envs=2)
-
-
 def test_all_wrong_tensors_are_named_at_once():
     task = task_with("observation", lambda s, sim: sim.ee_position)
+    type(task).compute_reward = lambda s, a, d: a.sub_(d)[:, :1]
     type(task).failure = lambda s, sim: torch.zeros(1, 1)
     with pytest.raises(ValueError) as caught:
         make(task)
     assert str(caught.value).splitlines() == [
         "Own.observation must return shape (1, 0), got (1, 3)",
+        "Own.compute_reward must not change goals or the state of the simulation in "
+        "place: change a copy, such as tensor.clone()",
         "Own.failure must return bool, got torch.float32",
     ]
-
-
-@pytest.mark.parametrize(
-    ("name", "function"),
-    [
-        ("observation", lambda s, sim: sim.ee_position.mul_(2)[:, :0]),
-        ("extra_observation", lambda s, sim: {"double": sim.ee_position[0].mul_(2)}),
-        ("compute_reward", lambda s, a, d: a.sub_(d)[:, :1]),
-        ("reward", lambda s, sim, action, a, d: d.square_()[:, :1]),
-    ],
-)
-def test_functions_that_change_goals_or_the_state_are_refused(name, function):
-    with pytest.raises(ValueError, match=f"Own.{name} must not change"):
-        make(task_with(name, function), num_envs=2)
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from tensordict import TensorDict
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
-from torch_panda import Panda, Reach, RobotTaskEnv
+from torch_panda import Panda, Reach
 from torch_panda.datasets import generate
 from torch_panda.gymnasium_envs import GoalVectorEnv
 from torch_panda.gymnasium_envs.sb3 import SB3VecEnv
@@ -42,10 +41,6 @@ def costly():
         task=Costly,
         max_episode_steps=4,
     )
-
-
-def make(task, **options):
-    return RobotTaskEnv(robot=Panda(block_gripper=True), task=task, seed=0, **options)
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])
@@ -160,42 +155,3 @@ def test_generated_data_hold_infos_under_next_only():
     assert data["next", "cost"].shape == (2, 4, 1)
     keys = set(data.keys())
     assert "orientation" in keys and "cost" not in keys
-
-
-def task_with(function):
-    return type("Own", (Reach,), {"info": function})()
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda s, sim: {"cost": 1.0}, r"info\['cost'\] must return a tensor"),
-        (lambda s, sim: {"cost": sim.ee_position[0]}, "must return shape"),
-        (lambda s, sim: {"observation": sim.ee_position}, "environment's own keys"),
-        (
-            lambda s, sim: {"is_success": sim.ee_position},
-            "because Gymnasium and Stable-Baselines3 use these keys",
-        ),
-        (lambda s, sim: {"cost": sim.ee_position.mul_(2)}, "must not change"),
-    ],
-)
-def test_wrong_infos_are_refused(function, message):
-    with pytest.raises(ValueError, match=message):
-        make(task_with(function), num_envs=2)
-
-
-def test_an_info_that_is_a_view_of_the_state_is_copied():
-    task = task_with(lambda s, sim: {"hand": sim.ee_position})
-    with make(task, num_envs=2) as env:
-        td = env.reset()
-        before = td["hand"].clone()
-        env.step(td.set("action", torch.ones(2, 3)))
-        assert torch.equal(td["hand"], before)
-
-
-def test_a_state_restores_an_environment_with_infos():
-    with torch_panda.make(ID, num_envs=2, seed=0) as env:
-        start = env.reset()
-        state = TensorDict({"desired_goal": torch.zeros(2, 3)}, env.batch_size)
-        again = env.reset(state, set_state=True)
-        assert set(start.keys()) == set(again.keys())
