@@ -118,11 +118,6 @@ def test_a_step_returns_the_stepped_clients_that_diverged():
         assert simulation.step(control, setpoint, [0, 2]) == [0]
 
 
-def test_an_unknown_reaction_to_divergence_is_refused():
-    with pytest.raises(ValueError, match="on_divergence must be one of"):
-        torch_panda.make("PandaReach-v1", on_divergence="ignore")
-
-
 def test_states_that_would_diverge_are_refused():
     with make("raise") as env:
         env.reset()

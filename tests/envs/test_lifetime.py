@@ -7,8 +7,6 @@ import weakref
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
 from torchrl.envs import EnvCreator, ParallelEnv
 
 import torch_panda
@@ -116,29 +114,6 @@ def test_a_state_dict_is_a_file_without_code(tmp_path, seed):
         goal = env.reset()["desired_goal"]
         env.load_state_dict(state)
         assert torch.equal(env.reset()["desired_goal"], goal)
-
-
-def test_a_resumed_collector_continues_with_the_next_goals():
-    def collect(env):
-        policy = TensorDictModule(
-            torch.nn.LazyLinear(3), in_keys=["observation"], out_keys=["action"]
-        )
-        policy(env.reset())
-        return Collector(env, policy, frames_per_batch=100, total_frames=200)
-
-    def goals(data):
-        return data["desired_goal"][:, 0]
-
-    first, second = collect(make(seed=1)), collect(make())
-    next(iter(first))
-    second.load_state_dict(first.state_dict())
-    second.env.load_state_dict(first.env.state_dict())
-    for collector in (first, second):
-        collector.reset()
-    expected, actual = next(iter(first)), next(iter(second))
-    assert torch.equal(goals(expected), goals(actual))
-    first.shutdown()
-    second.shutdown()
 
 
 def test_environments_of_an_env_creator_have_their_own_seeds():

@@ -303,6 +303,10 @@ def test_a_bad_action_is_refused_and_changes_nothing(env, action, error, message
         ({"num_envs": True}, TypeError),
         ({"num_threads": 2.5}, TypeError),
         ({"seed": -1}, ValueError),
+        ({"on_divergence": "ignore"}, ValueError),
+        ({"renderer": "gl"}, ValueError),
+        ({"physics": "fastest"}, ValueError),
+        ({"physics": 3}, ValueError),
         ({"render_size": 64}, ValueError),  # without pixels, nothing is rendered
         ({"camera": torch_panda.Camera()}, ValueError),
     ],

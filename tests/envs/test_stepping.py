@@ -52,22 +52,6 @@ def detections(env):
     return [client.num_detections for client in env.episodes.simulation.clients]
 
 
-def push(td):
-    towards = td["achieved_goal"] - td["observation"][:, :3]
-    return td.set("action", 20 * towards)
-
-
-def test_the_number_of_threads_does_not_change_the_numbers():
-    def rollout(num_threads):
-        with make(num_envs=6, num_threads=num_threads) as env:
-            return env.rollout(10, push), detections(env)
-
-    (one, one_detected), *others = map(rollout, (1, 2, 6))
-    for other, other_detected in others:
-        assert (one == other).all()
-        assert one_detected == other_detected
-
-
 def test_an_arm_alone_steps_the_same_in_every_episode():
     """With a single body, the broad phase has no pair that resets its cursor."""
 

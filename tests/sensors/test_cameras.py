@@ -177,11 +177,6 @@ def test_egl_that_does_not_work_raises(monkeypatch):
     egl._check_egl.cache_clear()
 
 
-def test_an_unknown_renderer_is_refused():
-    with pytest.raises(ValueError, match=r"renderer must be one of.*'gl'"):
-        make(renderer="gl")
-
-
 def test_a_camera_on_the_hand_sees_the_cube_beside_a_fixed_camera():
     front = CameraSensor(Camera(width=48, height=48, shadows=False))
     hand = CameraSensor(
