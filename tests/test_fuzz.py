@@ -103,31 +103,6 @@ def check_alive(env):
     assert td["observation"].isfinite().all()
 
 
-def test_any_id_makes_an_environment_or_is_refused():
-    pieces = st.sampled_from([*"-v13", "Panda", "Push", "Joints", "Dense", "Reach", ""])
-    words = st.one_of(things, st.lists(pieces, max_size=5).map("".join))
-
-    @fuzz
-    @given(words)
-    def check(word):
-        if word in torch_panda.ENV_IDS:
-            torch_panda.make(word).close()
-        else:
-            with pytest.raises(ValueError, match="unknown environment id"):
-                torch_panda.make(word)
-            if ":" in str(word):  # to Gymnasium, a module to import
-                return
-            try:
-                env = gymnasium.make(f"torch_panda/{word}")
-            except gymnasium.error.Error:
-                return
-            # Without a version, Gymnasium takes the latest.
-            assert env.spec.id.startswith(f"torch_panda/{word}-v")
-            env.close()
-
-    check()
-
-
 def test_any_arguments_of_make_work_or_raise_a_documented_error():
     @fuzz
     @given(

@@ -1,6 +1,5 @@
 """A user's task with all hooks and a drawer, written with public names only."""
 
-import gymnasium
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -158,35 +157,6 @@ def test_episodes_and_exact_states_repeat_bit_for_bit():
         again["action"] = after["action"][[1, 1, 1]]
         forked = env.step(again)["next"]
         assert (forked == after["next"][[1, 1, 1]]).all()
-
-
-def test_gymnasium_makes_a_registered_task():
-    with gymnasium.make(
-        f"torch_panda/{ID}", task_options={"distance_threshold": 0.01}
-    ) as env:
-        observation, _ = env.reset(seed=0)
-        assert env.observation_space.contains(observation)
-        steps = 0
-        ended = False
-        while not ended:
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample() * 0)
-            ended, steps = terminated or truncated, steps + 1
-        assert steps == 30
-        assert env.unwrapped.torch_env.task.distance_threshold == 0.01
-    vector = gymnasium.make_vec(f"torch_panda/{ID}", num_envs=2)
-    assert vector.unwrapped.torch_env.max_episode_steps == 30
-    vector.reset(seed=0)
-    vector.close()
-
-
-def test_a_moved_drawer_changes_the_picture():
-    with torch_panda.make(ID, seed=0) as env:
-        env.reset()
-        before, state = env.render(size=64), env.get_state()
-        state["object_joint_position"][:] = 0.1
-        env.reset(state, set_state=True)
-        assert (env.render(size=64) != before).any()
-        assert "object" in env.segmentation_ids
 
 
 class Buffered(Reach):

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 import torch_panda
 from torch_panda import Drawer, Panda, PegInsertion, Push, Reach, RobotTaskEnv, Task
@@ -294,11 +293,3 @@ def test_a_default_that_the_constructor_would_replace_is_refused(task):
     message = r"no effect, .* write @dataclass\(kw_only=True\) .*: float = 0.\d+$"
     with pytest.raises(TypeError, match=message):
         task()
-
-
-def test_a_goal_is_given_as_the_error_of_an_assigned_goal_says(env):
-    goal = torch.full((8, 3), 0.02)
-    start = env.reset(
-        TensorDict({"desired_goal": goal}, env.batch_size), set_state=True
-    )
-    assert torch.equal(start["desired_goal"], goal)

@@ -370,7 +370,8 @@ def test_outputs_and_states_are_on_the_given_cuda_device():
 def test_the_repr_of_an_environment_shows_its_parts_and_solver():
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=3) as env:
         text = repr(env)
-    assert text.startswith("RobotTaskEnv(robot=Panda(")
+    assert text.startswith("RobotTaskEnv(robot=Panda(control_type='ee', ")
+    assert "fingers_width=0.0" in text
     assert "task=Reach(reward_type='sparse'" in text
     call, solver = text.split(" [solver: ")
     assert call.endswith("num_envs=2, seed=3, max_episode_steps=50)")

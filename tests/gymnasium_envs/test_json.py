@@ -120,7 +120,12 @@ def test_a_specification_equals_itself_after_a_round_trip():
 
 def test_ids_of_users_make_a_round_trip():
     torch_panda.register("Nudge-v0", robot=torch_panda.Panda, task=torch_panda.Push)
-    env = gymnasium.make("torch_panda/Nudge-v0", physics=PhysicsParams(n_substeps=4))
+    env = gymnasium.make(
+        "torch_panda/Nudge-v0",
+        physics=PhysicsParams(n_substeps=4),
+        task_options={"distance_threshold": 0.01},
+    )
     again = remake(env)
     assert again.unwrapped.torch_env.physics.n_substeps == 4
+    assert again.unwrapped.torch_env.task.distance_threshold == 0.01
     again.close()

@@ -186,19 +186,6 @@ def test_shadows_only_darken():
     assert 0.001 < (darker > 5).float().mean() < 0.1
 
 
-def test_a_red_cube_is_below_a_green_one_in_stack():
-    with torch_panda.make("PandaStack-v1", seed=0) as env:
-        env.reset()
-        for index, channel in ((0, 0), (1, 1)):
-            position = env.get_state()["object_pose"][index, :3].tolist()
-            camera = Camera(
-                target=tuple(position), distance=0.2, pitch=-89, width=16, height=16
-            )
-            color = env.render(camera=camera)[8, 8]
-            assert color.argmax() == channel
-            assert color[channel] > 4 * color[channel - 1]
-
-
 def test_render_shows_the_chosen_environments():
     with torch_panda.make("PandaPush-v1", num_envs=5, num_threads=2, seed=0) as env:
         with pytest.raises(ValueError, match="environment 0 was not reset: call reset"):
@@ -222,18 +209,6 @@ def test_render_shows_the_chosen_environments():
                 env.render(wrong, camera=CLOSE)
     with pytest.raises(BulletError, match="closed"):
         env.render()
-
-
-def test_pictures_do_not_depend_on_threads():
-    pictures = []
-    for num_threads in (1, 3):
-        with torch_panda.make(
-            "PandaFlip-v1", num_envs=4, num_threads=num_threads, seed=0
-        ) as env:
-            torch.manual_seed(0)
-            env.rollout(3)
-            pictures.append(env.render(camera=CLOSE))
-    assert (pictures[0] == pictures[1]).all()
 
 
 def test_rendering_does_not_change_the_simulation():

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torch_panda import Flip, Panda, PickAndPlace, Push, Reach, RobotTaskEnv, Stack
+from torch_panda import Flip, Panda, Push, Reach, RobotTaskEnv, Stack
 from torch_panda.rotations import rotate
 
 angle = st.floats(-math.pi, math.pi)
@@ -94,15 +94,6 @@ def test_a_distance_at_the_threshold_is_neither_success_nor_punished():
     achieved = torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64)
     assert not task.is_success(achieved, goal)
     assert task.compute_reward(achieved, goal) == 0.0
-
-
-def test_the_repr_of_a_task_shows_its_arguments():
-    task = PickAndPlace(distance_threshold=0.02)
-    assert repr(task) == (
-        "PickAndPlace(reward_type='sparse', distance_threshold=0.02, "
-        "goal_xy_range=0.3, obj_xy_range=0.3, object_mass=2.0, object_friction=5.0, "
-        "table_friction=0.1, goal_z_range=0.2)"
-    )
 
 
 class Bonus(Push):
