@@ -5,8 +5,7 @@ from ctypes import c_double
 
 import numpy as np
 import pybullet
-import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from torch_panda.bullet.loop import load_library
@@ -21,22 +20,11 @@ def c_angles(*quaternion):
     return list(angles)
 
 
-FUNCTIONS = [euler_angles, c_angles]
-
-
-def assert_equals_pybullet(roll, pitch, yaw):
+@given(angle, angle, angle)
+@example(0.3, math.pi / 2, 1.0)
+@example(0.3, -math.pi / 2, 1.0)
+def test_angles_equal_those_of_pybullet(roll, pitch, yaw):
     quaternion = pybullet.getQuaternionFromEuler((roll, pitch, yaw))
     expected = pybullet.getEulerFromQuaternion(quaternion)
-    for function in FUNCTIONS:
+    for function in (euler_angles, c_angles):
         np.testing.assert_array_equal(function(*quaternion), expected)
-
-
-@given(angle, angle, angle)
-def test_angles_equal_those_of_pybullet(roll, pitch, yaw):
-    assert_equals_pybullet(roll, pitch, yaw)
-
-
-@pytest.mark.parametrize("pitch", [math.pi / 2, -math.pi / 2])
-@given(roll=angle, yaw=angle)
-def test_angles_equal_those_of_pybullet_at_a_vertical_pitch(pitch, roll, yaw):
-    assert_equals_pybullet(roll, pitch, yaw)
