@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 import torch_panda
+from tests.pushing import pusher
 from torch_panda import Randomization, RobotTaskEnv
 from torch_panda.envs.randomization import PARAMETERS
 
@@ -23,13 +24,11 @@ ALL = Randomization(
 ID = "PandaPickAndPlace-v1"
 
 
-def push(env, start=None):
+def push(env):
     """Move the hand to the cube and push it."""
-    td, seen = env.reset() if start is None else start, []
+    policy, td, seen = pusher(env), env.reset(), []
     for _ in range(25):
-        action = torch.zeros(env.action_spec.shape)
-        action[..., :3] = (td["achieved_goal"] - td["observation"][..., :3]) * 10
-        td = env.step(td.clone().set("action", action))["next"]
+        td = env.step(policy(td.clone()))["next"]
         seen.append(td)
     return torch.stack(seen)
 

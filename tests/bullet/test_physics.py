@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torch_panda
+from tests.pushing import pusher
 from torch_panda import PhysicsParams
 from torch_panda.bullet import EXACT, FAST, PhysicsClient
 
@@ -14,12 +15,7 @@ from torch_panda.bullet import EXACT, FAST, PhysicsClient
 def rollout(physics, env_id="PandaPush-v1"):
     """Observations while the arm moves to the cube and pushes it, (20, 18)."""
     with torch_panda.make(env_id, seed=1, physics=physics) as env:
-
-        def towards_cube(td):
-            offset = td["achieved_goal"] - td["observation"][:3]
-            return td.set("action", (offset * 20).clamp(-1, 1))
-
-        return env.rollout(20, towards_cube)["next", "observation"]
+        return env.rollout(20, pusher(env))["next", "observation"]
 
 
 @pytest.fixture(scope="module")

@@ -7,23 +7,17 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 import torch_panda
 from tests.devices import on_gpu
+from tests.pushing import pusher
 from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.solver import activate
 from torch_panda.envs import robot_task
 
 
-def push_towards(td, generator):
-    """Actions towards the object, so that contacts are frequent."""
-    towards = (td["achieved_goal"] - td["observation"][..., :3]) * 20
-    noise = torch.randn(towards.shape, generator=generator) * 0.3
-    return towards + noise
-
-
 def run(env, steps):
     """Reset the environments and push the objects for some steps."""
-    generator, td = torch.Generator().manual_seed(0), env.reset()
+    policy, td = pusher(env, noise=0.3), env.reset()
     for _ in range(steps):
-        td = env.step(td.set("action", push_towards(td, generator)))["next"]
+        td = env.step(policy(td))["next"]
 
 
 @pytest.fixture
@@ -95,12 +89,10 @@ def test_unknown_options_of_a_reset_are_refused(env):
 
 def test_a_partial_reset_changes_no_bit_of_the_other_environments(env):
     with torch_panda.make("PandaPush-v1", num_envs=3, seed=0) as other:
-        td, untouched = env.reset(), other.reset()
-        generator = torch.Generator().manual_seed(0)
+        policy, td, untouched = pusher(env, noise=0.3), env.reset(), other.reset()
         for step in range(30):
-            action = push_towards(td, generator)
-            td = env.step(td.set("action", action))["next"]
-            untouched = other.step(untouched.set("action", action))["next"]
+            untouched["action"] = policy(td)["action"]
+            td, untouched = env.step(td)["next"], other.step(untouched)["next"]
             if step == 10:
                 td["_reset"] = torch.tensor([[False], [True], [False]])
                 td = env.reset(td)

@@ -7,6 +7,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from tests.envs.test_checks import make_kuka
+from tests.pushing import pusher
 from torch_panda import Reach, RobotTaskEnv
 from torch_panda.bullet.urdf import find_urdf
 from torch_panda.rotations import rotate
@@ -150,20 +151,12 @@ def test_motors_carry_the_arm_at_rest():
 
 
 def test_sensors_do_not_change_the_physics():
-    def pull(td):
-        """Fingers, cube and table touch."""
-        noise = torch.rand(3, 4, generator=generator) * 2 - 1
-        towards = (td["achieved_goal"] - td["observation"][:, :3]) * 10
-        noise[:, :3] = noise[:, :3] * 0.5 + towards
-        return td.set("action", noise)
-
     ends = []
     for sensors in ((), SENSORS):
-        generator = torch.Generator().manual_seed(0)
         with torch_panda.make(
             "PandaPickAndPlace-v1", num_envs=3, seed=0, sensors=sensors
         ) as env:
-            rollout = env.rollout(50, pull)
+            rollout = env.rollout(50, pusher(env, noise=0.5))
             ends.append((rollout["next", "observation"], env.get_state()))
     assert rollout["next", "finger_contact"].any()
     (ours, our_state), (theirs, their_state) = ends
