@@ -33,8 +33,7 @@ class Configured:
     changeable: ClassVar[tuple[str, ...]] = ()
     """Arguments that may change in an environment, in addition to the base classes'."""
     _replaceable_methods: ClassVar[frozenset[str]] = frozenset()
-    # The fixes for errors, by unknown name: of an argument, and of an assignment.
-    _argument_advice: ClassVar[Mapping[str, str]] = {}
+    # The fixes for assignments, by unknown name.
     _assignment_advice: ClassVar[Mapping[str, str]] = {}
     _is_frozen = False
 
@@ -43,7 +42,7 @@ class Configured:
         # A constructor with ``**options`` passes them on, so Python checks these.
         if not _has_options(inspect.signature(cls.__init__).parameters):
             accepted = argument_names(cls)
-            check_names(cls.__name__, arguments, accepted, cls._argument_advice)
+            check_names(cls.__name__, arguments, accepted)
         _check_defaults(cls)
         return super().__new__(cls)
 

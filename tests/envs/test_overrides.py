@@ -72,13 +72,6 @@ def test_success_and_reward_follow_a_threshold_that_changes_later(threshold):
     assert td["terminated"].equal(td["success"])
 
 
-def test_an_own_task_that_imports_selects_state_is_told_that_it_is_not_needed():
-    with pytest.warns(FutureWarning, match="no longer needed: delete the import"):
-        from torch_panda.bullet import selects_state
-
-    assert selects_state(make) is make
-
-
 def test_the_callers_action_is_kept_and_not_changed():
     with make() as env:
         start = env.reset()

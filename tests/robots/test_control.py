@@ -240,23 +240,18 @@ def test_fingers_that_follow_match_the_joint_that_leads():
     assert setpoint[0].tolist() == pytest.approx([0.24, 0.4], abs=1e-6)
 
 
+@pytest.mark.parametrize("joints", [(2,), (0, 1)])
+def test_joints_that_cannot_mimic_another_are_refused(joints):
+    message = r"mimic_joints must be indices below 2 and leave out one joint"
+    with pytest.raises(ValueError, match=message):
+        Gripper((0.8, 0.8), (0.0, 0.0), width=0.1, mimic_joints=joints)
+
+
 def test_fingers_open_as_wide_as_the_gripper_allows():
     with RobotTaskEnv(robot=Panda(), task=Reach(), num_envs=1) as env:
         simulation, td = hold(env, unit(4, 3))
         assert td["observation"][0, 6] == pytest.approx(0.08, abs=0.001)
         assert simulation.joint_position[0, 7:].sum().item() == pytest.approx(0.08)
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (lambda: torch_panda.Robot(joint_forces=()), "effort_limits"),
-        (lambda: Gripper(followers=()), "mimic_joints"),
-    ],
-)
-def test_a_former_name_of_an_argument_is_refused_with_the_new_one(make, name):
-    with pytest.raises(TypeError, match=f"use {name}"):
-        make()
 
 
 @pytest.mark.parametrize("robot_class", [Panda, Kuka, XArm6, XArm6Gripper])

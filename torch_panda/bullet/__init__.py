@@ -1,9 +1,5 @@
 """Bullet's C API: one client, and many clients stepped in parallel."""
 
-import warnings
-from collections.abc import Callable
-from typing import Any
-
 from torch_panda.bullet.blueprint import Blueprint
 from torch_panda.bullet.client import PhysicsClient
 from torch_panda.bullet.connection import BulletError
@@ -42,15 +38,3 @@ __all__ = [
     "WorkerPool",
     "resolve_physics",
 ]
-
-
-def __getattr__(name: str) -> Callable[..., Any]:
-    """Let tasks that still import ``selects_state`` work, and say that it has gone."""
-    if name != "selects_state":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(
-        "selects_state is no longer needed: delete the import and the decorators",
-        FutureWarning,
-        stacklevel=2,
-    )
-    return lambda function: function

@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
@@ -101,9 +101,6 @@ class Robot(Configured):
     """
 
     changeable: ClassVar[tuple[str, ...]] = ("action_scale",)
-    _argument_advice: ClassVar[Mapping[str, str]] = {
-        "joint_forces": "use effort_limits"
-    }
 
     def __init__(
         self,

@@ -1,12 +1,10 @@
 """Grippers whose fingers open and close together."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
-from torch_panda.arguments import check_names
 from torch_panda.checks import check_above_zero, check_finite
 
 
@@ -41,13 +39,6 @@ class Gripper:
     _per_width: Tensor = field(init=False, repr=False, compare=False)
     _closed: Tensor = field(init=False, repr=False, compare=False)
 
-    def __new__(cls, *args: object, **arguments: object) -> Self:
-        """Refuse unknown arguments."""
-        accepted = [field.name for field in fields(cls) if field.init]
-        advice = {"followers": "use mimic_joints"}
-        check_names(cls.__name__, arguments, accepted, advice)
-        return super().__new__(cls)
-
     def __post_init__(self) -> None:
         for name in ("closed", "opened"):
             for position in getattr(self, name):
@@ -63,11 +54,14 @@ class Gripper:
             )
         per_width = (opened - closed) / self.width
         leads = closed != opened
-        leads[list(self.mimic_joints)] = False
+        if {*self.mimic_joints} <= {*range(len(leads))}:
+            leads[list(self.mimic_joints)] = False
+        else:
+            leads[:] = False
         if not leads.any():
             raise ValueError(
-                f"mimic_joints must leave out one joint that moves, got "
-                f"{self.mimic_joints}"
+                f"mimic_joints must be indices below {len(leads)} and leave out one "
+                f"joint that moves, got {self.mimic_joints}"
             )
         weights = torch.where(leads, 1 / per_width, 0.0) / leads.sum()
         object.__setattr__(self, "_closed", closed)
