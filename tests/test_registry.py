@@ -4,6 +4,7 @@ import pytest
 
 import torch_panda
 from torch_panda import Panda, Push
+from torch_panda.learning.environments import is_from_gymnasium
 from torch_panda.registry import Family
 
 
@@ -113,3 +114,10 @@ def test_an_unknown_id_is_named_with_a_similar_one_and_the_accepted_ones(env_id)
         with pytest.raises(ValueError, match="unknown environment id"):
             torch_panda.make(unknown)
     assert torch_panda.max_episode_steps(env_id) == 30
+
+
+@pytest.mark.parametrize("function", [torch_panda.make, is_from_gymnasium])
+def test_the_id_of_gymnasium_is_answered_with_ours(function):
+    message = "'torch_panda/PandaPush-v1' is the id in .*: use 'PandaPush-v1' here$"
+    with pytest.raises(ValueError, match=message):
+        function("torch_panda/PandaPush-v1")

@@ -180,6 +180,8 @@ FAMILIES = (
     ),
 )
 
+# Ids in `gymnasium.make` begin with it.
+GYMNASIUM_PREFIX = "torch_panda/"
 _REGISTRATIONS = {
     registration.env_id: registration
     for family in FAMILIES
@@ -320,6 +322,9 @@ def find_registration(env_id: str) -> Registration:
     """
     if isinstance(env_id, str) and is_registered(env_id):
         return _REGISTRATIONS[env_id]
+    own_id = str(env_id).removeprefix(GYMNASIUM_PREFIX)
+    if is_registered(own_id):
+        raise ValueError(f"{env_id!r} is the id in gymnasium.make: use {own_id!r} here")
     if isinstance(env_id, str) and env_id in gymnasium.registry:
         raise ValueError(
             f"an environment of torch_panda is needed here, but {env_id} is one of "
@@ -357,7 +362,7 @@ def _register_with_gymnasium(registration: Registration) -> None:
     is made. Gymnasium's ``TimeLimit`` truncates, so ``gymnasium.make`` accepts another
     ``max_episode_steps``.
     """
-    name = f"torch_panda/{registration.env_id}"
+    name = GYMNASIUM_PREFIX + registration.env_id
     gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that it replaces.
     gymnasium.register(
         name,

@@ -92,6 +92,14 @@ def test_a_partial_reset_to_an_exact_state_restores_only_its_own():
         assert torch.equal(pose, expected["achieved_goal"][1])
 
 
+def test_a_reset_of_no_environment_to_an_exact_state_changes_nothing():
+    with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:
+        td = env.step(env.reset().set("action", torch.ones(2, 3)))["next"]
+        state = env.get_state(exact=True).set("_reset", torch.zeros(2, 1) > 0)
+        same = env.reset(state, set_state=True)
+        assert torch.equal(same["observation"], td["observation"])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

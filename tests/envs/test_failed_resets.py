@@ -146,3 +146,28 @@ def test_a_diverged_step_does_not_count_as_success():
             assert ends == [False, False, True]
             assert after["done"]
     assert solved  # some of these states would have counted as success
+
+
+class Stutters(Panda):
+    fails = False
+
+    def setpoint(self, action, simulation):
+        if self.fails:
+            raise RuntimeError("no setpoint")
+        return super().setpoint(action, simulation)
+
+
+def test_a_step_without_a_setpoint_was_not_taken():
+    robot = Stutters(block_gripper=True)
+    with RobotTaskEnv(robot=robot, task=Reach(), num_envs=1, seed=0) as env:
+        td = env.reset().set("action", torch.ones(1, 3))
+        robot.fails = True
+        with pytest.raises(RuntimeError, match="no setpoint"):
+            env.step(td)
+        robot.fails = False
+        after = env.step(td)["next", "observation"]
+        state = env.get_state(exact=True)
+        assert state["step_count"].tolist() == [[1]]
+        env.reset()
+        again = env.reset(state, set_state=True)["observation"]
+        assert torch.equal(again, after)

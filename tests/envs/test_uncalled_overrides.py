@@ -53,6 +53,25 @@ def test_a_function_of_an_object_that_is_never_called_is_refused(name):
         make(task)
 
 
+class Counting(StartInTheMiddle):
+    def sample_start(self, rng):
+        self.sample_goal(rng)
+        return super().sample_start(rng)
+
+
+class CountsItsGoals(Counting):
+    level = 0
+
+    def sample_goal(self, rng):
+        self.level += 1
+        return super().sample_goal(rng)
+
+
+def test_looking_for_overrides_does_not_change_the_task():
+    with make(CountsItsGoals()) as env:
+        assert env.task.level == 0
+
+
 class Composed(Push):
     """A user's base class whose `sample_start` calls the goal in some episodes."""
 

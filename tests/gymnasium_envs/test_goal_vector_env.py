@@ -1,5 +1,6 @@
 """`GoalVectorEnv` returns the same values as SyncVectorEnv."""
 
+import contextlib
 import gc
 
 import gymnasium
@@ -114,6 +115,16 @@ def test_a_step_before_the_first_reset_is_refused():
     with pytest.raises(ResetNeeded, match=r"reset environments \[0, 1\]"):
         env.step(np.zeros((2, 3)))
     env.close()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_the_first_reset_starts_all_environments(mode):
+    env = GoalVectorEnv("PandaReach-v1", num_envs=2, autoreset_mode=mode)
+    with contextlib.closing(env):
+        env.reset(seed=0, options={"reset_mask": np.array([True, False])})
+        _, reward, *_ = env.step(np.zeros((2, 3), dtype=np.float32))
+        assert reward.tolist() == [-1, -1]
+        assert env.torch_env.episodes.step_count.flatten().tolist() == [1, 1]
 
 
 @pytest.fixture(scope="module")

@@ -328,9 +328,11 @@ class Episodes:
             self._check_all_reset()
             action = self._read_action(action)
             envs = None if step_mask is None else indices(step_mask)
+            # If the robot's function raises, no step was taken.
+            setpoint = self._setpoint(action)
             self.step_count += 1 if step_mask is None else step_mask
             self._exact_states.record(action, step_mask)
-            if diverged := self._advance(action, envs):
+            if diverged := self.simulation.step(self._control, setpoint, envs):
                 ended = [goal[diverged] for goal in self._goals]
                 self._recover(diverged)
                 started = [goal[diverged] for goal in self._goals]
@@ -544,7 +546,8 @@ class Episodes:
     def _repeat_step(self, action: Tensor, step_mask: Tensor, last: list[int]) -> None:
         """Repeat a step of an exact state; see `exact_states.TakeStep`."""
         self._exact_states.record(action, step_mask)
-        self._advance(action, indices(step_mask))
+        setpoint = self._setpoint(action)
+        self.simulation.step(self._control, setpoint, indices(step_mask))
         # Sensors report the present only, so the last step of each environment is
         # enough for them.
         for sensor in self._sensors:
@@ -576,10 +579,9 @@ class Episodes:
             )
         return action.clamp(-1.0, 1.0).float()
 
-    def _advance(self, action: Tensor, envs: Sequence[int] | None) -> list[int]:
-        """Advance the physics by one step; return the environments that diverged."""
-        setpoint = self.robot.setpoint(action, self.simulation).numpy()
-        return self.simulation.step(self._control, setpoint, envs)
+    def _setpoint(self, action: Tensor) -> Doubles:
+        """What the robot's motors aim at, (n, ...); see `Robot.setpoint`."""
+        return self.robot.setpoint(action, self.simulation).numpy()
 
     def _observe(self, action: Tensor | None = None) -> Observed:
         """Observe all environments.

@@ -56,7 +56,7 @@ class Replay(NamedTuple):
         """
         rows = torch.tensor(self.envs, device="cpu")
         num_envs = len(next(iter(state.values())))
-        for index in range(int(self.num_actions.max())):
+        for index in range(max(self.num_actions.tolist(), default=0)):
             is_acting = self.num_actions > index
             action = self.actions.new_zeros(num_envs, self.actions.shape[-1])
             action[rows[is_acting]] = self.actions[is_acting, index]

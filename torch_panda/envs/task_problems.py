@@ -184,7 +184,8 @@ def find_goal_entries_problems(
 def find_uncalled_samplers(task: Task) -> list[str]:
     """Find methods that a task overrides, but that its `sample_start` never calls.
 
-    `sample_start` is called on a copy of the task. If it fails, nothing is found.
+    `sample_start` and the other methods are called on copies of the task. If one of
+    them fails, nothing is found.
     """
     if type(task).sample_start is Task.sample_start:
         return []
@@ -195,11 +196,11 @@ def find_uncalled_samplers(task: Task) -> list[str]:
     }
     if not unused:
         return []
-    probe = copy.copy(task)
+    probe, original = copy.copy(task), copy.copy(task)
 
     def record(name: str, rng: np.random.Generator) -> object:
         unused.discard(name)
-        return getattr(task, name)(rng)
+        return getattr(original, name)(rng)
 
     for name in unused:
         setattr(probe, name, partial(record, name))

@@ -127,7 +127,8 @@ class GoalVectorEnv(
             if own_seed is not None:
                 self.torch_env.set_env_seed(index, own_seed)
         start = self.torch_env.episodes.reset(_indices(mask), state)
-        self._ended = self._ended & ~mask
+        # The first reset starts all environments.
+        self._ended = self._ended & ~mask & self._was_reset
         self._was_reset = True
         return self._observation(start), self._infos(start, mask)
 

@@ -97,8 +97,8 @@ def join_entries(
                 raise ValueError(f"the key of an entry must be text, got {key!r}")
         if taken := (_ENVIRONMENT_KEYS | set(reserved)) & observer.entries.keys():
             raise ValueError(
-                f"{sorted(taken)} are the environment's own keys; sensors and "
-                "extra_observation need other keys"
+                f"{sorted(taken)} are the environment's own keys: use other keys in "
+                "sensors, extra_observation and the task's info"
             )
         if shared := entries.keys() & observer.entries.keys():
             raise ValueError(

@@ -7,6 +7,7 @@ import gymnasium
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
 from torch_panda.registry import (
+    GYMNASIUM_PREFIX,
     find_registration,
     is_registered,
     make,
@@ -34,6 +35,8 @@ def is_from_gymnasium(env_id: str) -> bool:
     """
     if is_registered(env_id):
         return False
+    if env_id.startswith(GYMNASIUM_PREFIX):
+        find_registration(env_id)  # raises
     if env_id not in gymnasium.registry:
         try:
             find_registration(env_id)
