@@ -60,6 +60,18 @@ def file(tmp_path):
     return path
 
 
+def test_a_changed_urdf_is_read_again(file):
+    def hand_position():
+        with RobotTaskEnv(robot=make_gantry(file), task=Reach()) as env:
+            return env.reset()["observation"][:3]
+
+    before = hand_position()
+    slide = '<axis xyz="1 0 0"/>'
+    file.write_text(GANTRY.replace(slide, f'{slide}<origin xyz="0 0 0.1"/>'))
+    change = (hand_position() - before).tolist()
+    assert change == pytest.approx([0, 0, 0.1], abs=1e-3)
+
+
 @pytest.mark.parametrize("control_type", ["ee", "ee_pose", "joints", "joint_velocity"])
 def test_a_gantry_moves_under_each_control_type(file, control_type):
     robot = make_gantry(file, control_type=control_type, block_gripper=True)

@@ -5,11 +5,14 @@ import re
 import tempfile
 import threading
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from torch_panda.bullet.library import library_path
 from torch_panda.checks import check_vector
+
+_Result = TypeVar("_Result")
 
 _JOINT_TYPES = (
     "revolute",
@@ -233,7 +236,21 @@ def make_scratch_folder() -> Path:
         return Path(tempfile.mkdtemp(dir=_process_folder().name))
 
 
-@functools.cache
+def cache_by_file(function: Callable[..., _Result]) -> Callable[..., _Result]:
+    """Cache the results of a function of a file until the file changes."""
+
+    @functools.cache
+    def call(modified: int, file: str, *args: Hashable) -> _Result:
+        return function(file, *args)
+
+    @functools.wraps(function)
+    def cached(file: str, *args: Hashable) -> _Result:
+        return call(Path(file).stat().st_mtime_ns, file, *args)
+
+    return cached
+
+
+@cache_by_file
 def urdf_with_tool(file: str, tool: Tool) -> str:
     """Write a copy of a URDF with a tool, and return the path of the copy.
 

@@ -4,7 +4,6 @@ The Panda's meshes have 100,000 triangles. In a picture of 64 x 64 pixels, Bulle
 software renderer spends 95 % of the time on triangles that are smaller than a pixel.
 """
 
-import functools
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -13,7 +12,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from torch_panda.bullet.urdf import find_mesh, make_scratch_folder, parse_urdf
+from torch_panda.bullet.urdf import (
+    cache_by_file,
+    find_mesh,
+    make_scratch_folder,
+    parse_urdf,
+)
 
 # Texture coordinates in the same cell of this size count as the same colour.
 _TEXTURE_CELL = 0.1
@@ -22,7 +26,7 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
-@functools.cache
+@cache_by_file
 def decimated_urdf(urdf: str, cell: float) -> Path:
     """Write a copy of a URDF with coarse visual meshes and no collision shapes.
 
