@@ -16,7 +16,7 @@ from torch_panda import Camera
 SCENES = {
     "Reach": (1, Camera((0.0, 0.02, 0.14), 0.72, 50, -22, fov=50)),
     "Push": (1, Camera((-0.03, 0.04, 0.1), 0.72, 55, -30, fov=50)),
-    "Slide": (2, Camera((0.14, 0.0, 0.08), 0.9, 40, -30, fov=50)),
+    "Slide": (3, Camera((0.14, 0.0, 0.08), 0.9, 40, -30, fov=50)),
     "PickAndPlace": (4, Camera((0.03, -0.04, 0.16), 0.72, 55, -22, fov=50)),
     "Stack": (1, Camera((-0.03, 0.04, 0.11), 0.72, 55, -28, fov=50)),
     "Flip": (1, Camera((0.0, 0.0, 0.08), 0.55, 60, -25, fov=50)),
