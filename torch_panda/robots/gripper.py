@@ -53,12 +53,10 @@ class Gripper:
                 f"one position, got {self.closed} and {self.opened}"
             )
         per_width = (opened - closed) / self.width
-        leads = closed != opened
-        if {*self.mimic_joints} <= {*range(len(leads))}:
-            leads[list(self.mimic_joints)] = False
-        else:
-            leads[:] = False
-        if not leads.any():
+        indices = range(len(closed))
+        mimics = [joint in self.mimic_joints for joint in indices]
+        leads = (closed != opened) & ~torch.tensor(mimics, device="cpu")
+        if not leads.any() or not {*self.mimic_joints} <= {*indices}:
             raise ValueError(
                 f"mimic_joints must be indices below {len(leads)} and leave out one "
                 f"joint that moves, got {self.mimic_joints}"
