@@ -580,7 +580,7 @@ class Episodes:
         return action.clamp(-1.0, 1.0).float()
 
     def _setpoint(self, action: Tensor) -> Doubles:
-        """What the robot's motors aim at, (n, ...); see `Robot.setpoint`."""
+        """Compute the setpoints of the motors, (n, ...); see `Robot.setpoint`."""
         return self.robot.setpoint(action, self.simulation).numpy()
 
     def _observe(self, action: Tensor | None = None) -> Observed:
