@@ -230,8 +230,52 @@ def test_bodies_that_nothing_moves_are_shown_as_they_were_built():
                     for name in nodes
                     if name.startswith(f"/body{arm}/") and name.endswith("_link_7")
                 )
-                shown = world_pose(nodes, tip) @ (*client.centre_of_mass(arm, 6), 1)
+                shown = world_pose(nodes, tip) @ (*client.inertial_frame(arm, 6)[:3], 1)
                 np.testing.assert_allclose(shown[:3], centre, atol=1e-6)
+
+
+class Plate(torch_panda.Task):
+    """An object from a URDF whose inertial frame is neither at its base nor upright."""
+
+    goal_dim, observation_dim = 3, 0
+
+    def __init__(self, urdf):
+        self.urdf = urdf
+
+    def build(self, client):
+        return Bodies(objects=(client.load_urdf(self.urdf),))
+
+    def sample_objects(self, rng):
+        return ((0.2, 0.1, 0.5, 0.0, 0.8, 0.0, 0.6),)
+
+    def sample_goal(self, rng):
+        return (0.0, 0.0, 0.0)
+
+    def achieved_goal(self, simulation):
+        return simulation.object_pose[:, 0, :3]
+
+
+def test_an_object_with_a_shifted_centre_of_mass_is_where_bullet_has_it(tmp_path):
+    path = tmp_path / "plate.urdf"
+    box = '<geometry><box size="0.1 0.2 0.04"/></geometry><origin xyz="0.02 0 0"/>'
+    path.write_text(
+        f"""<robot name="plate"><link name="plate"><inertial><mass value="1"/>
+        <origin xyz="0.05 0 0.1" rpy="0 0.5 0"/>
+        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+        <visual>{box}</visual><collision>{box}</collision></link></robot>"""
+    )
+    with torch_panda.RobotTaskEnv(robot=torch_panda.Panda(), task=Plate(path)) as env:
+        env.reset()
+        (body,) = env.episodes.simulation.scene.objects
+        x, y, z, *quaternion = env.get_state()["object_pose"].flatten().tolist()
+        rotation = SO3.from_quaternion_xyzw(np.array(quaternion))
+        inertial = SO3.from_y_radians(0.5)
+        with env.open_viewer(port=8765) as viewer:
+            viewer.update()
+            shown = world_pose(nodes_of(viewer), f"/body{body}/base")
+        np.testing.assert_allclose(shown @ (0.05, 0, 0.1, 1), (x, y, z, 1), atol=1e-6)
+        upright = (rotation @ inertial.inverse()).as_matrix()
+        np.testing.assert_allclose(shown[:3, :3], upright, atol=1e-6)
 
 
 def test_parts_of_a_urdf_that_the_page_cannot_show_are_left_out(tmp_path):

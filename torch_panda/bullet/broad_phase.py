@@ -108,7 +108,8 @@ def _plan_links(
     links, base = [], poses[0]
     for link, pose in enumerate(poses, start=-1):
         snapshot = built
-        offset = rotate_vector(pose[3:], client.centre_of_mass(body, link))
+        centre = client.inertial_frame(body, link)[:3]
+        offset = rotate_vector(pose[3:], centre)
         if any(offset):
             x, y, z = (x - dx for x, dx in zip(base[:3], offset, strict=True))
             client.set_base(body, (x, y, z), base[3:])

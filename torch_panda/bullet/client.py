@@ -351,9 +351,17 @@ class PhysicsClient:
         """Restitution of a link (-1 is the base)."""
         return float(self._dynamics(body, link).restitution)
 
-    def centre_of_mass(self, body: int, link: int = -1) -> tuple[float, ...]:
-        """Centre of mass of a link (-1 is the base) in the link's URDF frame [m]."""
-        return tuple(self._dynamics(body, link).local_inertial_frame[:3])
+    def inertial_frame(self, body: int, link: int = -1) -> tuple[float, ...]:
+        """Pose (7,) of a link's inertial frame in the link's URDF frame.
+
+        Args:
+            body: Body id.
+            link: Index of the link; -1 is the base.
+
+        Returns:
+            Centre of mass [m] and quaternion xyzw.
+        """
+        return tuple(self._dynamics(body, link).local_inertial_frame)
 
     def _dynamics(self, body: int, link: int) -> capi.DynamicsInfo:
         command = capi.dynamics_info_init(self.connection.handle, body, link)

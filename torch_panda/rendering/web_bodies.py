@@ -13,6 +13,7 @@ import viser
 import yourdfpy
 from PIL import Image
 from viser.extras import ViserUrdf
+from viser.transforms import SE3, SO3
 
 from torch_panda.bullet import Box, Cylinder, PhysicsClient, Scene, Sphere
 from torch_panda.bullet.blueprint import CreateBody, LoadURDF, SetBase, SetJoints
@@ -45,10 +46,14 @@ class WebBodies:
         for command in client.blueprint:
             match command:
                 case LoadURDF(body, file):
+                    # A URDF's shapes are in the frame of the base. The poses that
+                    # Bullet reports, and `_nodes`, are of the base's inertial frame.
+                    inertial = _transform(client.inertial_frame(body))
+                    base = _transform((*command.position, *command.orientation))
                     name = f"/body{body}"
-                    self._nodes[body] = self._tree.add_frame(name, show_axes=False)
-                    pose = np.array((*command.position, *command.orientation))
-                    _place(self._nodes[body], pose)
+                    self._nodes[body] = self._add_frame(name, base @ inertial)
+                    name = f"{name}/base"
+                    self._add_frame(name, inertial.inverse())
                     urdf = ViserUrdf(server, _read_urdf(file), root_node_name=name)
                     names = [joint.name for joint in client.joints(body)]
                     self._urdfs[body] = urdf, names
@@ -107,6 +112,14 @@ class WebBodies:
             head_radius=0.007,
             head_length=0.015,
             visible=len(arrows) > 0,
+        )
+
+    def _add_frame(self, name: str, pose: SE3) -> Any:  # noqa: ANN401 (viser's)
+        return self._tree.add_frame(
+            name,
+            show_axes=False,
+            position=pose.translation(),
+            wxyz=pose.rotation().wxyz,
         )
 
     def _set_joints(
@@ -181,6 +194,12 @@ def _read_urdf(file: str) -> yourdfpy.URDF:
         io.BytesIO(ElementTree.tostring(robot)),
         filename_handler=lambda fname: str(find_mesh(fname, Path(file))),
     )
+
+
+def _transform(pose: Sequence[float]) -> SE3:
+    """The transform of a pose (7,): position [m] and quaternion xyzw."""
+    rotation = SO3.from_quaternion_xyzw(np.array(pose[3:]))
+    return SE3.from_rotation_and_translation(rotation, np.array(pose[:3]))
 
 
 def _place(node: Any, pose: Floats) -> None:  # noqa: ANN401 (viser's handles)
