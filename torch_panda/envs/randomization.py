@@ -55,7 +55,8 @@ class Randomization:
     ranges. The drawn factors depend on (seed, environment, episode number) only.
 
     Attributes:
-        object_mass: Mass and inertia of all objects.
+        object_mass: Mass of all objects. Bullet computes their inertia from the mass
+            and the collision shape, even where a URDF has another inertia.
         object_friction: Lateral friction of all objects and their links. For a
             contact, Bullet multiplies the frictions of the two bodies.
         table_friction: Lateral friction of the table, the ground and the bases of all
