@@ -5,13 +5,14 @@ import re
 import tempfile
 import threading
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 from torch_panda.bullet.library import library_path
 from torch_panda.checks import check_vector
 
+_Args = ParamSpec("_Args")
 _Result = TypeVar("_Result")
 
 _JOINT_TYPES = (
@@ -236,16 +237,21 @@ def make_scratch_folder() -> Path:
         return Path(tempfile.mkdtemp(dir=_process_folder().name))
 
 
-def cache_by_file(function: Callable[..., _Result]) -> Callable[..., _Result]:
+def cache_by_file(
+    function: Callable[Concatenate[str, _Args], _Result],
+) -> Callable[Concatenate[str, _Args], _Result]:
     """Cache the results of a function of a file until the file changes."""
 
     @functools.cache
-    def call(modified: int, file: str, *args: Hashable) -> _Result:
-        return function(file, *args)
+    def call(
+        modified: int, file: str, *args: _Args.args, **kwargs: _Args.kwargs
+    ) -> _Result:
+        return function(file, *args, **kwargs)
 
     @functools.wraps(function)
-    def cached(file: str, *args: Hashable) -> _Result:
-        return call(Path(file).stat().st_mtime_ns, file, *args)
+    def cached(file: str, *args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
+        modified = Path(file).stat().st_mtime_ns
+        return call(modified, file, *args, **kwargs)  # type: ignore[arg-type]
 
     return cached
 
