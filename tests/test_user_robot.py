@@ -38,12 +38,12 @@ GANTRY = (
 )
 
 
-def make_gantry(file, **options):
+def make_gantry(file, ee_link=6, **options):
     return Robot(
         urdf=file,
         neutral_joint_position=(0.0,) * 6,
         effort_limits=(500.0, 500.0, 500.0, 50.0, 100.0, 100.0),
-        ee_link=6,
+        ee_link=ee_link,
         ee_orientation=(0.0, 0.0, 0.0, 1.0),
         base_position=(0.0, 0.0, 0.3),
         gripper=Gripper(closed=(0.0, 0.0), opened=(0.04, 0.04), width=0.07),
@@ -85,6 +85,29 @@ def test_a_gantry_moves_under_each_control_type(file, control_type):
             td = env.step(td.set("action", action))["next"]
         moved = td["achieved_goal"] - start
         assert (moved[:, 0] > 0.05).all() and (moved[:, 1:].abs() < 0.01).all()
+
+
+@pytest.mark.parametrize("control_type", ["ee", "ee_pose"])
+def test_a_turned_centre_of_mass_stays_where_it_is(file, control_type):
+    hand = '<link name="hand"><inertial>'
+    assert hand in GANTRY
+    frame = f'{hand}<origin xyz="0.03 0.01 0.05" rpy="0 0 0.7"/>'
+    file.write_text(GANTRY.replace(hand, frame))
+    robot = make_gantry(file, control_type=control_type, block_gripper=True, ee_link=3)
+    with RobotTaskEnv(robot=robot, task=Reach()) as env:
+        td = env.reset()
+        simulation = env.episodes.simulation
+        assert any(simulation.ee_frame[:6])
+        position = simulation.ee_position.clone()
+        orientation = simulation.ee_orientation.clone()
+        if control_type == "ee":  # keeps the orientation of the robot's options
+            orientation = orientation.new_tensor([robot.ee_orientation])
+        for _ in range(30):
+            td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
+        torch.testing.assert_close(simulation.ee_position, position, atol=2e-3, rtol=0)
+        torch.testing.assert_close(
+            simulation.ee_orientation, orientation, atol=1e-3, rtol=0
+        )
 
 
 def pick_and_place(env, steps):

@@ -145,6 +145,16 @@ def test_ee_pose_moves_along_the_world_and_rotates_in_the_hand_frame():
             assert cosine.acos() < 0.6 * cosine_at_start.acos()
 
 
+@pytest.mark.parametrize("control_type", ["ee", "ee_pose"])
+@pytest.mark.parametrize("arm", ["Panda", "Kuka", "XArm6", "XArm6Gripper"])
+def test_the_hand_stays_where_it_is_without_an_action(arm, control_type):
+    """Also if its centre of mass is not at the origin of its link, as in the Kuka."""
+    with make(f"{arm}Reach-v1", control_type=control_type) as env:
+        start = env.reset()["achieved_goal"]
+        _, td = hold(env, torch.zeros(env.action_spec.shape), 50)
+        assert (td["achieved_goal"] - start).norm() < 0.002
+
+
 def test_rotations_agree_with_pybullet():
     torch.manual_seed(0)
     vectors = torch.randn(20, 3, dtype=torch.float64)

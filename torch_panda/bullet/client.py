@@ -694,9 +694,10 @@ class PhysicsClient:
 
         Args:
             body: Body id.
-            link: Index of the link whose centre of mass should reach the pose.
-            position: Target position (3,), world frame [m].
-            orientation: Target orientation, quaternion xyzw.
+            link: Index of the link.
+            position: Target of the origin of the link's URDF frame (3,), which may lie
+                beside its centre of mass; see `inertial_frame`. World frame [m].
+            orientation: Target orientation of its inertial frame, quaternion xyzw.
             joint_positions: Output, one position per movable joint.
         """
         command = capi.ik_init(self.connection.handle, body)

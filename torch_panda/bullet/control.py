@@ -27,9 +27,8 @@ class MotorControl:
     A setpoint is a row of numbers. Its first part is for the arm. Without ``ik_link``,
     it has one number per joint of the arm: positions [rad], velocities [rad/s] or
     torques [N m], depending on ``arm_mode``. With ``ik_link``, it is the target
-    position of that link's centre of mass, world frame [m], followed by the link's
-    target orientation (quaternion xyzw) unless ``ik_orientation`` fixes the
-    orientation. The second part has the positions of all other joints [rad] or [m].
+    position of that link and, unless ``ik_orientation`` fixes it, its orientation; see
+    `PhysicsClient.inverse_kinematics`. The second part has the positions of all other joints [rad] or [m].
 
     Attributes:
         forces: Maximum force of every joint's motor [N m] or [N]. The torques of

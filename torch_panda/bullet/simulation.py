@@ -41,6 +41,8 @@ class VectorSimulation:
             resets overwrite them: copy the ones that you keep. The tensors that tasks
             read are also attributes of the simulation, for example
             ``simulation.ee_position`` (num_envs, 3) [m].
+        ee_frame: Pose of the end-effector in the URDF's frame of the robot's
+            ``ee_link``; see `PhysicsClient.inertial_frame`.
         n_substeps: Number of substeps per step.
         ctrl_dt: Length of a step [s].
     """
@@ -68,6 +70,7 @@ class VectorSimulation:
             self._clients.append(client)
             self.scene = _build_scene(build, client)
             self._check_joints()
+            self.ee_frame = client.inertial_frame(self.scene.robot, self.scene.ee_link)
             self._blueprint = client.blueprint
             for _ in range(1, num_envs):
                 self._clients.append(PhysicsClient(physics=physics))

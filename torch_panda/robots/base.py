@@ -27,6 +27,7 @@ from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
     NO_ROTATION,
     quaternion_product,
+    rotate,
     rotation_vector_to_quaternion,
 )
 
@@ -69,7 +70,7 @@ class Robot(Configured):
         effort_limits: Largest torque [N m] or force [N] of each movable joint's motor.
         ee_link: Index of the link whose centre of mass is the end-effector.
         ee_orientation: Orientation that the end-effector keeps under the control type
-            "ee", quaternion xyzw, world frame.
+            "ee": of the link's inertial frame, quaternion xyzw, world frame.
         num_arm_joints: Number of the arm's joints, which are the first movable joints.
             Without a gripper, the joints after them keep their start positions. None
             means all joints except the gripper's.
@@ -258,8 +259,9 @@ class Robot(Configured):
             simulation: The environments.
 
         Returns:
-            (num_envs, k) float64: the values of `arm_setpoint`, and then the positions
-            of the other joints [rad] or [m].
+            (num_envs, k) float64: the values of `arm_setpoint`, but with the position
+            of the URDF's frame of ``ee_link`` instead of the end-effector's, and then
+            the positions of the other joints [rad] or [m].
         """
         if self.gripper is None or self.block_gripper:
             arm = self.arm_setpoint(action, simulation)
@@ -268,6 +270,8 @@ class Robot(Configured):
             arm = self.arm_setpoint(action[:, :-1], simulation)
             fingers = simulation.joint_position[:, self.num_arm_joints :]
             others = self.gripper.setpoint(action[:, -1:], fingers)
+        if self.control_type in ("ee", "ee_pose"):
+            arm = self._link_target(arm, simulation.ee_frame)
         return torch.cat((arm, others), dim=1)
 
     def arm_setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:
@@ -303,6 +307,28 @@ class Robot(Configured):
         """Positions of the end-effector at an offset [m], within the workspace."""
         position = simulation.ee_position + offset
         return position.clamp(self._lowest, self._highest)
+
+    def _link_target(self, target: Tensor, ee_frame: Sequence[float]) -> Tensor:
+        """Targets of the inverse kinematics for targets of the end-effector.
+
+        The inverse kinematics bring the origin of the URDF's frame of ``ee_link`` to a
+        position, and its inertial frame to an orientation. The end-effector is the
+        inertial frame.
+
+        Args:
+            target: Return value of `arm_setpoint`, (num_envs, 3) or (num_envs, 7).
+            ee_frame: See `VectorSimulation`.
+        """
+        centre, rotation = target.new_tensor(ee_frame).split((3, 4))
+        if not centre.any():  # as in the Panda
+            return target
+        position, orientation = target[:, :3], target[:, 3:]
+        if self.control_type == "ee":
+            orientation = target.new_tensor(self.ee_orientation)
+            orientation = orientation / torch.linalg.vector_norm(orientation)
+        inverse = rotation * rotation.new_tensor((-1.0, -1.0, -1.0, 1.0))
+        offset = rotate(quaternion_product(orientation, inverse), centre)
+        return torch.cat((position - offset, target[:, 3:]), dim=1)
 
     def control(
         self, client: PhysicsClient, body: int, setpoint: npt.NDArray[np.float64]
