@@ -31,6 +31,13 @@ class OwnRobot(Panda):
         return -super().observation(simulation)
 
 
+class OwnStep(RobotTaskEnv):
+    """An environment with a reward of its own."""
+
+    def _step(self, tensordict):
+        return super()._step(tensordict).set("reward", torch.full((N, 1), 7.0))
+
+
 def make(task=None, robot=None):
     robot, task = robot or Panda(block_gripper=True), task or Push()
     return RobotTaskEnv(robot=robot, task=task, num_envs=N, seed=0)
@@ -54,6 +61,12 @@ def test_a_robots_own_setpoint_and_observation_are_used():
     expected = plain["observation"].clone()
     expected[:, :6] *= -1
     assert other["observation"].equal(expected)
+
+
+def test_an_environments_own_step_is_used():
+    with OwnStep(robot=Panda(block_gripper=True), task=Push(), num_envs=N) as env:
+        assert (step(env, 1.0)["reward"] == 7.0).all()
+        assert (env.rollout(2)["next", "reward"] == 7.0).all()
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.04, 1e30])

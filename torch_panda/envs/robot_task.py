@@ -354,7 +354,7 @@ class RobotTaskEnv(EnvBase):
         ):
             return super().step(tensordict)
         # The result has all keys, so skip torchrl's search for missing ones.
-        return tensordict.set("next", self._act(tensordict, None))
+        return tensordict.set("next", self._step(tensordict))
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """Draw the random actions that torchrl would draw, in a fifth of its time.
@@ -576,15 +576,13 @@ class RobotTaskEnv(EnvBase):
     # ---- called by torchrl ---------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        return self._act(tensordict, self._read_mask(tensordict, "_step"))
-
-    def _act(self, tensordict: TensorDictBase, step_mask: Tensor | None) -> TensorDict:
         action = tensordict.get("action", None)
         is_on_cpu = isinstance(action, Tensor) and action.is_cpu
         if isinstance(action, Tensor) and is_on_cpu != (self.device == _CPU):
             raise ValueError(
                 f"the action must be on device {self.device}, got {action.device}"
             )
+        step_mask = self._read_mask(tensordict, "_step")
         return self._emit(self.episodes.step(action, step_mask))
 
     def _reset(  # type: ignore[override]  # other options are refused
