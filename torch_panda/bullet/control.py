@@ -28,7 +28,8 @@ class MotorControl:
     it has one number per joint of the arm: positions [rad], velocities [rad/s] or
     torques [N m], depending on ``arm_mode``. With ``ik_link``, it is the target
     position of that link and, unless ``ik_orientation`` fixes it, its orientation; see
-    `PhysicsClient.inverse_kinematics`. The second part has the positions of all other joints [rad] or [m].
+    `PhysicsClient.inverse_kinematics`. The second part has the positions of all other
+    joints [rad] or [m].
 
     Attributes:
         forces: Maximum force of every joint's motor [N m] or [N]. The torques of
