@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from tests.devices import on_gpu
@@ -43,6 +44,7 @@ def test_default_dtype_and_device_change_nothing():
             td = env.rollout(2, lambda td: td.set("action", torch.ones(3).cpu()))
             exact = env.get_state(exact=True)
             env.reset(exact, set_state=True)
+            assert env.rand_action()["action"].dtype == env.action_spec.dtype
             return td["next"], env.get_state(), exact
 
     expected = observe()
@@ -349,6 +351,12 @@ def test_clients_are_closed_if_an_environment_cannot_be_built(monkeypatch):
     for client in clients:
         with pytest.raises(torch_panda.BulletError, match="closed"):
             client.step(1)
+
+
+def test_a_cpu_may_have_an_index():
+    with torch_panda.make("PandaReach-v1", num_envs=2, device="cpu:0") as env:
+        check_env_specs(env)
+        assert env.rollout(2)["next", "observation"].shape == (2, 2, 6)
 
 
 @on_gpu

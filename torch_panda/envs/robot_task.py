@@ -34,9 +34,6 @@ if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.web_viewer import WebViewer
     from torch_panda.rendering.window import Window
 
-_CPU = torch.device("cpu")
-
-
 class RobotTaskEnv(EnvBase):
     """Goal-conditioned environments of one robot and one task, stepped in parallel.
 
@@ -364,7 +361,8 @@ class RobotTaskEnv(EnvBase):
         """
         if tensordict is None:
             tensordict = TensorDict({}, self.batch_size, device=self.device)
-        action = torch.rand(self.action_spec.shape, device=self.device) * 2 - 1
+        spec = self.action_spec
+        action = torch.rand(spec.shape, dtype=spec.dtype, device=self.device) * 2 - 1
         return tensordict.set("action", action)
 
     def set_env_seed(self, env: int, seed: int) -> None:
@@ -578,7 +576,7 @@ class RobotTaskEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict.get("action", None)
         is_on_cpu = isinstance(action, Tensor) and action.is_cpu
-        if isinstance(action, Tensor) and is_on_cpu != (self.device == _CPU):
+        if isinstance(action, Tensor) and is_on_cpu != (self.device.type == "cpu"):
             raise ValueError(
                 f"the action must be on device {self.device}, got {action.device}"
             )
@@ -694,7 +692,7 @@ class RobotTaskEnv(EnvBase):
             values.pop("observation", None)
         if self.num_envs is None:
             values = {key: value.squeeze(0) for key, value in values.items()}
-        if self.device != _CPU:
+        if self.device.type != "cpu":
             values = {key: value.to(self.device) for key, value in values.items()}
         # torchrl also makes its tensordicts by this private function. The public
         # constructor would take ten times as long, because of its checks.
