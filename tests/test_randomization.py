@@ -161,6 +161,52 @@ def test_damping_slows_a_falling_arm_down():
     assert 0 < speeds[1] < 0.9 * speeds[0]
 
 
+class DampedPanda(torch_panda.Panda):
+    """A Panda whose `build` sets the damping of its joints."""
+
+    def build(self, client):
+        body = super().build(client)
+        for joint in client.joints(body):
+            client.set_dynamics(body, joint.number, joint_damping=0.5)
+        return body
+
+
+class MoonReach(torch_panda.Reach):
+    """`build` sets gravity, and adds a box that moves and is not among the objects."""
+
+    def build(self, client):
+        self.box = client.create_box((0.1,) * 3, mass=1.0, position=(0.5, 0, 1))
+        client.set_gravity(-1.62)
+        return super().build(client)
+
+
+def test_physics_that_build_sets_are_the_nominal_ones():
+    """Factors of 1 keep them."""
+    ends = []
+    for ranges in ((), ("gravity", "joint_damping")):
+        randomize = Randomization(**dict.fromkeys(ranges, (1.0, 1.0)))
+        robot, task = DampedPanda(control_type="joint_torque"), MoonReach()
+        with RobotTaskEnv(robot=robot, task=task, randomize=randomize, seed=0) as env:
+            td = env.reset()
+            for _ in range(4):
+                td = env.step(td.set("action", torch.zeros(8)))["next"]
+            ends.append(td["observation"])
+            (client,) = env.episodes.simulation.clients
+            speed = client.state(task.box).base_velocity[2]
+    assert torch.equal(*ends)
+    assert speed == pytest.approx(-1.62 * 0.16, rel=0.01)
+
+
+def test_only_fixed_bodies_count_as_tables():
+    task = MoonReach()
+    randomize = Randomization(table_friction=(0.1, 0.1), object_restitution=(0.5, 0.5))
+    with RobotTaskEnv(robot=torch_panda.Panda(), task=task, randomize=randomize) as env:
+        env.reset()
+        (client,) = env.episodes.simulation.clients
+        assert client.friction(task.box) == 0.5
+        assert client.restitution(task.box) == 0.0
+
+
 def test_masses_change_and_a_state_can_set_them():
     with make(Randomization(object_mass=(0.5, 2.0))) as env:
         env.reset()

@@ -46,7 +46,7 @@ VELOCITY_GAIN = 1.0
 
 
 class Joint(NamedTuple):
-    """A joint of a body, as its URDF describes it.
+    """A joint of a body, as its URDF describes it, but with its present damping.
 
     Attributes:
         number: Index of the joint, and of the link that it moves.
@@ -87,6 +87,7 @@ class PhysicsClient:
     Attributes:
         connection: The connection to Bullet, for commands that this class lacks.
         struct: The struct through which C code uses the client; see `Loop`.
+        gravity: Gravity along the world's z axis [m/s^2]; see `set_gravity`.
     """
 
     def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
@@ -97,7 +98,10 @@ class PhysicsClient:
         self.connection = connect()
         self.struct = structs.Client(handle=self.connection.handle)
         self._physics = physics
+        self.gravity = physics.gravity
         self._bodies: list[int] = []
+        # Damping that was set, by body and joint: Bullet does not report it.
+        self._joint_damping: dict[tuple[int, int], float] = {}
         self._blueprint: list[Command] = []
         self._is_recording = True
         try:
@@ -332,7 +336,7 @@ class PhysicsClient:
                 number=index,
                 name=info.joint_name.decode(),
                 is_movable=info.u_size == 1,
-                damping=info.damping,
+                damping=self._joint_damping.get((body, index), info.damping),
                 lower_limit=info.lower_limit,
                 upper_limit=info.upper_limit,
             )
@@ -448,6 +452,8 @@ class PhysicsClient:
         self.connection.submit(
             command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
         )
+        if joint_damping is not None:
+            self._joint_damping[body, link] = joint_damping
         self._record(SetPhysics("set_dynamics", (body, link, *numbers.values())))
 
     def set_joint_friction(self, body: int, joint: int, force: float) -> None:
@@ -558,6 +564,7 @@ class PhysicsClient:
         command = capi.physics_init(self.connection.handle)
         capi.physics_set_gravity(command, 0.0, 0.0, gravity)
         self._run(command, "set gravity")
+        self.gravity = gravity
         self._record(SetPhysics("set_gravity", (gravity,)))
 
     def save(self) -> int:

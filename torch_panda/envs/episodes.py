@@ -162,9 +162,7 @@ class Episodes:
         try:
             _raise_problems(find_problems(robot, task, simulation, self.goal_indices))
             self.renderer = VectorRenderer(simulation, renderer=renderer)
-            self._randomizer = DomainRandomizer(
-                randomize, robot, task, simulation, self.physics
-            )
+            self._randomizer = DomainRandomizer(randomize, robot, task, simulation)
             self.goal = torch.zeros(n, task.goal_dim, dtype=torch.float64, device="cpu")
             self.step_count = torch.zeros(n, 1, dtype=torch.int64, device="cpu")
             self.goal_dim = task.goal_dim

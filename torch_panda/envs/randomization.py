@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_panda.bullet import PhysicsClient, PhysicsParams, Scene, VectorSimulation
+from torch_panda.bullet import PhysicsClient, Scene, VectorSimulation
 from torch_panda.checks import check_not_negative, check_range, check_rows
 from torch_panda.robots import Robot
 from torch_panda.sensors import Entry
@@ -130,7 +130,6 @@ class PhysicsFactors:
         client: A client whose physics still have their nominal values.
         scene: The scene that all clients hold.
         finger_links: The robot's ``finger_links``.
-        physics: The integration parameters of the clients.
     """
 
     def __init__(
@@ -139,10 +138,13 @@ class PhysicsFactors:
         client: PhysicsClient,
         scene: Scene,
         finger_links: Sequence[int],
-        physics: PhysicsParams,
     ) -> None:
-        movable = {scene.robot, *scene.objects, *scene.markers}
-        fixed = [(body, -1) for body in client.bodies if body not in movable]
+        listed = {scene.robot, *scene.objects, *scene.markers}
+        fixed = [
+            (body, -1)
+            for body in client.bodies
+            if body not in listed and client.mass(body) == 0
+        ]
         objects = [
             (body, link)
             for body in scene.objects
@@ -166,7 +168,7 @@ class PhysicsFactors:
         self._changes: dict[tuple[int, int], list[tuple[str, int, float]]] = {}
         for index, name in enumerate(names):
             if name == "gravity":
-                self._gravity = (index, physics.gravity)
+                self._gravity = (index, client.gravity)
                 continue
             target = targets[name]
             # A nominal value of 0 is replaced by 1 if the drawn number should become
@@ -214,7 +216,6 @@ class DomainRandomizer:
         robot: Robot,
         task: Task,
         simulation: VectorSimulation,
-        physics: PhysicsParams,
     ) -> None:
         self._randomization = randomization or Randomization()
         self._task = task
@@ -241,7 +242,6 @@ class DomainRandomizer:
                 simulation.clients[0],
                 simulation.scene,
                 robot.finger_links,
-                physics,
             )
             self.state[PHYSICS_PARAMETERS] = torch.ones(
                 n, k, dtype=torch.float64, device="cpu"

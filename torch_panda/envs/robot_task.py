@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # imported at their first use; WebViewer needs an extra
     from torch_panda.rendering.web_viewer import WebViewer
     from torch_panda.rendering.window import Window
 
+
 class RobotTaskEnv(EnvBase):
     """Goal-conditioned environments of one robot and one task, stepped in parallel.
 
