@@ -31,14 +31,16 @@ def test_a_rebound_environment_is_gone_at_once(no_collection):
     env.rollout(3)
     env.render(size=8)
     env.get_state(exact=True)
-    clients = list(env.episodes.simulation.clients)
+    connections = [client.connection for client in env.episodes.simulation.clients]
     for renderers in env.episodes.renderer._idle.values():
-        clients += [renderer._solids._connection for renderer in renderers]
-    assert len(clients) > 2
+        connections += [renderer._solids._connection for renderer in renderers]
+    assert len(connections) > 2
     reference = weakref.ref(env)
     env = None
     assert reference() is None
-    assert all(client.is_closed for client in clients)
+    for connection in connections:
+        with pytest.raises(torch_panda.BulletError, match="closed"):
+            _ = connection.handle
 
 
 class PushHarder(torch_panda.RobotTaskEnv):

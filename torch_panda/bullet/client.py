@@ -137,11 +137,6 @@ class PhysicsClient:
         capi.physics_set_residual_threshold(command, physics.residual_threshold)
         self._run(command, "set parameters")
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether the client was closed."""
-        return self.connection.is_closed
-
     def close(self) -> None:
         """Free the world. Closing again does nothing."""
         self.struct.handle = None
@@ -568,28 +563,15 @@ class PhysicsClient:
         self._record(SetPhysics("set_gravity", (gravity,)))
 
     def save(self) -> int:
-        """Take a snapshot of all poses and velocities, for `load`; return its id."""
+        """Take a snapshot of all poses and velocities, and return its id.
+
+        The C code of resets loads it; see ``broad_phase.py``.
+        """
         command = capi.save_init(self.connection.handle)
         status = self.connection.submit(
             command, capi.CMD_SAVE_STATE_COMPLETED, "save a state"
         )
         return int(capi.status_snapshot(status))
-
-    def load(self, snapshot: int) -> None:
-        """Restore a snapshot.
-
-        Load only snapshots that were taken without contacts. To restore contacts,
-        Bullet would run a collision detection, which changes its broad phase and is
-        not counted in ``num_detections``.
-
-        Unlike `set_base`, this does not update the bodies' AABBs in Bullet's broad
-        phase. The next collision detection updates them.
-        """
-        command = capi.load_init(self.connection.handle)
-        capi.load_set_snapshot(command, snapshot)
-        self.connection.submit(
-            command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state"
-        )
 
     def control_joints(
         self,

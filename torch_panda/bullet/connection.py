@@ -42,11 +42,6 @@ class Connection:
             raise client_closed()
         return self._handle
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether the client was closed."""
-        return self._handle is None
-
     def submit(self, command: int, expected: int, action: str) -> int:
         """Submit a command, release the GIL while Bullet works, and check the answer.
 
