@@ -95,6 +95,29 @@ def test_ctrl_c_in_close_does_not_free_a_client_twice(monkeypatch):
     assert len(freed) == 1
 
 
+@pytest.mark.parametrize(
+    ("method", "arguments", "message"),
+    [
+        ("set_friction", (7,), r"body id must be one of \(0, 1\), got 7"),
+        ("set_dynamics", (1, 7), r"body 1 has 7 links .*got 7"),
+        ("set_joint_friction", (0, 0, 1.0), "body 0 has 0 joints, .*got 0"),
+        ("set_collision_filter", (1, -2, 0, 0), "body 1 has 7 links .*got -2"),
+        ("enable_wrench_sensor", (1, -1), "body 1 has 7 joints, .*got -1"),
+        ("set_joints", (1, (0, 7), (0, 0), (0, 0)), "body 1 has 7 joints, .*got 7"),
+        ("set_base", (-1, (0, 0, 0)), r"body id must be one of \(0, 1\), got -1"),
+        ("mass", (0, 0), "body 0 has 0 links .*got 0"),
+    ],
+)
+def test_bodies_and_links_that_do_not_exist_are_refused(method, arguments, message):
+    with PhysicsClient() as client:
+        client.create_sphere(0.1, mass=1.0, position=(0, 0, 0))
+        client.load_urdf("kuka_iiwa/model.urdf")
+        blueprint = client.blueprint
+        with pytest.raises(ValueError, match=message):
+            getattr(client, method)(*arguments)
+        assert client.blueprint == blueprint
+
+
 def test_a_missing_urdf_is_named():
     with PhysicsClient() as client:
         with pytest.raises(FileNotFoundError, match=r"no_such\.urdf"):

@@ -51,7 +51,7 @@ class Joint(NamedTuple):
     Attributes:
         number: Index of the joint, and of the link that it moves.
         name: Name of the joint.
-        is_movable: Whether the joint has one degree of freedom.
+        num_dofs: Number of its degrees of freedom; 0 if the joint is fixed.
         damping: Damping [N m s/rad] or [N s/m].
         lower_limit: Lowest position [rad] or [m].
         upper_limit: Highest position. It is below ``lower_limit`` if the joint has no
@@ -60,10 +60,15 @@ class Joint(NamedTuple):
 
     number: int
     name: str
-    is_movable: bool
+    num_dofs: int
     damping: float
     lower_limit: float
     upper_limit: float
+
+    @property
+    def is_movable(self) -> bool:
+        """Whether the joint has one degree of freedom."""
+        return self.num_dofs == 1
 
 
 class PhysicsClient:
@@ -99,7 +104,7 @@ class PhysicsClient:
         self.struct = structs.Client(handle=self.connection.handle)
         self._physics = physics
         self.gravity = physics.gravity
-        self._bodies: list[int] = []
+        self._num_joints: dict[int, int] = {}  # by body, in the order of building
         # Damping that was set, by body and joint: Bullet does not report it.
         self._joint_damping: dict[tuple[int, int], float] = {}
         self._blueprint: list[Command] = []
@@ -156,7 +161,7 @@ class PhysicsClient:
     @property
     def bodies(self) -> tuple[int, ...]:
         """Ids of the bodies, in the order in which they were built."""
-        return tuple(self._bodies)
+        return tuple(self._num_joints)
 
     @property
     def blueprint(self) -> Blueprint:
@@ -206,7 +211,7 @@ class PhysicsClient:
             fixed_base=fixed_base,
             flags=capi.URDF_IGNORE_VISUAL_SHAPES,
         )
-        self._bodies.append(body)
+        self._num_joints[body] = capi.joint_count(self.connection.handle, body)
         self._record(LoadURDF(body, file, base_position, rotation, fixed_base))
         return body
 
@@ -296,7 +301,7 @@ class PhysicsClient:
         body = building.create_body(
             self.connection, centre, mass=mass, collision_shape=collision_shape
         )
-        self._bodies.append(body)
+        self._num_joints[body] = 0
         self._record(CreateBody(body, shape, mass, centre, visual, is_marker))
         return body
 
@@ -322,21 +327,42 @@ class PhysicsClient:
 
     def joints(self, body: int) -> list[Joint]:
         """The joints of a body in Bullet's order: depth-first from the base."""
+        self._check_link(body)
         handle = self.connection.handle
         info = capi.JointInfo()
         joints = []
-        for index in range(capi.joint_count(handle, body)):
+        for index in range(self._num_joints[body]):
             capi.joint_info(handle, body, index, byref(info))
             joint = Joint(
                 number=index,
                 name=info.joint_name.decode(),
-                is_movable=info.u_size == 1,
+                num_dofs=info.u_size,
                 damping=self._joint_damping.get((body, index), info.damping),
                 lower_limit=info.lower_limit,
                 upper_limit=info.upper_limit,
             )
             joints.append(joint)
         return joints
+
+    def _check_link(self, body: int, link: int = -1, *, lowest: int = -1) -> None:
+        """Check that a link (-1 is the base) exists, because Bullet ignores others.
+
+        Args:
+            body: Body id.
+            link: Index of the link, or of the joint that moves it.
+            lowest: Lowest valid index; 0 for joints.
+
+        Raises:
+            ValueError: The body or the link does not exist.
+        """
+        count = self._num_joints.get(body)
+        if count is None:
+            raise ValueError(f"a body id must be one of {self.bodies}, got {body}")
+        if not lowest <= link < count:
+            parts = "links besides its base (-1)" if lowest else "joints"
+            raise ValueError(
+                f"body {body} has {count} {parts}, numbered from 0, got {link}"
+            )
 
     def mass(self, body: int, link: int = -1) -> float:
         """Mass of a link (-1 is the base) [kg]; 0 for a base that cannot move."""
@@ -363,6 +389,7 @@ class PhysicsClient:
         return tuple(self._dynamics(body, link).local_inertial_frame)
 
     def _dynamics(self, body: int, link: int) -> capi.DynamicsInfo:
+        self._check_link(body, link)
         command = capi.dynamics_info_init(self.connection.handle, body, link)
         status = self.connection.submit(
             command, capi.CMD_GET_DYNAMICS_INFO_COMPLETED, "report dynamics"
@@ -385,7 +412,8 @@ class PhysicsClient:
         A coefficient that is None stays as it is.
 
         Raises:
-            ValueError: A coefficient is negative or not finite.
+            ValueError: A coefficient is negative or not finite, or the link does not
+                exist.
         """
         self.set_dynamics(
             body,
@@ -429,8 +457,9 @@ class PhysicsClient:
                 [N s/m].
 
         Raises:
-            ValueError: A number is negative or not finite.
+            ValueError: A number is negative or not finite, or the link does not exist.
         """
+        self._check_link(body, link)
         numbers = {
             "mass": mass,
             "lateral_friction": lateral_friction,
@@ -459,8 +488,10 @@ class PhysicsClient:
         500 N m or 500 N at the default substep of 2 ms.
 
         Raises:
-            ValueError: The force is negative or not finite.
+            ValueError: The force is negative or not finite, or the joint does not
+                exist.
         """
+        self._check_link(body, joint, lowest=0)
         check_not_negative(force=force)
         handle, info = self.connection.handle, capi.JointInfo()
         capi.joint_info(handle, body, joint, byref(info))
@@ -483,14 +514,23 @@ class PhysicsClient:
 
         Bullet removes the link from the broad phase and inserts it again, so the link
         loses its present overlaps and contacts.
+
+        Raises:
+            ValueError: The link does not exist.
         """
+        self._check_link(body, link)
         command = capi.filter_init(self.connection.handle)
         capi.filter_set_group_mask(command, body, link, group, mask)
         self._run(command, "set a collision filter")
         self._record(SetCollisionFilter(body, link, group, mask))
 
     def enable_wrench_sensor(self, body: int, joint: int) -> None:
-        """Make Bullet compute the wrench in a joint; see `BodyState.wrenches`."""
+        """Make Bullet compute the wrench in a joint; see `BodyState.wrenches`.
+
+        Raises:
+            ValueError: The joint does not exist.
+        """
+        self._check_link(body, joint, lowest=0)
         handle = self.connection.handle
         command = capi.physics_init(handle)
         capi.physics_set_joint_feedback(command, capi.JOINT_FEEDBACK_IN_JOINT_FRAME)
@@ -515,7 +555,13 @@ class PhysicsClient:
         positions: Sequence[float],
         velocities: Sequence[float],
     ) -> None:
-        """Set the positions and velocities of several joints; see `set_joint`."""
+        """Set the positions and velocities of several joints; see `set_joint`.
+
+        Raises:
+            ValueError: A joint does not exist.
+        """
+        for joint in joints:
+            self._check_link(body, joint, lowest=0)
         building.set_joints(self.connection, body, joints, positions, velocities)
         if self._is_recording:
             self._record(
@@ -540,10 +586,12 @@ class PhysicsClient:
             angular_velocity: Angular velocity [rad/s].
 
         Raises:
-            ValueError: The position is not finite, or the quaternion has no direction.
+            ValueError: The position is not finite, the quaternion has no direction, or
+                the body does not exist.
         """
         centre = check_vector("position", position)
         check_quaternion("orientation", orientation)
+        self._check_link(body)
         building.set_base(
             self.connection,
             body,
