@@ -114,6 +114,48 @@ def test_builders_that_return_nothing_are_refused():
         VectorSimulation(lambda client: None, 1)
 
 
+WRIST = """<robot name="arm"><link name="upper"/><link name="lower"/>
+<joint name="wrist" type="{}"><axis xyz="0 0 1"/><parent link="upper"/>
+<child link="lower"/></joint></robot>"""
+
+
+class OwnBodies(Reach):
+    """Returns the ids that a function of the client returns."""
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def build(self, client):
+        super().build(client)
+        return self.function(client)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "message"),
+    [
+        (Bodies(objects=1), r"objects of .* tuple of ids from \(0, 1, 2, 3\), got 1"),
+        (Bodies(objects=(1, 99)), r"objects of .*got \(1, 99\)"),
+        (Bodies(markers=(4,)), r"markers of .*got \(4,\)"),
+    ],
+)
+def test_bodies_that_do_not_exist_are_refused(bodies, message):
+    with pytest.raises(ValueError, match=message):
+        make(OwnBodies(lambda client: bodies))
+
+
+@pytest.mark.parametrize(("joint_type", "count"), [("spherical", 3), ("planar", 2)])
+def test_objects_with_joints_of_several_degrees_are_refused(
+    tmp_path, joint_type, count
+):
+    path = tmp_path / "wrist.urdf"
+    path.write_text(WRIST.format(joint_type))
+    task = OwnBodies(lambda client: Bodies(objects=(client.load_urdf(path),)))
+    message = f"joint 'wrist' of body 4 must .* one degree of freedom, got {count}"
+    with pytest.raises(ValueError, match=message):
+        make(task)
+
+
 class Changing(Push):
     """Builds another cube every time, under the same body ids."""
 

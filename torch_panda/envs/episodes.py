@@ -3,7 +3,7 @@
 import math
 import secrets
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal, get_args
@@ -738,6 +738,8 @@ def _build_scene(
     Raises:
         TypeError: `Robot.build` does not return a body id, or `Task.build` does not
             return `Bodies`.
+        ValueError: `Bodies` does not hold tuples of body ids, or a joint has several
+            degrees of freedom.
     """
     body = robot.build(client)
     if not isinstance(body, int):
@@ -750,6 +752,12 @@ def _build_scene(
         raise TypeError(
             f"{type(task).__name__}.build must return Bodies, got {bodies!r}"
         )
+    for name, ids in bodies._asdict().items():
+        if not (isinstance(ids, Collection) and {*ids} <= {*client.bodies}):
+            raise ValueError(
+                f"{name} of the Bodies that {type(task).__name__}.build returns must "
+                f"be a tuple of ids from {client.bodies}, got {ids!r}"
+            )
     for sensor in sensors:
         sensor.build(client, body, robot)
     objects = tuple(bodies.objects)
@@ -764,7 +772,14 @@ def _build_scene(
 
 
 def _movable_joints(client: PhysicsClient, body: int) -> tuple[int, ...]:
-    return tuple(joint.number for joint in client.joints(body) if joint.is_movable)
+    joints = client.joints(body)
+    for joint in joints:
+        if joint.num_dofs > 1:
+            raise ValueError(
+                f"joint {joint.name!r} of body {body} must have at most one degree of "
+                f"freedom, got {joint.num_dofs}"
+            )
+    return tuple(joint.number for joint in joints if joint.is_movable)
 
 
 def _raise_problems(problems: Sequence[str]) -> None:
