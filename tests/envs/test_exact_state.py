@@ -125,6 +125,21 @@ def test_a_wrong_exact_state_is_refused(change, message):
         env.rollout(3)
 
 
+def test_an_episode_whose_action_scale_changes_has_no_exact_state():
+    with torch_panda.make("PandaPush-v1", num_envs=2, seed=0) as env:
+        td = env.reset().set("action", torch.ones(2, 3))
+        env.robot.action_scale = 0.03
+        env.step(td.clone())
+        state = env.get_state(exact=True)
+        env.robot.action_scale = 0.04
+        with pytest.raises(torch_panda.BulletError, match=r"from 0.03 to 0.04 .*0, 1"):
+            env.get_state(exact=True)
+        env.reset()
+        env.get_state(exact=True)
+        env.robot.action_scale = 0.03
+        env.reset(state, set_state=True)
+
+
 def test_episodes_without_end_are_forgotten(monkeypatch):
     monkeypatch.setattr(exact_states, "_MAX_STEPS", 10)
     with torch_panda.make("PandaReach-v1", num_envs=2, seed=0) as env:

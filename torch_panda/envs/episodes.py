@@ -329,7 +329,7 @@ class Episodes:
             # If the robot's function raises, no step was taken.
             setpoint = self._setpoint(action)
             self.step_count += 1 if step_mask is None else step_mask
-            self._exact_states.record(action, step_mask)
+            self._exact_states.record(action, step_mask, self.robot.action_scale)
             if diverged := self.simulation.step(self._control, setpoint, envs):
                 ended = [goal[diverged] for goal in self._goals]
                 self._recover(diverged)
@@ -354,7 +354,9 @@ class Episodes:
         with self._guard:
             self._check_all_reset()
             state = {key: value.clone() for key, value in self._state().items()}
-            return {**state, **self._exact_states.export()} if exact else state
+            if exact:
+                state |= self._exact_states.export(self.robot.action_scale)
+            return state
 
     def state_entries(self) -> dict[str, Entry]:
         """Shapes and dtypes of the entries of a state, by key."""
@@ -543,7 +545,7 @@ class Episodes:
 
     def _repeat_step(self, action: Tensor, step_mask: Tensor, last: list[int]) -> None:
         """Repeat a step of an exact state; see `exact_states.TakeStep`."""
-        self._exact_states.record(action, step_mask)
+        self._exact_states.record(action, step_mask, self.robot.action_scale)
         setpoint = self._setpoint(action)
         self.simulation.step(self._control, setpoint, indices(step_mask))
         # Sensors report the present only, so the last step of each environment is

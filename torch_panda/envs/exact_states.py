@@ -93,9 +93,9 @@ class ExactStates:
             (self._start[key].numpy(), value.numpy()) for key, value in state.items()
         ]
         self._action_dim = action_dim
-        # Actions (n, action_dim), and a mask (n, 1) of the environments that took them;
-        # None means all.
-        self._steps: list[tuple[Tensor, Tensor | None]] = []
+        # Actions (n, action_dim); a mask (n, 1) of the environments that took them,
+        # where None means all; and the robot's action_scale.
+        self._steps: list[tuple[Tensor, Tensor | None, float]] = []
         # Index in _steps of the first step of each environment's episode.
         self._first_steps = [0] * len(next(iter(state.values())))
 
@@ -109,13 +109,16 @@ class ExactStates:
         if self._count_unused_steps() > _MAX_UNUSED_STEPS:
             self._delete_unused_steps()
 
-    def record(self, action: Tensor, step_mask: Tensor | None) -> None:
+    def record(
+        self, action: Tensor, step_mask: Tensor | None, action_scale: float
+    ) -> None:
         """Record a step.
 
         Args:
             action: (n, action_dim) float32. The caller must not change it later.
             step_mask: Mask of the environments that take the step, (n, 1) bool; None
                 means all.
+            action_scale: The robot's ``action_scale`` in this step.
         """
         if len(self._steps) == _MAX_STEPS:
             self._delete_unused_steps()
@@ -123,10 +126,14 @@ class ExactStates:
             # Forget the episodes that need the oldest step.
             self._first_steps = [first or _DROPPED for first in self._first_steps]
             self._delete_unused_steps()
-        self._steps.append((action, None if step_mask is None else step_mask.clone()))
+        mask = None if step_mask is None else step_mask.clone()
+        self._steps.append((action, mask, action_scale))
 
-    def export(self) -> dict[str, Tensor]:
+    def export(self, action_scale: float) -> dict[str, Tensor]:
         """The recorded starts and actions.
+
+        Args:
+            action_scale: The robot's present ``action_scale``.
 
         Returns:
             The starts under keys with the prefix ``start_``, ``actions`` (n, k,
@@ -134,7 +141,8 @@ class ExactStates:
             ``num_actions[i]`` actions of environment i, followed by zeros.
 
         Raises:
-            BulletError: An episode is too long for its actions to be kept.
+            BulletError: An episode is too long for its actions to be kept, or has steps
+                with another ``action_scale``.
         """
         first_steps = self._first_steps
         if too_long := [i for i, first in enumerate(first_steps) if first == _DROPPED]:
@@ -150,14 +158,20 @@ class ExactStates:
             (begins <= index)
             if step_mask is None
             else (begins <= index) & step_mask.flatten()
-            for index, (_, step_mask) in enumerate(steps, start=oldest)
+            for index, (_, step_mask, _) in enumerate(steps, start=oldest)
         ]
         counts = torch.zeros(len(begins), dtype=torch.int64, device="cpu")
         longest = int(sum(took_step, start=counts).max())
         shape = (len(begins), longest, self._action_dim)
         actions = torch.zeros(shape, dtype=torch.float32, device="cpu")
-        for (action, _), mask in zip(steps, took_step, strict=True):
+        for (action, _, scale), mask in zip(steps, took_step, strict=True):
             rows = mask.nonzero().flatten()
+            if scale != action_scale and len(rows):
+                raise BulletError(
+                    f"action_scale changed from {scale} to {action_scale} during the "
+                    f"episodes of environments {rows.tolist()}, so their states cannot "
+                    f"be exact: change it between a reset and the first step"
+                )
             actions[rows, counts[rows]] = action[rows]
             counts[rows] += 1
         start = {START + key: value.clone() for key, value in self._start.items()}

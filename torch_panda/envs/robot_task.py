@@ -402,8 +402,9 @@ class RobotTaskEnv(EnvBase):
             ``physics_seed`` (*batch, 1) int64.
 
         Raises:
-            BulletError: The environment is closed or needs a reset, or an episode is
-                too long for an exact state.
+            BulletError: The environment is closed or needs a reset; or an episode is
+                too long for an exact state, or the robot's ``action_scale`` changed
+                during the episode.
         """
         return self._emit(self.episodes.get_state(exact=exact))
 
