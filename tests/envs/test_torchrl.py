@@ -167,6 +167,8 @@ def test_an_observation_named_state_is_no_state():
         again = env.reset(start.clone())
         assert not torch.equal(start["desired_goal"], again["desired_goal"])
         env.reset(start.clone().update(env.get_state()), set_state=True)
+        with pytest.raises(ValueError, match="'state' that Observing or a sensor"):
+            TransformedEnv(env, StateTransform()).reset()
 
 
 def test_a_state_transform_wraps_one_environment():

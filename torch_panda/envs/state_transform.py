@@ -40,8 +40,18 @@ class StateTransform(Transform):
                 env._has_state_transform = True
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the state to the observed entries."""
+        """Add the state to the observed entries.
+
+        Raises:
+            ValueError: The environment already has an entry ``state``.
+        """
         assert isinstance(observation_spec, Composite)
+        env = self._env()
+        if NESTED_STATE in env.episodes.entries:
+            raise ValueError(
+                f"StateTransform would replace the entry {NESTED_STATE!r} that "
+                f"{type(env.task).__name__} or a sensor observes: use another key"
+            )
         observation_spec[NESTED_STATE] = self._state_spec()
         return observation_spec
 
