@@ -1,10 +1,13 @@
 """Divergence is noticed and named, and the environment starts its next episode."""
 
+from typing import ClassVar
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 import torch_panda
+from torch_panda.sensors import Entry, Sensor
 
 
 def make(on_divergence, **options):
@@ -105,6 +108,33 @@ def test_the_transition_that_diverges_keeps_its_goal(goal):
         new = env.reset(following.set("_reset", only_1))
         is_new = (new["desired_goal"] != start["desired_goal"]).any(1)
         assert is_new.tolist() == [False, True, False]
+
+
+class Steps(Sensor):
+    """Counts the steps of each episode."""
+
+    entries: ClassVar = {"steps": Entry((1,), torch.float32)}
+
+    def attach(self, simulation, renderer, robot):
+        self._count = torch.zeros(simulation.num_envs, 1)
+        return self
+
+    def after_reset(self, envs):
+        self._count[list(envs)] = 0
+
+    def after_step(self, envs):
+        self._count[list(envs)] += 1
+
+    def observe(self):
+        return {"steps": self._count.clone()}
+
+
+def test_a_divergence_is_no_step_of_a_sensors_next_episode():
+    with make("reset", sensors=(Steps(),)) as env:
+        env.reset()
+        step(env)
+        blow_up(env, 1, "object")
+        assert step(env)["steps"].flatten().tolist() == [2, 0, 2]
 
 
 def test_a_step_returns_the_stepped_clients_that_diverged():

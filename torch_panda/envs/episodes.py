@@ -330,7 +330,9 @@ class Episodes:
             setpoint = self._setpoint(action)
             self.step_count += 1 if step_mask is None else step_mask
             self._exact_states.record(action, step_mask, self.robot.action_scale)
+            continued = range(self.num_envs) if envs is None else envs
             if diverged := self.simulation.step(self._control, setpoint, envs):
+                continued = [env for env in continued if env not in diverged]
                 ended = [goal[diverged] for goal in self._goals]
                 self._recover(diverged)
                 started = [goal[diverged] for goal in self._goals]
@@ -338,7 +340,7 @@ class Episodes:
                 # ended ones, which the policy pursued.
                 self._set_goals(diverged, ended)
             for sensor in self._sensors:
-                sensor.after_step(range(self.num_envs) if envs is None else envs)
+                sensor.after_step(continued)
             observed = self._observe(action)
             if step_mask is not None:
                 observed["reward"] = observed["reward"] * step_mask
