@@ -94,11 +94,14 @@ class BodyState:
 
         A wrench is a force [N] and a torque [N m]. It acts at the joint between the two
         links and is given in the child link's frame. It is zero unless the joint has a
-        wrench sensor.
+        wrench sensor. A reset keeps the numbers of the last substep before it.
         """
         return _view(self._wrenches, 0, self._num_links, 6)
 
     @property
     def motor_forces(self) -> Doubles:
-        """Torques [N m] or forces [N] of the motors in the last substep (m,)."""
+        """Torques [N m] or forces [N] of the motors in the last substep (m,).
+
+        A reset keeps the numbers of the last substep before it.
+        """
         return _view(self._motor_forces, 0, self._num_links)
