@@ -9,8 +9,10 @@ import torch_panda
 from tests.envs.test_checks import make_kuka
 from tests.pushing import pusher
 from torch_panda import Reach, RobotTaskEnv
+from torch_panda.bullet.pool import WorkerError
 from torch_panda.bullet.urdf import find_urdf
 from torch_panda.rotations import rotate
+from torch_panda.sensors import JointTorque
 
 SENSORS = ("wrist_force_torque", "finger_contact", "joint_torque")
 G = 9.81  # [m/s^2]
@@ -189,6 +191,20 @@ def test_a_partial_reset_keeps_the_torques_of_other_environments():
         td = env.reset(td.clone().set("_reset", mask))
         assert (td["joint_torque"][0] == 0).all()
         assert (td["joint_torque"][1] == before[1]).all()
+
+
+class Scalar(JointTorque):
+    """Returns one number for all joints."""
+
+    def read(self, client, scene, robot):
+        return super().read(client, scene, robot).sum()
+
+
+def test_a_reading_of_a_wrong_shape_is_refused():
+    with torch_panda.make("PandaPush-v1", num_envs=2, sensors=(Scalar(),)) as env:
+        message = r"0: ValueError: Scalar.read must return shape \(9,\), got \(\)"
+        with pytest.raises(WorkerError, match=message):
+            env.rollout(1)
 
 
 def test_sensors_that_a_robot_cannot_have_are_refused():

@@ -158,4 +158,10 @@ class _ForceReading:
     def _read(self, env: int) -> None:
         client, scene = self._simulation.clients[env], self._simulation.scene
         value = self._sensor.read(client, scene, self._robot)
-        self._values[env].numpy()[:] = value
+        row = self._values[env].numpy()
+        if np.shape(value) != row.shape:
+            raise ValueError(
+                f"{type(self._sensor).__name__}.read must return shape {row.shape}, "
+                f"got {np.shape(value)}"
+            )
+        row[:] = value
