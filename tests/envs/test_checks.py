@@ -6,6 +6,7 @@ import torch
 import torch_panda
 from torch_panda import BulletError, Panda, Push, Reach, RobotTaskEnv
 from torch_panda.bullet import VectorSimulation
+from torch_panda.sensors import CameraSensor
 from torch_panda.tasks import Bodies, create_table
 
 
@@ -54,6 +55,18 @@ DEGREES = (0.0, 30.0, 0.0, -90.0, 0.0, 60.0, 0.0)
             "robot must .* class Panda",
         ),
         (make, {"task": Reach(), "robot": Reach()}, TypeError, r"robot .*got Reach\("),
+        (
+            make,
+            {"task": Reach(), "sensors": "joint_state"},
+            TypeError,
+            "sensors must be a tuple .*got 'joint_state'",
+        ),
+        (
+            make,
+            {"task": Reach(), "sensors": (CameraSensor,)},
+            TypeError,
+            "sensors must .*instance of Sensor, got the class CameraSensor",
+        ),
         (make_kuka_env, {"ee_link": 7}, ValueError, "ee_link must be a link .* 0 to 6"),
         (make_kuka_env, {"wrist_joint": 7}, ValueError, "wrist_joint must be a joint"),
         (make_kuka_env, {"wrist_joint": -1}, ValueError, "wrist_joint must be a joint"),

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from torch_panda.arguments import load_class
+from torch_panda.checks import check_instance
 from torch_panda.rendering import Camera
 from torch_panda.rendering.camera import resized
 from torch_panda.robots import Robot
@@ -69,9 +70,17 @@ def resolve_sensors(
 
     Raises:
         ValueError: A name is unknown, or the robot cannot have a sensor.
+        TypeError: An argument has a wrong type.
     """
+    if isinstance(sensors, str) or not isinstance(sensors, Sequence):
+        raise TypeError(
+            f"sensors must be a tuple or list of names or Sensor objects, got "
+            f"{sensors!r}"
+        )
     for sensor in sensors:
-        if isinstance(sensor, str) and sensor not in sensors_of(robot):
+        if not isinstance(sensor, str):
+            check_instance("each of sensors", sensor, Sensor)
+        elif sensor not in sensors_of(robot):
             raise ValueError(
                 f"sensors must be among {sensors_of(robot)} for this robot, or Sensor "
                 f"objects, got {sensor!r}"
