@@ -180,7 +180,9 @@ def test_rotations_agree_with_pybullet():
 @pytest.mark.parametrize("control_type", ["ee", "ee_pose"])
 def test_the_hand_stays_in_the_workspace(control_type):
     box = torch.tensor([[-0.1, -0.05, 0.15], [0.1, 0.05, 0.25]])
-    with make(control_type=control_type, workspace=box.tolist()) as env:
+    workspace = box.double().numpy()
+    with make(control_type=control_type, workspace=workspace) as env:
+        workspace[:] = 0.0  # the robot has a copy
         for direction, corner in zip((-1.0, 1.0), box, strict=True):
             action = torch.zeros(env.action_spec.shape)
             action[:, :3] = direction

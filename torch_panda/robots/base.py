@@ -168,7 +168,7 @@ class Robot(Configured):
         self.base_position = check_vector("base_position", base_position)
         self.base_orientation = tuple(map(float, base_orientation))
         try:
-            box = np.asarray(workspace, dtype=np.float64)
+            box = np.array(workspace, dtype=np.float64)
         except (TypeError, ValueError):  # no numbers, or corners of different sizes
             box = np.empty(0)
         if box.shape != (2, 3) or not (box[0] <= box[1]).all():
