@@ -179,3 +179,6 @@ def test_a_gripper_or_tool_that_does_not_fit_is_refused(file):
     robot.tool = Tool("wrist", (0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="a tool must be fixed to one of"):
         RobotTaskEnv(robot=robot, task=Reach())
+    file.write_text(GANTRY.replace("left", "tool"))
+    with pytest.raises(ValueError, match="already has a link named 'tool'"):
+        RobotTaskEnv(robot=make_gantry(file), task=Reach())

@@ -264,14 +264,21 @@ def urdf_with_tool(file: str, tool: Tool) -> str:
     be another one, because Bullet's order is depth-first.
 
     Raises:
-        ValueError: The URDF has no link of the name to which the tool is fixed, or the
-            tool's position is not finite.
+        ValueError: The URDF has no link of the name to which the tool is fixed, or
+            already has a link or joint named "tool"; or the tool's position is not
+            finite.
     """
     source = Path(file).absolute()
     robot = parse_urdf(source)
     links = [link.get("name") for link in robot.findall("link")]
     if tool.link not in links:
         raise ValueError(f"a tool must be fixed to one of {links}, got {tool.link!r}")
+    for element in (*robot.findall("link"), *robot.findall("joint")):
+        if element.get("name") == "tool":
+            raise ValueError(
+                f"{file} already has a {element.tag} named 'tool', so it cannot get a "
+                f"Tool: rename the {element.tag}"
+            )
     for mesh in robot.iter("mesh"):
         if (path := find_mesh(mesh.get("filename", ""), source)) is not None:
             mesh.set("filename", str(path))
