@@ -222,8 +222,12 @@ class TwoObjects(Push):
 
 
 def test_a_task_of_another_form_says_where_its_objects_are():
-    with (
-        RobotTaskEnv(robot=Panda(), task=TwoObjects(), goal="observation") as env,
-        pytest.raises(NotImplementedError, match=r"TwoObjects\.objects_at_goal"),
-    ):
-        env.reset()
+    with pytest.raises(ValueError, match=r"needs TwoObjects\.objects_at_goal"):
+        RobotTaskEnv(robot=Panda(), task=TwoObjects(), goal="observation")
+
+
+def test_goal_entries_of_an_unknown_part_are_refused():
+    entries = GoalEntries("objects", (0, 1, 2))
+    task = type("Wrong", (Push,), {"goal_entries": entries})()
+    with pytest.raises(ValueError, match=r"part of goal_entries must be .*'objects'"):
+        RobotTaskEnv(robot=Panda(), task=task)

@@ -13,6 +13,7 @@ from torch_panda.bullet import (
     SimulationState,
     VectorSimulation,
 )
+from torch_panda.checks import check_choice
 from torch_panda.robots import Robot
 from torch_panda.rotations import euler_angles
 from torch_panda.tasks import Task
@@ -27,10 +28,14 @@ def find_goal_indices(robot: Robot, task: Task) -> tuple[int, ...] | None:
     Returns:
         ``goal_dim`` columns. None if the task does not declare ``goal_entries``, or if
         a subclass overrides a function that the declaration describes.
+
+    Raises:
+        ValueError: The part of ``goal_entries`` is neither "robot" nor "task".
     """
     entries = task.goal_entries
     if entries is None or not _is_up_to_date(task):
         return None
+    check_choice("part of goal_entries", entries.part, ("robot", "task"))
     if entries.part == "robot" and type(robot).observation is not Robot.observation:
         return None
     offset = robot.observation_dim if entries.part == "task" else 0
@@ -93,6 +98,9 @@ class GoalObserver:
     The functions of robot and task observe these states as a second simulation, which
     shares the clients of the first one, but not its tensors.
 
+    Raises:
+        ValueError: The task needs an `Task.objects_at_goal` of its own.
+
     Attributes:
         desired: Observations of the present episodes' goals, (n, observation_dim)
             float32.
@@ -111,6 +119,12 @@ class GoalObserver:
         self._at_goal = simulation.with_state(
             SimulationState(simulation.scene, simulation.num_envs)
         )
+        start = ObjectState(simulation.object_pose, simulation.object_joint_position)
+        goal = start.pose.new_zeros(simulation.num_envs, task.goal_dim)
+        try:
+            task.objects_at_goal(goal, start)
+        except NotImplementedError as error:
+            raise ValueError(str(error)) from None
         self._goal_indices = list(goal_indices)
         self._hand_pose = _neutral_hand_pose(robot, build_scene, physics)
         size = robot.observation_dim + task.observation_dim
