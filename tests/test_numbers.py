@@ -63,9 +63,9 @@ def test_numbers_of_other_libraries_are_accepted(number):
     [
         (Panda, "action_scale", (math.nan, -0.1, 0.0, "0.1")),
         (Panda, "fingers_width", (*NOT_NEGATIVE, 0.1)),
-        (Panda, "finger_friction", NOT_NEGATIVE),
+        (Panda, "finger_friction", (math.nan, -0.1, "0.1")),
         (Panda, "finger_spinning_friction", (math.nan, -0.1, "0.1")),
-        (XArm6Gripper, "finger_friction", NOT_NEGATIVE),
+        (XArm6Gripper, "finger_friction", (math.nan, -0.1, "0.1")),
         (Panda, "base_position", ((0, 0), (0, 0, math.nan), ("0", 0, 0), 0.0)),
         (Panda, "workspace", (((0, 0, math.nan), (1, 1, 1)), ((0, 0, 0), (1, 1)))),
     ],

@@ -6,6 +6,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from torch_panda import Gripper, PickAndPlace, Reach, Robot, RobotTaskEnv
+from torch_panda.bullet import PhysicsClient
 from torch_panda.robots import Tool
 
 FINGER = (
@@ -163,6 +164,17 @@ def test_shipped_robots_reach(env_id):
             error = td["desired_goal"] - td["achieved_goal"]
             td = env.step(td.set("action", error * 10))["next"]
         assert td["success"].all()
+
+
+@pytest.mark.parametrize(("friction", "expected"), [(None, 0.5), (2.0, 2.0)])
+def test_the_friction_of_the_fingers_is_that_of_the_robot(file, friction, expected):
+    with PhysicsClient() as client:
+        body = make_gantry(file, finger_friction=friction).build(client)
+        assert [client.friction(body, link) for link in (3, 4, 5)] == [
+            0.5,
+            expected,
+            expected,
+        ]
 
 
 def test_a_gripper_or_tool_that_does_not_fit_is_refused(file):

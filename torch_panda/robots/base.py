@@ -93,6 +93,7 @@ class Robot(Configured):
             "wrist_force_torque"; None means that the robot cannot have this sensor.
         finger_links: Indices of the links of the fingers, for the sensor
             "finger_contact".
+        finger_friction: Lateral friction of ``finger_links``; None means the URDF's.
 
     Once an environment was built, only ``action_scale`` may change.
 
@@ -122,7 +123,10 @@ class Robot(Configured):
         tool: Tool | None = None,
         wrist_joint: int | None = None,
         finger_links: Sequence[int] = (),
+        finger_friction: float | None = None,
     ) -> None:
+        if finger_friction is not None:
+            check_not_negative(finger_friction=finger_friction)
         check_choice("control_type", control_type, get_args(ControlType))
         if len(neutral_joint_position) != len(effort_limits):
             raise ValueError(
@@ -182,6 +186,7 @@ class Robot(Configured):
         self.tool = tool
         self.wrist_joint = wrist_joint
         self.finger_links = tuple(finger_links)
+        self.finger_friction = finger_friction
 
     def check_arguments(self) -> None:
         """Check the argument that may change; see `Configured.check_arguments`."""
@@ -204,7 +209,7 @@ class Robot(Configured):
         return self.gripper is not None and not self.block_gripper
 
     def build(self, client: PhysicsClient) -> int:
-        """Load the robot into a client and return its body id.
+        """Load the robot into a client, set its friction, and return its body id.
 
         Raises:
             FileNotFoundError: The URDF does not exist.
@@ -249,6 +254,9 @@ class Robot(Configured):
                         f"{name} must be a {part} of {self.urdf}, 0 to "
                         f"{len(joints) - 1}, got {index}"
                     )
+        if self.finger_friction is not None:
+            for link in self.finger_links:
+                client.set_friction(body, link, lateral=self.finger_friction)
         return body
 
     def setpoint(self, action: Tensor, simulation: VectorSimulation) -> Tensor:

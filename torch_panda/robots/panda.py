@@ -24,7 +24,7 @@ class Panda(Robot):
 
     Args:
         fingers_width: Distance between the fingers at the start of an episode [m].
-        finger_friction: Lateral friction of the fingers.
+        finger_friction: Lateral friction of the fingers; None means the URDF's.
         finger_spinning_friction: Spinning friction of the fingers; None means the
             URDF's 0.1.
 
@@ -42,10 +42,10 @@ class Panda(Robot):
         base_orientation: Sequence[float] = NO_ROTATION,
         workspace: Workspace = ABOVE_THE_TABLE,
         fingers_width: float = 0.0,
-        finger_friction: float = 1.0,
+        finger_friction: float | None = 1.0,
         finger_spinning_friction: float | None = None,
     ) -> None:
-        check_not_negative(fingers_width=fingers_width, finger_friction=finger_friction)
+        check_not_negative(fingers_width=fingers_width)
         if finger_spinning_friction is not None:
             check_not_negative(finger_spinning_friction=finger_spinning_friction)
         if fingers_width > GRIPPER.width:
@@ -69,19 +69,15 @@ class Panda(Robot):
             workspace=workspace,
             wrist_joint=WRIST_JOINT,
             finger_links=FINGER_LINKS,
+            finger_friction=finger_friction,
         )
         self._fingers_width = fingers_width
-        self.finger_friction = finger_friction
         self.finger_spinning_friction = finger_spinning_friction
 
     def build(self, client: PhysicsClient) -> int:
         """Load the robot and set the friction of its fingers."""
         body = super().build(client)
-        for link in FINGER_LINKS:
-            client.set_friction(
-                body,
-                link,
-                lateral=self.finger_friction,
-                spinning=self.finger_spinning_friction,
-            )
+        if self.finger_spinning_friction is not None:
+            for link in FINGER_LINKS:
+                client.set_friction(body, link, spinning=self.finger_spinning_friction)
         return body

@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 
-from torch_panda.bullet import PhysicsClient
 from torch_panda.bullet.urdf import Tool
-from torch_panda.checks import check_not_negative
 from torch_panda.robots.base import ABOVE_THE_TABLE, ControlType, Robot, Workspace
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import NO_ROTATION
@@ -58,8 +56,7 @@ class XArm6(Robot):
 class XArm6Gripper(Robot):
     """The xArm 6 with its gripper: 6 joints of the arm and 6 of the fingers.
 
-    ``finger_friction`` is the lateral friction of the fingers. `Robot` explains the
-    other arguments.
+    `Robot` explains the arguments.
     """
 
     def __init__(
@@ -71,9 +68,8 @@ class XArm6Gripper(Robot):
         base_position: Sequence[float] = BASE_POSITION,
         base_orientation: Sequence[float] = NO_ROTATION,
         workspace: Workspace = ABOVE_THE_TABLE,
-        finger_friction: float = 1.0,
+        finger_friction: float | None = 1.0,
     ) -> None:
-        check_not_negative(finger_friction=finger_friction)
         super().__init__(
             urdf="xarm/xarm6_with_gripper.urdf",
             neutral_joint_position=(*NEUTRAL_ARM_WITH_GRIPPER, *GRIPPER.closed),
@@ -88,12 +84,5 @@ class XArm6Gripper(Robot):
             workspace=workspace,
             tool=TOOL,
             finger_links=FINGER_LINKS,
+            finger_friction=finger_friction,
         )
-        self.finger_friction = finger_friction
-
-    def build(self, client: PhysicsClient) -> int:
-        """Load the robot and set the friction of its fingers."""
-        body = super().build(client)
-        for link in FINGER_LINKS:
-            client.set_friction(body, link, lateral=self.finger_friction)
-        return body
