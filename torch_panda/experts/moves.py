@@ -13,7 +13,6 @@ from torch_panda.rotations import dot
 GAIN = 0.8 / 0.05  # action per metre of offset; a step covers 0.8 of the offset
 GRIPPER = 0.2  # distance by which an action of 1 opens the fingers [m]
 OPEN = 0.075  # distance between the fingers before a grasp [m]
-CUBE = 0.04  # edge length of a cube [m]
 # Deceleration of a cube that slides on the table of -v3 [m/s^2]: the friction of a
 # contact is the product of the frictions of cube and table, 0.5 * 0.5. In Stack-v1 it
 # is 5 * 0.1, so cubes stop sooner.

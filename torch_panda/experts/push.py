@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from torch_panda.experts.moves import CUBE, go_over, norm, push_to
+from torch_panda.experts.moves import go_over, norm, push_to
+from torch_panda.tasks.table import CUBE_SIZE
 
 ON_TOP = 0.01  # height of the pressing end-effector above the cube's top [m]
 
@@ -14,8 +15,8 @@ def drag(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Te
     This is for the slippery table of -v1, on which a pushed cube would slide too far.
     """
     ee, cube = observation[..., :3], achieved_goal
-    sideways, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE / 2 + ON_TOP
-    is_pressing = (norm(sideways) < CUBE / 2) & (ee[..., 2:] < top + 0.004)
+    sideways, top = (cube - ee)[..., :2], cube[..., 2:] + CUBE_SIZE / 2 + ON_TOP
+    is_pressing = (norm(sideways) < CUBE_SIZE / 2) & (ee[..., 2:] < top + 0.004)
     step = 0.6 * (desired_goal - cube)[..., :2]
     step = step / (norm(step) / 0.02).clamp(min=1.0)
     drag_action = torch.cat((step, torch.full_like(top, -0.01)), -1) / 0.05

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from torch_panda.experts.moves import CUBE, carry, is_held, norm, push_to
+from torch_panda.experts.moves import carry, is_held, norm, push_to
+from torch_panda.tasks.table import CUBE_SIZE
 
 
 def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
@@ -16,7 +17,7 @@ def act(observation: Tensor, achieved_goal: Tensor, desired_goal: Tensor) -> Ten
     lower, upper = achieved_goal.split(3, -1)
     lower_speed, upper_speed = (norm(observation[..., k : k + 3]) for k in (13, 25))
     lower_held, upper_held = is_held(ee, width, lower), is_held(ee, width, upper)
-    goal, top = desired_goal[..., :3], lower + lower.new_tensor((0.0, 0.0, CUBE))
+    goal, top = desired_goal[..., :3], lower + lower.new_tensor((0.0, 0.0, CUBE_SIZE))
 
     def arrived(error: Tensor, speed: Tensor, held: Tensor, tolerance: float) -> Tensor:
         return torch.where(held, (error < 0.01) & (speed < 0.1), error < tolerance)
