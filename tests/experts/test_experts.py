@@ -90,9 +90,11 @@ def test_a_single_environment_has_no_batch_dimension():
         ("PandaPushJoints-v1", "^no expert for 'PandaPushJoints-v1': .* Reach, Push"),
         ("KukaReach-v1", "^no expert for 'KukaReach-v1': "),
         ("PandaFly-v1", "unknown environment id 'PandaFly-v1'"),
+        ("FreePush-v0", "with block_gripper=True at Reach, Push, .*=False at PickAnd"),
     ],
 )
 def test_ids_without_an_expert_are_refused(env_id, message):
+    torch_panda.register("FreePush-v0", robot=torch_panda.Panda, task=torch_panda.Push)
     with pytest.raises(ValueError, match=message):
         experts.make_expert(env_id)
 

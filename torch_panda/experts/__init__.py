@@ -78,8 +78,9 @@ def make_expert(env_id: str) -> TensorDictModule:
     """Make the scripted expert for an id.
 
     Args:
-        env_id: Id of a Panda with end-effector control at one of the shipped tasks. The
-            expert expects the default ``action_scale`` of 0.05 m.
+        env_id: Id of a Panda with end-effector control at one of the shipped tasks. Its
+            gripper must be blocked unless the expert uses it. The expert expects the
+            default ``action_scale`` of 0.05 m.
 
     Returns:
         A module from ``observation``, ``achieved_goal`` and ``desired_goal`` to
@@ -91,10 +92,14 @@ def make_expert(env_id: str) -> TensorDictModule:
     registration = find_registration(env_id)
     act = find_expert(registration.make_robot(), registration.make_task())
     if act is None:
-        names = ", ".join(task.__name__ for task in EXPERTS)
+        blocked, free = (
+            ", ".join(t.__name__ for t, x in EXPERTS.items() if x.uses_fingers == uses)
+            for uses in (False, True)
+        )
         raise ValueError(
             f"no expert for {env_id!r}: there are experts for the Panda with "
-            f"end-effector control at {names}"
+            f"end-effector control, with block_gripper=True at {blocked}, and with "
+            f"block_gripper=False at {free}"
         )
 
     def act_within_limits(*observed: Tensor) -> Tensor:
