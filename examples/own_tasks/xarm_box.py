@@ -1,4 +1,4 @@
-"""Push a box with an arm that is not the Panda.
+"""Push a box with arms that are not the Panda.
 
 python -m torch_panda train --import examples/own_tasks/xarm_box.py --env-id XArmBox-v0
 """
@@ -10,7 +10,7 @@ from torch import Tensor
 
 import torch_panda
 from torch_panda.bullet import Box, PhysicsClient, VectorSimulation
-from torch_panda.robots import XArm6
+from torch_panda.robots import Kuka, XArm6
 from torch_panda.tasks import Bodies, create_table, object_observation
 
 HALF_EXTENTS = (0.03, 0.05, 0.03)  # [m]
@@ -47,3 +47,4 @@ class PushBox(torch_panda.Task):
 
 
 torch_panda.register("XArmBox-v0", robot=XArm6, task=PushBox)
+torch_panda.register("KukaBox-v0", robot=Kuka, task=PushBox)

@@ -121,6 +121,7 @@ def test_the_arm_of_own_task_moves_the_balls():
         ("two_cubes", "TwoCubes-v0", 2),
         ("lever", "Lever-v0", 1),
         ("xarm_box", "XArmBox-v0", 1),
+        ("xarm_box", "KukaBox-v0", 1),
     ],
 )
 def test_the_layout_of_each_own_task_is_found(name, env_id, num_objects):
