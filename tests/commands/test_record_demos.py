@@ -31,6 +31,19 @@ def test_the_saved_action_is_the_one_without_noise(tmp_path):
     assert ((moved / 0.05 - saved)[10:50].abs() > 0.3).any()
 
 
+def test_the_seed_determines_the_noise(tmp_path):
+    # The hand and the goal are always at the same place, so only the noise is random.
+    files = []
+    for index, seed in enumerate((0, 0, 1)):
+        args = record_demos.Args("PandaReach-v1", 2, seed, noise_eps=0.3)
+        args.task_options = {"goal_range": 0.0}
+        args.out = tmp_path / f"{index}.pt"
+        record_demos.main(args)
+        files.append(torch.load(args.out)["next"]["observation"])
+    assert torch.equal(files[0], files[1])
+    assert not torch.equal(files[0][0], files[2][0])
+
+
 def test_options_of_the_task_can_be_changed(capsys):
     args = record_demos.Args("PandaReach-v1", 4, num_envs=4)
     for threshold, success in ((0.5, "100.0%"), (1e-9, "  0.0%")):

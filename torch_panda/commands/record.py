@@ -59,7 +59,8 @@ class Args:
     episodes: Positive | None = None
     """number of demonstrations (kind "expert"); None means 200"""
     seed: Seed = 0
-    """seed of the environments (kind "expert"), or of the generated data"""
+    """seed of the environments and the noise (kind "expert"), or of the generated
+    data"""
     num_envs: Positive = 32
     """number of environments stepped in parallel"""
     num_threads: Positive | None = None
@@ -192,6 +193,7 @@ def record_demonstrations(args: Args) -> None:
         TypeError: The task does not have one of the ``task_options``.
         OSError: The data cannot be written.
     """
+    torch.manual_seed(args.seed)  # the noise uses torch's generator
     expert: TensorDictModuleBase = make_expert(args.env_id)
     episodes = args.episodes or EPISODES
     env = torch_panda.make(
