@@ -18,8 +18,9 @@ from torch_panda.rendering.visual_client import VisualClient
 
 BACKGROUND = -1  # body id in a segmentation
 
-# Smallest cells in which merging the vertices of a mesh saves time [m].
-_FINEST_CELL = 0.004
+# Mesh cells of renderers [m]. They are few, because each has copies of the scene. Finer
+# ones would not save time.
+_MESH_CELLS = (0.004, 0.006, 0.009, 0.0125, 0.025, 0.05)
 
 
 class Frames(NamedTuple):
@@ -56,8 +57,8 @@ class VectorRenderer:
     """Renders the environments of a simulation in parallel.
 
     Each thread uses an `EnvRenderer` of its own. The first picture builds the renderers
-    that it needs. For small pictures, the robot's meshes are coarsened to cells of half
-    a pixel (see `mesh_cell`).
+    that it needs. For small pictures, the robot's meshes are coarsened to cells of at
+    most half a pixel (see `mesh_cell`).
 
     Args:
         simulation: The simulation whose environments are rendered. Its threads also
@@ -240,13 +241,11 @@ def blend(
 def mesh_cell(camera: Camera) -> float:
     """Mesh cell that suits a camera's pictures [m].
 
-    It is half the size of a pixel at the camera's target, rounded to millimetres. Cells
-    below `_FINEST_CELL` would not save time. The result is then 0, which renders all
-    details.
+    It is the largest of `_MESH_CELLS` that is at most half the size of a pixel at the
+    camera's target. If there is none, the result is 0, which renders all details.
     """
     pixel = 2 * camera.distance * math.tan(math.radians(camera.fov) / 2) / camera.height
-    cell = round(pixel / 2, 3)
-    return cell if cell >= _FINEST_CELL else 0.0
+    return max((cell for cell in _MESH_CELLS if cell <= pixel / 2), default=0.0)
 
 
 def segmentation_ids(simulation: VectorSimulation) -> dict[str, int]:
