@@ -174,3 +174,12 @@ def test_attributes_of_panda_gym_are_refused_with_their_replacement(adapters, na
         with pytest.raises(AttributeError, match=r"no attribute 'wings'$"):
             _ = env.unwrapped.wings
         assert env.unwrapped.torch_env.task.reward_type == "sparse"
+
+
+@pytest.mark.parametrize("name", ["distance_threshold", "reward_type", "block_gripper"])
+def test_options_of_the_task_and_the_robot_are_refused(adapters, name):
+    for env in adapters:
+        with pytest.raises(AttributeError, match=f"{name} is an option of the"):
+            setattr(env.unwrapped, name, 0.5)
+    with pytest.raises(AttributeError, match=f"{name} is an option of the"):
+        adapters[-1].set_attr(name, 0.5)

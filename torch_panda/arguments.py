@@ -239,6 +239,25 @@ def argument_names(owner: type) -> list[str]:
     return names
 
 
+def check_no_option(name: str, path: str, **parts: Configured) -> None:
+    """Refuse to set an option of a part on the environment, where it has no effect.
+
+    Args:
+        name: Name of the attribute to set.
+        path: Expression for the environment that has the parts, for the error.
+        **parts: Parts of the environment, by name.
+
+    Raises:
+        AttributeError: The attribute is an option of a part.
+    """
+    for part, owner in parts.items():
+        if name in argument_names(type(owner)):
+            raise AttributeError(
+                f"{name} is an option of the {part}, not of the environment: see "
+                f"{path}.{part}.{name}"
+            )
+
+
 def _own_arguments(owner: type) -> list[str]:
     """Names of the arguments of the ``__init__`` that a class itself defines."""
     parameters = inspect.signature(vars(owner)["__init__"]).parameters

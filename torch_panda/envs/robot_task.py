@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from typing_extensions import Self
 
-from torch_panda.arguments import argument_names
+from torch_panda.arguments import check_no_option
 from torch_panda.bullet import PhysicsName, PhysicsParams
 from torch_panda.checks import check_device
 from torch_panda.envs.episodes import Episodes, Observed, OnDivergence, indices
@@ -174,12 +174,7 @@ class RobotTaskEnv(EnvBase):
                 f"environment"
             )
         if "_episodes" in vars(self) and not name.startswith("_"):
-            for part, owner in (("task", self.task), ("robot", self.robot)):
-                if name in argument_names(type(owner)):
-                    raise AttributeError(
-                        f"{name} is an option of the {part}, not of the environment: "
-                        f"see env.{part}.{name}"
-                    )
+            check_no_option(name, "env", task=self.task, robot=self.robot)
         super().__setattr__(name, value)
 
     @property

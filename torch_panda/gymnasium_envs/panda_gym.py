@@ -2,6 +2,8 @@
 
 from typing import NoReturn
 
+from torch_panda.arguments import check_no_option
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.gymnasium_envs.rendering import CAMERA_FIELDS
 
 _TORCH_ENV = "env.unwrapped.torch_env"
@@ -27,6 +29,8 @@ _REPLACEMENTS = {
 class PandaGymErrors:
     """Names the replacement of an attribute that only panda-gym has."""
 
+    torch_env: RobotTaskEnv
+
     def __getattr__(self, name: str) -> NoReturn:
         """Raise an error; Python calls this method for missing attributes only."""
         message = f"{type(self).__name__!r} object has no attribute {name!r}"
@@ -35,7 +39,10 @@ class PandaGymErrors:
         raise AttributeError(message)
 
     def __setattr__(self, name: str, value: object) -> None:
-        """Refuse to set an attribute that has an effect in panda-gym only."""
+        """Refuse attributes of panda-gym, and options of the task and the robot."""
         if name in _REPLACEMENTS:
             self.__getattr__(name)
+        if "torch_env" in vars(self):
+            env = self.torch_env
+            check_no_option(name, _TORCH_ENV, task=env.task, robot=env.robot)
         super().__setattr__(name, value)
