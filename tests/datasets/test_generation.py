@@ -155,6 +155,10 @@ def test_play_gives_up_a_goal_after_the_time_of_an_episode():
     [
         ({"kind": "expert"}, "kind must be one of noisy, play, random, got 'expert'"),
         ({"kind": "noisy", "env_id": "KukaReach-v1"}, "no expert for"),
+        (
+            {"kind": "play", "robot_options": {"block_gripper": False}},
+            r"no expert for Panda\(.*block_gripper=False",
+        ),
         ({"kind": "random", "transitions": 0}, "transitions must be"),
         ({"kind": "noisy", "goal": "observation"}, "leave out goal='observation'"),
         ({"kind": "play", "max_episode_steps": 50}, "max_episode_steps must be 120"),

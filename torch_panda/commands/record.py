@@ -194,7 +194,6 @@ def record_demonstrations(args: Args) -> None:
         OSError: The data cannot be written.
     """
     torch.manual_seed(args.seed)  # the noise uses torch's generator
-    expert: TensorDictModuleBase = make_expert(args.env_id)
     episodes = args.episodes or EPISODES
     env = torch_panda.make(
         args.env_id,
@@ -203,6 +202,7 @@ def record_demonstrations(args: Args) -> None:
         seed=args.seed,
         **make_options(args),
     )
+    expert: TensorDictModuleBase = make_expert(env)
     writer = None if args.out is None else open_writer(args, args.out, env)
     expert = add_noise(expert, env, args.noise_eps)
     success: list[Tensor] = []

@@ -143,7 +143,6 @@ def generate_parts(
             f"the experts of the kind {kind} need the goals of the task: leave out "
             f"goal={make_options['goal']!r}, or use the kind random"
         )
-    expert = None if kind == "random" else make_expert(env_id)
     make_options = {**make_options, **fixed_options(kind)}
     num_episodes, steps = batch_shape(env_id, kind, transitions, **make_options)
     num_envs = min(num_envs, num_episodes)
@@ -152,6 +151,9 @@ def generate_parts(
     with make_env(
         env_id, num_envs=num_envs, num_threads=num_threads, **make_options
     ) as env:
+        expert = None
+        if kind != "random":
+            expert = make_expert(env if isinstance(env, RobotTaskEnv) else env_id)
         draws_with_start = (
             isinstance(env, RobotTaskEnv)
             and type(env.task).sample_start is not Task.sample_start

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torch_panda.envs import RobotTaskEnv
 from torch_panda.experts import (
     drawer,
     flip,
@@ -74,13 +75,13 @@ EXPERTS: dict[type[Task], Expert] = {
 }
 
 
-def make_expert(env_id: str) -> TensorDictModule:
-    """Make the scripted expert for an id.
+def make_expert(env: str | RobotTaskEnv) -> TensorDictModule:
+    """Make the scripted expert for an id or an environment.
 
     Args:
-        env_id: Id of a Panda with end-effector control at one of the shipped tasks. Its
-            gripper must be blocked unless the expert uses it. The expert expects the
-            default ``action_scale`` of 0.05 m.
+        env: Id or environment of a Panda with end-effector control at one of the
+            shipped tasks. Its gripper must be blocked unless the expert uses it. The
+            expert expects the default ``action_scale`` of 0.05 m.
 
     Returns:
         A module from ``observation``, ``achieved_goal`` and ``desired_goal`` to
@@ -89,15 +90,21 @@ def make_expert(env_id: str) -> TensorDictModule:
     Raises:
         ValueError: The id is unknown, or there is no expert for it.
     """
-    registration = find_registration(env_id)
-    act = find_expert(registration.make_robot(), registration.make_task())
+    if isinstance(env, str):
+        registration = find_registration(env)
+        robot, task = registration.make_robot(), registration.make_task()
+        name = repr(env)
+    else:
+        robot, task = env.robot, env.task
+        name = f"{robot} at {task}"
+    act = find_expert(robot, task)
     if act is None:
         blocked, free = (
             ", ".join(t.__name__ for t, x in EXPERTS.items() if x.uses_fingers == uses)
             for uses in (False, True)
         )
         raise ValueError(
-            f"no expert for {env_id!r}: there are experts for the Panda with "
+            f"no expert for {name}: there are experts for the Panda with "
             f"end-effector control, with block_gripper=True at {blocked}, and with "
             f"block_gripper=False at {free}"
         )
