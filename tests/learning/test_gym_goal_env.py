@@ -552,3 +552,9 @@ def test_random_data_depend_on_the_seed_alone():
 def test_data_of_episodes_that_end_early_are_refused(ends):
     with pytest.raises(ValueError, match="ends episodes before their time limit"):
         generate(register(ends=ends), kind="random", transitions=1, seed=0, num_envs=2)
+
+
+def test_data_of_episodes_without_a_time_limit_are_refused():
+    env_id = register(max_episode_steps=None)
+    with pytest.raises(ValueError, match=f"{env_id} .* has no max_episode_steps"):
+        generate(env_id, kind="random", transitions=1, seed=0, num_envs=2)

@@ -96,8 +96,11 @@ def episode_length(env_id: str) -> int:
     """Number of steps after which the episodes of an id are truncated.
 
     Raises:
-        ValueError: The id is unknown.
+        ValueError: The id is unknown, or its episodes have no time limit.
     """
     if is_from_gymnasium(env_id):
-        return int(gymnasium.spec(env_id).max_episode_steps or 0)
+        limit = gymnasium.spec(env_id).max_episode_steps
+        if limit is None:
+            raise ValueError(f"{env_id} cannot be used: it has no max_episode_steps")
+        return limit
     return max_episode_steps(env_id)
