@@ -110,6 +110,25 @@ def test_the_default_device_changes_nothing(mode):
     assert observation["observation"].shape == (2, 6)
 
 
+def test_a_diverged_episode_keeps_its_goal_if_another_one_starts():
+    env = GoalVectorEnv(
+        "PandaPush-v1", num_envs=2, max_episode_steps=2, on_divergence="reset"
+    )
+    with contextlib.closing(env):
+        env.reset(seed=0)
+        env.step(np.zeros((2, 3)))
+        env.reset(options={"reset_mask": np.array([True, False])})
+        start, *_, ended, _ = env.step(np.zeros((2, 3)))
+        assert ended.tolist() == [False, True]
+        simulation = env.torch_env.episodes.simulation
+        cube, client = simulation.scene.objects[0], simulation.clients[0]
+        client.set_base(cube, (0, 0, 0.02), (0, 0, 0, 1), (1e300, 0, 0), (0, 0, 0))
+        after, *_, ended, _ = env.step(np.zeros((2, 3)))
+        assert ended.tolist() == [True, False]
+        same = after["desired_goal"] == start["desired_goal"]
+        assert same.all(axis=1).tolist() == [True, False]
+
+
 def test_a_step_before_the_first_reset_is_refused():
     env = GoalVectorEnv("PandaReach-v1", num_envs=2)
     with pytest.raises(ResetNeeded, match=r"reset environments \[0, 1\]"):

@@ -157,9 +157,9 @@ class GoalVectorEnv(
         step_mask = ~ended.unsqueeze(1) if resets_now else None
         after = episodes.step(arrays.action(actions), step_mask)
         if resets_now:
-            # The reset returns the entries of all environments. The entries of those
-            # that took the step are the same as after the step.
-            after |= episodes.reset(_indices(ended))
+            # An episode that diverged in this step keeps its last observation.
+            for key, values in episodes.reset(_indices(ended)).items():
+                after[key] = after[key].index_put((ended,), values[ended])
         outcome = (
             after["reward"].squeeze(1).double().numpy(),
             after["terminated"].squeeze(1).numpy(),
