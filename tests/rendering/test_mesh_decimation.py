@@ -105,3 +105,24 @@ def test_meshes_and_textures_of_equal_names_stay_apart(two_parts):
         size = max(float(line.split()[1]) for line in lines if line.startswith("v "))
         found.append((size, (path.parent / "paint.png").read_text()))
     assert found == [(1.0, "left"), (2.0, "right")]
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        "v\t0 0 0\n  v 1 0 0\n\tv 0 1 0\nf\t1 2 3\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.5\n\nf 1/1 2/1 3/1\n",
+        "v 0 0 0\n",
+    ],
+    ids=["tabs and indentation", "one texture coordinate", "no faces"],
+)
+def test_unusual_obj_files_are_read(tmp_path, mesh):
+    (tmp_path / "part.obj").write_text(mesh)
+    urdf = tmp_path / "robot.urdf"
+    geometry = '<geometry><mesh filename="part.obj"/></geometry>'
+    urdf.write_text(
+        f"<robot name='r'><link name='l'><visual>{geometry}</visual></link></robot>"
+    )
+    (coarse,) = parse_urdf(decimated_urdf(str(urdf), 0.01)).iter("mesh")
+    lines = Path(coarse.get("filename")).read_text().splitlines()
+    assert sum(line.startswith("f ") for line in lines) == mesh.count("f")

@@ -58,8 +58,14 @@ def decimated_urdf(urdf: str, cell: float) -> Path:
 
 
 def _coarse_obj(original: Path, cell: Floats) -> Path:
-    """Write the coarse version of an .obj file and its texture into a new folder."""
+    """Write the coarse version of an .obj file and its texture into a new folder.
+
+    Returns:
+        Path of the new file; ``original`` if it has no faces.
+    """
     vertices, coordinates, corners = _read_obj(original)
+    if not len(vertices) or not len(corners):
+        return original
     positions, texture, faces = merge_vertices(vertices, coordinates, corners, cell)
     path = make_scratch_folder() / original.name
     lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in positions]
@@ -141,14 +147,14 @@ def _read_obj(path: Path) -> tuple[Floats, Floats, Integers]:
     coordinates = [[0.0, 0.0]]
     corners: list[list[tuple[int, int]]] = []
     for line in path.read_text(errors="replace").splitlines():
-        keyword, _, rest = line.partition(" ")
+        keyword, *values = line.split() or [""]
         if keyword == "v":
-            vertices.append([float(x) for x in rest.split()[:3]])
-        elif keyword == "vt":
-            coordinates.append([float(x) for x in rest.split()[:2]])
+            vertices.append([float(x) for x in values[:3]])
+        elif keyword == "vt":  # numbers may be missing
+            coordinates.append([float(x) for x in (*values, "0", "0")[:2]])
         elif keyword == "f":
             polygon = []
-            for corner in rest.split():
+            for corner in values:
                 vertex, coordinate = [*corner.split("/"), ""][:2]
                 # Indices count from 1, or backwards from the last element so far.
                 v, t = int(vertex), int(coordinate or 0)
@@ -174,5 +180,6 @@ def _values(path: Path, key: str) -> Iterator[str]:
     """The last words of the lines of a text file that begin with ``key``."""
     with path.open(errors="replace") as lines:
         for line in lines:
-            if line.startswith(key + " "):
-                yield line.split()[-1]
+            words = line.split()
+            if words[:1] == [key]:
+                yield words[-1]
