@@ -4,6 +4,7 @@ import socket
 from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 from itertools import combinations, product
+from unittest.mock import Mock
 
 import numpy as np
 import pybullet
@@ -280,7 +281,8 @@ def test_an_object_with_a_shifted_centre_of_mass_is_where_bullet_has_it(tmp_path
 
 def test_parts_of_a_urdf_that_the_page_cannot_show_are_left_out(tmp_path):
     capsule = '<geometry><capsule radius="0.1" length="0.2"/></geometry>'
-    ball = '<geometry><sphere radius="0.1"/></geometry>'
+    red = '<material name="red"><color rgba="1 0 0"/></material>'
+    ball = f'<geometry><sphere radius="0.1"/></geometry>{red}'
     path = tmp_path / "limb.urdf"
     path.write_text(
         f"""<robot name="limb">
@@ -310,7 +312,7 @@ def test_an_open_drawer_is_open_on_the_page():
             assert np.abs(drawer.position).max() == pytest.approx(0.08)
 
 
-def test_wrong_calls_of_a_viewer_raise_clear_errors(env):
+def test_wrong_calls_of_a_viewer_raise_clear_errors(env, monkeypatch):
     with env.open_viewer(port=8765) as viewer:
         with pytest.raises(torch_panda.BulletError, match="never reset"):
             viewer.update()
@@ -322,6 +324,8 @@ def test_wrong_calls_of_a_viewer_raise_clear_errors(env):
         ):
             thread.submit(viewer.update).result()
         assert viewer.url.startswith("http://127.0.0.1:87")
+        monkeypatch.setattr(viewer._server, "get_host", lambda: "::1")
+        assert viewer.url.startswith("http://[::1]:87")
     env.close()
     with pytest.raises(torch_panda.BulletError, match="closed"):
         env.open_viewer()
@@ -422,9 +426,20 @@ def test_the_own_page_can_connect(viewer, host, origin):
 
 
 def test_a_version_of_viser_that_cannot_be_checked_is_refused(env, monkeypatch):
-    monkeypatch.setattr(web_viewer.viser, "ViserServer", lambda **options: None)
+    unchecked = Mock()
+    monkeypatch.setattr(web_viewer.viser, "ViserServer", unchecked)
     with pytest.raises(RuntimeError, match="cannot check web requests"):
         env.open_viewer(port=8765)
+    unchecked.return_value.stop.assert_called_once()
+
+
+def test_a_viewer_that_cannot_show_the_bodies_stops_its_server(env, monkeypatch):
+    stop = Mock(wraps=web_viewer.viser.ViserServer.stop)
+    monkeypatch.setattr(web_viewer.viser.ViserServer, "stop", lambda self: stop(self))
+    monkeypatch.setattr(web_viewer, "WebBodies", Mock(side_effect=OSError))
+    with pytest.raises(OSError):
+        env.open_viewer(port=8765)
+    stop.assert_called_once()
 
 
 def test_indices_from_a_browser_never_raise(env):

@@ -176,7 +176,7 @@ def _read_urdf(file: str) -> yourdfpy.URDF:
 
     Elements that are not shown go first, because yourdfpy refuses some that Bullet
     accepts, such as capsules and spherical joints. ``mimic`` goes, too: in Bullet, each
-    joint has a position of its own.
+    joint has a position of its own. Bullet ignores colours that are not four numbers.
     """
     robot = parse_urdf(file)
     for link in robot.findall("link"):
@@ -184,6 +184,10 @@ def _read_urdf(file: str) -> yourdfpy.URDF:
             geometry = part.find("geometry/*")
             if part.tag != "visual" or geometry is None or geometry.tag not in SHAPES:
                 link.remove(part)
+    for material in robot.iter("material"):
+        for color in material.findall("color"):
+            if len(color.get("rgba", "").split()) != 4:
+                material.remove(color)
     for joint in robot.findall("joint"):
         if joint.get("type") not in ("revolute", "continuous", "prismatic"):
             joint.set("type", "fixed")

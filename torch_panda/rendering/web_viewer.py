@@ -5,7 +5,7 @@ This module needs the extra ``viewer``.
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,13 +86,16 @@ class WebViewer:
         self._lock = threading.RLock()
         self._resumed = threading.Event()
         self._resumed.set()
-        with restricted_servers(allowed_names(host, allowed_hosts)):
-            self._server = server = viser.ViserServer(
-                host=host, port=port, label=title, verbose=False
-            )
+        with ExitStack() as on_error:
+            with restricted_servers(allowed_names(host, allowed_hosts)):
+                self._server = server = viser.ViserServer(
+                    host=host, port=port, label=title, verbose=False
+                )
+                on_error.callback(server.stop)
+            self._bodies = WebBodies(server, simulation.clients[0], simulation.scene)
+            on_error.pop_all()
         server.initial_camera.look_at = camera.target
         server.initial_camera.position = eye(camera)
-        self._bodies = WebBodies(server, simulation.clients[0], simulation.scene)
         gui = server.gui
         self._status = gui.add_markdown("waiting for the first step")
         self._note = gui.add_markdown("")
@@ -113,6 +116,8 @@ class WebViewer:
         """Address of the page."""
         host = self._server.get_host()
         name = "localhost" if host in WILDCARDS else host
+        if ":" in name:  # an IPv6 address
+            name = f"[{name}]"
         return f"http://{name}:{self._server.get_port()}"
 
     @property
