@@ -276,6 +276,18 @@ def test_faults_of_a_sensor_are_reported(function, message):
     assert re.search(message, line)
 
 
+@pytest.mark.parametrize(
+    ("task", "robot", "message"),
+    [
+        (Reach, None, "task must be an instance of Task, got the class Reach"),
+        (Reach(), Panda, "robot must be an instance of Robot, got the class Panda"),
+    ],
+)
+def test_classes_are_refused(task, robot, message):
+    with pytest.raises(TypeError, match=message):
+        check_task(task, robot=robot)
+
+
 def test_a_reserved_key_is_reported():
     task = make_task(info=lambda s, sim: {"episode": sim.ee_position})
     (line,) = find_problems(task)

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.checks import check_instance
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.goal_observation import find_goal_indices
 from torch_panda.envs.task_problems import (
@@ -61,12 +62,15 @@ def check_task(
 
     Raises:
         ValueError: There are problems. The message has one line for each.
+        TypeError: The task or the robot is of another type, such as a class.
     """
     if isinstance(task, str):
         registration = find_registration(task)
         task = registration.make_task()
         robot = registration.make_robot() if robot is None else robot
     robot = Panda() if robot is None else robot
+    check_instance("task", task, Task)
+    check_instance("robot", robot, Robot)
     check = _TaskCheck(copy.deepcopy(task), copy.deepcopy(robot))
     if problems := check.find_problems(sensors):
         raise ValueError("\n".join(problems)) from check.error
