@@ -8,6 +8,7 @@ from torchrl.envs.utils import check_env_specs
 
 import torch_panda
 from torch_panda import Camera, CameraSensor, HandCamera
+from torch_panda.bullet import Visual
 from torch_panda.rendering import egl
 
 # Most pictures below have the same size of a pixel, so that they share their coarse
@@ -123,6 +124,35 @@ def test_segmentation_and_depth_show_objects_at_their_positions():
         assert num_visible >= 3  # the arm or a cube may hide one
         assert (td["depth"] <= camera.far).all()
         assert (td["depth"][td["segmentation"] == ids["nothing"]] == camera.far).all()
+
+
+class Walls(torch_panda.Reach):
+    """Reach with two walls of one name, and bodies without a name."""
+
+    def build(self, client):
+        bodies = super().build(client)
+        for k, name in enumerate(("wall", "wall", None)):
+            client.create_box(
+                (0.02, 0.08, 0.1),
+                mass=0.0,
+                position=(0.2, 0.2 * k - 0.2, 0.1),
+                visual=Visual(name=name),
+            )
+        client.load_urdf("cube_small.urdf", position=(0, 0.3, 0.05), fixed_base=True)
+        return bodies
+
+
+def test_each_body_of_a_segmentation_has_a_name():
+    sensor = CameraSensor(Camera(width=SIZE, height=SIZE), segmentation=True)
+    with torch_panda.RobotTaskEnv(
+        robot=torch_panda.Panda(), task=Walls(), sensors=(sensor,)
+    ) as env:
+        seen = env.reset()["segmentation"].unique().tolist()
+        ids = env.segmentation_ids
+    assert set(seen) <= set(ids.values())
+    unnamed = [name for name in ids if name.startswith("body")]
+    named = {"nothing", "robot", "ground", "table", "wall1", "wall2"}
+    assert set(ids) == {*named, *unnamed} and len(unnamed) == 2
 
 
 def test_markers_are_in_pixels_but_not_in_depth_and_segmentation():

@@ -449,7 +449,8 @@ class RobotTaskEnv(EnvBase):
 
         The shipped tasks have ``nothing`` (-1), ``robot``, ``ground``, ``table``, and
         the objects, such as ``object`` in Push, and ``object1`` and ``object2`` in
-        Stack. A task can give a body another name with `Visual.name`.
+        Stack. A task can give a body another name with `Visual.name`; equal names are
+        numbered. Further bodies are named by their ids, such as ``body3``.
         """
         from torch_panda.rendering.renderer import segmentation_ids
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_panda.bullet import VectorSimulation, WorkerPool
-from torch_panda.bullet.blueprint import CreateBody
+from torch_panda.bullet.blueprint import CreateBody, LoadURDF
 from torch_panda.rendering.camera import Camera, to_metres
 from torch_panda.rendering.egl import RendererName
 from torch_panda.rendering.visual_client import VisualClient
@@ -249,12 +249,20 @@ def mesh_cell(camera: Camera) -> float:
 
 
 def segmentation_ids(simulation: VectorSimulation) -> dict[str, int]:
-    """The body ids in segmentations, by name of the body."""
+    """The body ids in segmentations, by name; see `RobotTaskEnv.segmentation_ids`."""
     scene = simulation.scene
-    names = {scene.robot: "robot"}
+    roles = {scene.robot: "robot"}
     for k, body in enumerate(scene.objects):
-        names[body] = "object" if len(scene.objects) == 1 else f"object{k + 1}"
+        roles[body] = "object" if len(scene.objects) == 1 else f"object{k + 1}"
+    names: dict[int, str] = {}
     for command in simulation.blueprint:
-        if isinstance(command, CreateBody) and command.visual.name is not None:
-            names[command.body] = command.visual.name
-    return {"nothing": BACKGROUND} | {names[body]: body for body in sorted(names)}
+        match command:
+            case CreateBody(body, is_marker=False, visual=visual):
+                names[body] = visual.name or roles.get(body, f"body{body}")
+            case LoadURDF(body):
+                names[body] = roles.get(body, f"body{body}")
+    ids = {"nothing": BACKGROUND}
+    for body, name in names.items():
+        equal = [other for other in names if names[other] == name]
+        ids[f"{name}{equal.index(body) + 1}" if len(equal) > 1 else name] = body
+    return ids
