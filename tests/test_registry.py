@@ -90,16 +90,22 @@ def test_make_says_what_to_use_with_an_id_of_a_user(env_id):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "error", "message"),
     [
-        ({"env_id": "PandaPush-v1"}, "ships; choose another one"),
-        ({"env_id": "Two words"}, "cannot be an id"),
-        ({"max_episode_steps": 0}, "max_episode_steps must be"),
+        ({"env_id": "PandaPush-v1"}, ValueError, "ships; choose another one"),
+        ({"env_id": "Two words"}, ValueError, "cannot be an id"),
+        ({"max_episode_steps": 0}, ValueError, "max_episode_steps must be"),
+        ({"robot": Panda()}, TypeError, "robot must be a class or a function"),
+        (
+            {"task": Push(), "max_episode_steps": 9},
+            TypeError,
+            "task must be a class or a function",
+        ),
     ],
 )
-def test_wrong_registrations_are_refused(arguments, message):
+def test_wrong_registrations_are_refused(arguments, error, message):
     accepted = {"env_id": "Shove-v0", "robot": Panda, "task": Push}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(error, match=message):
         torch_panda.register(**(accepted | arguments))
 
 

@@ -293,12 +293,19 @@ def register(
     Raises:
         ValueError: The id belongs to torch_panda or is invalid for Gymnasium, or
             ``max_episode_steps`` is below 1.
-        TypeError: ``max_episode_steps`` is None and ``task`` needs arguments.
+        TypeError: ``robot`` or ``task`` cannot be called, or ``max_episode_steps`` is
+            None and ``task`` needs arguments.
     """
     if env_id in ENV_IDS:
         raise ValueError(
             f"{env_id!r} is an id that torch_panda ships; choose another one"
         )
+    for name, maker in (("robot", robot), ("task", task)):
+        if not callable(maker):
+            raise TypeError(
+                f"{name} must be a class or a function, got {maker!r}: pass the class "
+                f"or a function that makes one"
+            )
     check_positive(max_episode_steps=max_episode_steps)
     steps = max_episode_steps or task().max_episode_steps
     registration = Registration(env_id, robot, task, steps, terminate_on_success)
