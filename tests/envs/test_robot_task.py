@@ -311,7 +311,18 @@ def test_bad_arguments_of_make_are_refused_by_name(arguments, error):
         torch_panda.make("PandaReach-v1", **arguments)
 
 
-@pytest.mark.parametrize("size", [0, "a", (64, 64, 3)])
+@pytest.mark.parametrize("camera", ["front", {"distance": 1.0}])
+def test_a_camera_of_a_wrong_type_is_refused(env, camera):
+    for call in (
+        lambda: torch_panda.make("PandaReach-v1", from_pixels=True, camera=camera),
+        lambda: env.render(camera=camera),
+        lambda: env.open_window(camera),
+    ):
+        with pytest.raises(TypeError, match="camera must be an instance of Camera"):
+            call()
+
+
+@pytest.mark.parametrize("size", [0, "a", (), (64, 64, 3)])
 def test_a_bad_render_size_is_refused(size):
     with pytest.raises((ValueError, TypeError), match=r"size|width"):
         torch_panda.make("PandaReach-v1", from_pixels=True, render_size=size)

@@ -211,6 +211,11 @@ ID = "PandaReach-v1"
             ValueError,
             "render_mode must be None or one of",
         ),
+        (
+            lambda one, many: GoalEnv(one, render_camera="front"),
+            TypeError,
+            "render_camera must be an instance of Camera",
+        ),
     ],
 )
 def test_bad_arguments_are_refused(call, error, message):

@@ -326,6 +326,8 @@ def test_wrong_calls_of_a_viewer_raise_clear_errors(env, monkeypatch):
         assert viewer.url.startswith("http://127.0.0.1:87")
         monkeypatch.setattr(viewer._server, "get_host", lambda: "::1")
         assert viewer.url.startswith("http://[::1]:87")
+    with pytest.raises(TypeError, match="camera must be an instance of Camera"):
+        env.open_viewer("front")
     env.close()
     with pytest.raises(torch_panda.BulletError, match="closed"):
         env.open_viewer()

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from torch_panda.checks import check_vector
+from torch_panda.checks import check_instance, check_vector
 from torch_panda.rendering import Camera
 
 RENDER_MODES = ("rgb_array",)
@@ -46,7 +46,10 @@ def take_camera(camera: Camera | None, arguments: dict[str, Any]) -> Camera | No
 
     Raises:
         ValueError: A camera argument is out of range.
+        TypeError: ``camera`` is not a `Camera`.
     """
+    if camera is not None:
+        check_instance("render_camera", camera, Camera)
     changes = {
         field: arguments.pop(name)
         for name, field in CAMERA_FIELDS.items()

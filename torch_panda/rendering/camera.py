@@ -10,6 +10,7 @@ import numpy.typing as npt
 from torch_panda.checks import (
     check_above_zero,
     check_finite,
+    check_instance,
     check_integer,
     check_vector,
 )
@@ -141,12 +142,13 @@ def resized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
 
     Raises:
         ValueError: The size is not one or two numbers, or one of them is below 1.
-        TypeError: A number is not an integer.
+        TypeError: A number is not an integer, or the camera is not a `Camera`.
     """
+    check_instance("camera", camera, Camera)
     if size is None:
         return camera
     sizes = np.atleast_1d(size).tolist()
-    if len(sizes) > 2:
+    if len(sizes) not in (1, 2):
         raise ValueError(f"size must be one or two numbers, got {size}")
     height, width = sizes[0], sizes[-1]
     return dataclasses.replace(camera, height=height, width=width)

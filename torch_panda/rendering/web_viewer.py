@@ -15,6 +15,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation
+from torch_panda.checks import check_instance
 from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.web_access import (
     WILDCARDS,
@@ -78,6 +79,7 @@ class WebViewer:
         port: int,
         allowed_hosts: Sequence[str],
     ) -> None:
+        check_instance("camera", camera, Camera)
         self._simulation, self._observe, self._title = simulation, observe, title
         self._exclusive = exclusive
         self._episodes: list[list[Frame]] = [[] for _ in range(simulation.num_envs)]

@@ -6,6 +6,7 @@ from typing_extensions import Self
 
 from torch_panda.bullet import VectorSimulation, capi
 from torch_panda.bullet.connection import BulletError, Connection
+from torch_panda.checks import check_instance
 from torch_panda.rendering.camera import Camera
 from torch_panda.rendering.egl import probe
 from torch_panda.rendering.visual_client import VisualClient
@@ -34,6 +35,7 @@ class Window:
     """
 
     def __init__(self, simulation: VectorSimulation, camera: Camera) -> None:
+        check_instance("camera", camera, Camera)
         _check_display()
         self._simulation = simulation
         arguments = (c_char_p * 1)(b"--unused")
