@@ -109,10 +109,11 @@ def test_noise_leaves_the_global_generator_alone():
     ("make_transform", "message"),
     [
         (lambda: ActionDelay(0), "steps must be at least 1"),
+        (lambda: ActionDelay(1.5), "steps must be an integer"),
         (lambda: ActionNoise(-1.0), "std must be"),
         (lambda: ObservationNoise(float("nan")), "std must be"),
     ],
 )
-def test_a_delay_of_0_and_a_bad_std_are_refused(make_transform, message):
-    with pytest.raises(ValueError, match=message):
+def test_a_bad_delay_and_a_bad_std_are_refused(make_transform, message):
+    with pytest.raises((ValueError, TypeError), match=message):
         make_transform()

@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from torch_panda.checks import check_not_negative
+from torch_panda.checks import check_integer, check_not_negative
 
 
 class GaussianNoise:
@@ -108,9 +108,11 @@ class ActionDelay(Transform):
 
     Raises:
         ValueError: ``steps`` is below 1.
+        TypeError: ``steps`` is not an integer.
     """
 
     def __init__(self, steps: int) -> None:
+        steps = check_integer("steps", steps)
         if steps < 1:
             raise ValueError(f"steps must be at least 1, got {steps}")
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
