@@ -25,7 +25,7 @@ def env():
 
 def test_demonstrations_keep_their_goals(env, make_demos, tmp_path):
     path = make_demos()
-    demos = read_demos(path, env)
+    demos = read_demos(str(path), env)
     run = make_run(small(path), tmp_path)
     batch = run.source.demos.sample(500)
     run.close()
@@ -100,6 +100,15 @@ def test_demonstrations_of_other_rewards_are_refused(make_demos):
         pytest.raises(ValueError, match=r"100% of the rewards .* is -1 instead of -0"),
     ):
         read_demos(path, env)
+
+
+def test_an_environment_without_observations_is_refused(make_demos):
+    options = {"from_pixels": True, "pixels_only": True, "render_size": 8}
+    with (
+        torch_panda.make("PandaPush-v1", num_envs=1, **options) as env,
+        pytest.raises(ValueError, match="make it without pixels_only"),
+    ):
+        read_demos(make_demos(), env)
 
 
 def test_rewards_that_are_no_function_of_goals_are_accepted(make_demos):

@@ -16,7 +16,7 @@ from torch_panda.tasks import Task
 DIFFERENT_REWARDS = 0.01
 
 
-def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
+def read_demos(path: Path | str, env: RobotTaskEnv) -> TensorDictBase:
     """Read demonstrations and check that they fit an environment.
 
     Args:
@@ -34,8 +34,15 @@ def read_demos(path: Path, env: RobotTaskEnv) -> TensorDictBase:
     Raises:
         ValueError: The path holds no demonstrations, they were recorded in an
             environment with another id, their sizes or rewards differ from those of
-            the environment, or the rows of an episode are not in the order of time.
+            the environment, the rows of an episode are not in the order of time, or the
+            environment does not observe ``observation``.
     """
+    path = Path(path)
+    if "observation" not in env.observation_spec:
+        raise ValueError(
+            "demonstrations need an environment that observes `observation`: make it "
+            "without pixels_only"
+        )
     if not path.exists():
         raise ValueError(
             f"there is no file or folder {path}: demonstrations are a file that "
