@@ -47,10 +47,9 @@ def test_attributes_and_methods_are_those_of_all_environments():
         env.set_attr("marker", 2, indices=1)
     with pytest.raises(AttributeError):
         env.get_attr("speed")
-    env.reset()
-    env.set_options({"state": {}})
     with pytest.raises(ValueError, match=r"vector_env\.reset"):
-        env.reset()
+        env.set_options({"state": {}})
+    env.reset()
     assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     env.close()
     with pytest.raises(torch_panda.BulletError, match="closed"):

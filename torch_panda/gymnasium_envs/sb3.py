@@ -55,20 +55,25 @@ class SB3VecEnv(PandaGymErrors, VecEnv):
         self.metadata = self.vector_env.metadata
 
     def reset(self) -> Observation:
-        """Start an episode in each environment, with the seeds of the last `seed` call.
-
-        Raises:
-            ValueError: `set_options` was called before.
-        """
-        if any(self._options):
-            raise ValueError(
-                "set_options is not supported: call vector_env.reset(options=...)"
-            )
+        """Start an episode in each environment, with the seeds of the last `seed`."""
         observation, infos = self.vector_env.reset(seed=self._seeds)
         own_infos = self._own_infos(infos)
         self.reset_infos = [info_of(own_infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         return observation
+
+    def set_options(
+        self, options: list[dict[str, Any]] | dict[str, Any] | None = None
+    ) -> None:
+        """Refuse options of the next reset.
+
+        Raises:
+            ValueError: There are options.
+        """
+        if options and any(options):
+            raise ValueError(
+                "set_options is not supported: call vector_env.reset(options=...)"
+            )
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Store the actions for `step_wait`."""
