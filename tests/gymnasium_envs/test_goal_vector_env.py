@@ -160,6 +160,8 @@ def env():
         ({"seed": [1, -2, 3]}, ValueError, "non-negative"),
         ({"options": {"mask": 1}}, ValueError, "only accepted option is .state"),
         ({"options": {"state": {}}}, ValueError, "must have entries, got none"),
+        ({"options": {"state": None}}, TypeError, "state must be an instance of Map"),
+        ({"options": {"state": [1.0]}}, TypeError, "state must be an instance of Map"),
         ({"options": {"state": {"object": [0]}}}, ValueError, "unknown entries .'obje"),
         ({"options": {"reset_mask": [True] * 3}}, TypeError, "array of bool"),
         ({"options": {"reset_mask": np.ones(3)}}, TypeError, "array of bool"),

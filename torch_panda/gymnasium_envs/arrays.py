@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from torch_panda.checks import check_instance
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.episodes import Observed
 from torch_panda.envs.state import EXACT_KEYS, PLAIN_KEYS
@@ -64,6 +65,7 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
     Raises:
         ValueError: An option has another name, or the state has no entries or unknown
             ones.
+        TypeError: The state is not a mapping, or a value is not an array of numbers.
     """
     if unknown := set(options) - {"state"}:
         raise ValueError(
@@ -72,6 +74,7 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
     if "state" not in options:
         return None
     state = options["state"]
+    check_instance("state", state, Mapping)
     if not state.keys():
         raise ValueError("the state must have entries, got none")
     unknown_keys = set(state.keys()).difference(PLAIN_KEYS, EXACT_KEYS)
@@ -81,7 +84,10 @@ def read_state(options: Mapping[str, Any]) -> dict[str, Tensor] | None:
             f"are those of get_state(): {', '.join(PLAIN_KEYS)}"
         )
     return {
-        key: torch.from_numpy(np.asarray(value).copy()) for key, value in state.items()
+        key: value.cpu().clone()
+        if isinstance(value, Tensor)
+        else torch.from_numpy(np.array(value))
+        for key, value in state.items()
     }
 
 
