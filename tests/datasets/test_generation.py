@@ -163,6 +163,7 @@ def test_play_gives_up_a_goal_after_the_time_of_an_episode():
         ({"kind": "noisy", "goal": "observation"}, "leave out goal='observation'"),
         ({"kind": "play", "max_episode_steps": 50}, "max_episode_steps must be 120"),
         ({"kind": "noisy", "play_noise": 0.1}, "play_noise works with the kind play"),
+        ({"kind": "random", "device": "cuda"}, "data are generated on the CPU"),
         ({"kind": "random", "terminate_on_success": True}, "must be False .* random"),
         (
             {"kind": "play", "env_id": "PandaPegInsertion-v1"},

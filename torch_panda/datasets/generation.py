@@ -131,6 +131,11 @@ def generate_parts(
         raise ValueError(
             f'play_noise works with the kind play only, got {play_noise} and "{kind}"'
         )
+    if make_options.get("device") not in (None, "cpu", torch.device("cpu")):
+        raise ValueError(
+            f"data are generated on the CPU, got device={make_options['device']!r}: "
+            "leave it out, and move the data"
+        )
     seed = check_seed(seed)
     for name, fixed in fixed_options(kind).items():
         if make_options.get(name) not in (None, fixed):
