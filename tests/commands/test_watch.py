@@ -89,7 +89,7 @@ def test_a_window_without_a_display_ends_with_one_line(monkeypatch):
 
 def test_an_episode_that_ends_at_success_is_shown_as_one(monkeypatch, capsys):
     window = Mock()
-    monkeypatch.setattr(watch, "FPS", 1e9)
+    monkeypatch.setattr(torch_panda.RobotTaskEnv, "render_fps", 1e9)
     with torch_panda.make("PandaReach-v3", num_envs=1, seed=0) as env:
         monkeypatch.setattr(env, "open_window", lambda: nullcontext(window))
         watch.show(env, make_expert("PandaReach-v3"), episodes=2)

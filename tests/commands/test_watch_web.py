@@ -17,7 +17,7 @@ def test_every_step_is_shown_on_the_page(monkeypatch):
     pytest.importorskip("yourdfpy", reason="needs the extra viewer")
     from torch_panda.rendering.web_viewer import WebViewer
 
-    monkeypatch.setattr(watch, "FPS", 1e6)
+    monkeypatch.setattr(torch_panda.RobotTaskEnv, "render_fps", 1e6)
     shown = []
     monkeypatch.setattr(WebViewer, "update", lambda self: shown.append(self.url))
     monkeypatch.setattr(itertools, "repeat", lambda policy: iter([policy] * 2))

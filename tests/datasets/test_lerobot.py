@@ -23,6 +23,7 @@ def test_a_lerobot_data_set_is_read_back(tmp_path):
     dataset = lerobot_dataset.LeRobotDataset("torch_panda/reach", root=folder)
     assert len(dataset) == EPISODES * 50
     assert dataset.meta.total_episodes == EPISODES
+    assert (dataset.meta.robot_type, dataset.fps) == ("panda", 25)
     seed = 3
     with torch_panda.make("PandaReach-v1", seed=seed) as env:
         start = env.reset()

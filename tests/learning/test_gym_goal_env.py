@@ -2,14 +2,16 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import RandomPolicy, check_env_specs, step_mdp
 
 from tests.commands.runs import read_curve, weights
 from tests.learning.hand_env import HIGH, LOW, MAX_STEPS, NEAR, SPEED, HandEnv, register
@@ -20,6 +22,7 @@ from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.environments import is_from_gymnasium, make_env
 from torch_panda.learning.environments.geometry import find_geometry, find_hand, probe
 from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
+from torch_panda.learning.evaluation.video import record
 from torch_panda.learning.options import default_args
 from torch_panda.learning.training import Run
 
@@ -164,6 +167,16 @@ def test_pictures_have_the_requested_size():
     assert pictures.dtype == torch.uint8
     assert (pictures[:, :, :10] == 0).all()
     assert (pictures[:, :, 20:] == 255).all()
+
+
+def test_a_video_is_as_fast_as_the_simulation(tmp_path):
+    class Fast(HandEnv):
+        metadata: ClassVar = {**HandEnv.metadata, "render_fps": 50}
+
+    path = tmp_path / "fast.mp4"
+    with make_env(register(Fast), num_envs=2, renders=True) as env:
+        record(env, RandomPolicy(env.action_spec), path)
+    assert iio.immeta(path)["fps"] == 50
 
 
 def test_a_simulator_that_cannot_render_is_an_os_error():

@@ -20,7 +20,7 @@ from torchrl.envs.utils import RandomPolicy
 import torch_panda
 from torch_panda.experts import make_expert
 from torch_panda.learning.environments import make_env, refusal
-from torch_panda.learning.evaluation.video import FPS, play, record
+from torch_panda.learning.evaluation.video import play, record
 from torch_panda.learning.files.policy_files import load_policy
 from torch_panda.learning.limits import Port, Positive, Seed, check_limits
 from torch_panda.learning.user_modules import Imports, import_modules
@@ -39,7 +39,7 @@ def show(
             for state in play(env, policy):
                 window.show(0)
                 success = bool(state["success"][0])
-                due += 1 / FPS
+                due += 1 / env.render_fps
                 time.sleep(max(0.0, due - time.perf_counter()))
                 if state["done"][0]:
                     break  # a -v3 episode ends at its first success
@@ -72,7 +72,7 @@ def serve(
         for number, policy in enumerate(policies, 1):
             viewer.write(f"episode {number}")
             for _ in play(env, policy):
-                due = time.perf_counter() + 1 / FPS
+                due = time.perf_counter() + 1 / env.render_fps
                 viewer.update()
                 viewer.wait()
                 time.sleep(max(0.0, due - time.perf_counter()))

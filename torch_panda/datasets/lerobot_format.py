@@ -20,7 +20,6 @@ STATE = "observation.state"
 # STATE.
 GOALS = "observation.environment_state"
 PICTURE = "observation.images.scene"
-FPS = 25  # steps per second
 
 
 class Writer:
@@ -50,10 +49,10 @@ class Writer:
         shutil.rmtree(self.unfinished, ignore_errors=True)
         self.dataset = LeRobotDataset.create(
             repo_id=f"torch_panda/{env_id}",
-            fps=FPS,
+            fps=env.render_fps,
             features=features(env),
             root=self.unfinished,
-            robot_type="panda",
+            robot_type=type(env.robot).__name__.lower(),
         )
 
     def add(self, episode: TensorDictBase, seed: int) -> None:

@@ -213,6 +213,11 @@ class RobotTaskEnv(EnvBase):
         return self._goal
 
     @property
+    def render_fps(self) -> int:
+        """Frames per second of a video in real time that has one frame per step."""
+        return round(1 / self.physics.ctrl_dt)
+
+    @property
     def max_episode_steps(self) -> int:
         """Number of steps after which an episode is ``truncated``."""
         return self.episodes.max_episode_steps

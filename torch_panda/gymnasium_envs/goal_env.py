@@ -137,7 +137,7 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
 
 def metadata_of(env: RobotTaskEnv) -> dict[str, Any]:
     """Gymnasium's metadata, with one frame per step."""
-    return {**GoalEnv.metadata, "render_fps": round(1 / env.physics.ctrl_dt)}
+    return {**GoalEnv.metadata, "render_fps": env.render_fps}
 
 
 def check_no_arguments(arguments: dict[str, Any]) -> None:

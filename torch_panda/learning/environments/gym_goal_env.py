@@ -56,6 +56,8 @@ class GymGoalEnv(EnvBase):
         has_sparse_reward: Whether `compute_reward` gives 0 for an achieved goal and -1
             for another one.
         terminate_on_success: False; see above.
+        render_fps: Frames per second of a video in real time that has one frame per
+            step.
 
     Raises:
         ValueError: The id is unknown, or the environment is not of this kind.
@@ -87,6 +89,7 @@ class GymGoalEnv(EnvBase):
             self._single.close()
             raise ValueError(f"{env_id} cannot be used: {'; '.join(problems)}")
         self.max_episode_steps = int(spec.max_episode_steps or 0)
+        self.render_fps = self._single.metadata.get("render_fps", 25)
         # Not every environment takes this argument.
         rendering: dict[str, Any] = {"render_mode": "rgb_array"} if renders else {}
         self._vector: VectorEnv[Any, Any, Any] = gymnasium.make_vec(

@@ -22,13 +22,12 @@ from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.files import prepare
 
 CELL = (240, 320)  # height and width of a cell [pixels]
-FPS = 25  # frames per second; one frame per step shows the episode in real time
 BORDER = 4  # width of a cell's frame [pixels]
 GREEN, GREY = (40, 170, 70), (120, 120, 120)
 
 
 def record(env: GoalEnv, policy: TensorDictModuleBase, path: Path) -> None:
-    """Write one episode of each environment into a video.
+    """Write one episode of each environment into a video, in real time.
 
     Args:
         env: Batch of environments.
@@ -48,8 +47,9 @@ def record(env: GoalEnv, policy: TensorDictModuleBase, path: Path) -> None:
             tqdm(play(env, policy), total=env.max_episode_steps + 1, unit="frame")
         )
     ]
+    fps = env.render_fps
     options = (
-        {"loop": 0, "duration": 1000 / FPS} if path.suffix == ".gif" else {"fps": FPS}
+        {"loop": 0, "duration": 1000 / fps} if path.suffix == ".gif" else {"fps": fps}
     )
     iio.imwrite(path, np.stack(frames), **options)
 
