@@ -1,5 +1,7 @@
 """Data augmentation: which rows are mirrored and shifted, and how."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -59,6 +61,14 @@ def test_half_of_the_rows_are_shifted_along_the_table(env):
         changed = (now != was).any(0).nonzero().flatten()
         assert changed.tolist() == [0, 1, 7, 8, 19, 20]
         torch.testing.assert_close((now - was)[:, :3], moved[:, :3])
+
+
+def test_objects_are_shifted_in_all_directions_if_a_goal_is_one_number(env):
+    geometry, rows = read_geometry(env), play_one_step(env)
+    geometry = replace(geometry, goal_positions=())
+    torch.manual_seed(0)
+    moved = shift(rows._replace(g=rows.g[:, :1]), geometry, 0.2).s - rows.s
+    assert (moved[:, 0] - moved[:, 1]).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("mode", ["none", "mirror", "mirror-shift"])

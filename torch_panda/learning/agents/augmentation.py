@@ -62,7 +62,7 @@ def shift(rows: Batch, geometry: Geometry, distance: float) -> Batch:
     All positions in a row move by the same offset, as if the robot's base stood
     elsewhere.
     """
-    offset = torch.empty_like(rows.g[:, :2]).uniform_(-distance, distance)
+    offset = rows.s.new_empty(len(rows.s), 2).uniform_(-distance, distance)
     offset *= torch.rand_like(offset[:, :1]) < 0.5
 
     def shifted(values: Tensor, starts: tuple[int, ...]) -> Tensor:
