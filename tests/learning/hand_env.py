@@ -32,6 +32,7 @@ class HandEnv(gymnasium.Env):
         ends: Ends an episode at success, or at failure, once the time is 5.
         follows: Whether the hand follows the actions.
         goal_size: Number of coordinates of a goal.
+        num_actions: Size of an action. Its first three numbers move the hand.
         has_object: Whether the goal is the object's and not the hand's.
         is_broken: Whether rendering fails.
         render_mode: As in Gymnasium.
@@ -48,6 +49,7 @@ class HandEnv(gymnasium.Env):
         ends: Literal["never", "success", "failure"] = "never",
         follows=True,
         goal_size=3,
+        num_actions=4,
         has_object=True,
         is_broken=False,
         render_mode=None,
@@ -56,7 +58,9 @@ class HandEnv(gymnasium.Env):
         self.ends, self.follows, self.has_object = ends, follows, has_object
         self.goal_size = goal_size
         self.is_broken, self.render_mode = is_broken, render_mode
-        self.action_space = Box(LOW, HIGH)
+        self.num_actions = num_actions
+        self.low, self.high = (np.resize(x, num_actions) for x in (LOW, HIGH))
+        self.action_space = Box(self.low, self.high)
         self._start()
         spaces = {
             key: Box(-np.inf, np.inf, x.shape, dtype=float)
@@ -69,7 +73,7 @@ class HandEnv(gymnasium.Env):
         self.time = np.zeros(1)
         self.hand, self.velocity = draw(-0.3, 0.3, 3), np.zeros(3)
         self.object = self.hand + draw(0.1, 0.2, 3)
-        self.goal, self.action = draw(-0.6, 0.6, 3), np.zeros(4)
+        self.goal, self.action = draw(-0.6, 0.6, 3), np.zeros(self.num_actions)
 
     def _observe(self):
         achieved = self.object if self.has_object else self.hand
@@ -89,7 +93,7 @@ class HandEnv(gymnasium.Env):
         assert self.action_space.contains(action)
         self.time = self.time + 1
         self.action = action.astype(float)
-        centre, half = (HIGH + LOW) / 2, (HIGH - LOW) / 2
+        centre, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         move = ((action - centre) / half)[:3]
         if not self.follows:
             move = self.np_random.uniform(-1, 1, 3)

@@ -15,6 +15,7 @@ from torch_panda.experts.cube_orientations import (
     straighten,
     to_matrix,
 )
+from torch_panda.learning.agents import Hyperparameters, make_agent
 from torch_panda.learning.environments.geometry import (
     declares_layout,
     find_geometry,
@@ -158,11 +159,56 @@ class OneNumberMore(torch_panda.Push):
         return torch.cat((super().observation(simulation), height), 1)
 
 
+class JointsFirst(torch_panda.Panda):
+    """Observes the angles of its joints, and then what every robot does."""
+
+    observation_dim = 13
+
+    def observation(self, simulation):
+        angles = simulation.joint_position[:, :7]
+        return torch.cat((angles, super().observation(simulation)), 1)
+
+
+class Posed(torch_panda.Push):
+    """Goals are orientation and position."""
+
+    goal_dim = 6
+    goal_entries = GoalEntries("task", (3, 4, 5, 0, 1, 2))
+
+    def achieved_goal(self, simulation):
+        return self.observation(simulation)[:, self.goal_entries.indices]
+
+    def sample_goal(self, rng):
+        return (*super().sample_goal(rng), 0.0, 0.0, 0.0)
+
+    def marker_pose(self, goal):
+        return super().marker_pose(goal[..., :3])
+
+
 @pytest.mark.parametrize("task", [Reversed, Planar, OneNumberMore])
 def test_a_declared_layout_must_fit(task):
     robot = torch_panda.Panda(block_gripper=True)
     assert declares_layout(robot, torch_panda.Push())
     assert not declares_layout(robot, task())
+    assert not declares_layout(JointsFirst(block_gripper=True), torch_panda.Push())
+
+
+@pytest.mark.parametrize("exploration", ["actions", "points"])
+def test_the_angles_of_a_robot_are_not_taken_for_its_hand(exploration):
+    robot = JointsFirst(control_type="joints", block_gripper=True)
+    with torch_panda.RobotTaskEnv(
+        robot=robot, task=torch_panda.Push(), num_envs=4, seed=0
+    ) as env:
+        hp = Hyperparameters(relative_inputs="fine", exploration=exploration)
+        agent = make_agent(env, hp)
+        env.rollout(2, agent.explore)
+        assert agent.spaces.geometry.positions == ()
+
+
+def test_a_goal_is_mirrored_in_its_own_order():
+    robot = torch_panda.Panda(block_gripper=True)
+    with torch_panda.RobotTaskEnv(robot=robot, task=Posed(), num_envs=1) as env:
+        assert read_geometry(env).goal == (-1, 1, -1, 1, -1, 1)
 
 
 @pytest.mark.parametrize(

@@ -427,7 +427,7 @@ def test_no_hand_is_found_if_nothing_follows_the_actions(make):
     assert geometry.positions == ()
     assert geometry.points == (14, 15, 16)
     assert geometry.origins == (OBJECT, OBJECT + 1, OBJECT + 2)
-    with pytest.raises(ValueError, match='exploration "points" needs the hand'):
+    with pytest.raises(ValueError, match="three actions that displace a hand"):
         make_agent(env, Hyperparameters(exploration="points"))
 
 
@@ -483,7 +483,8 @@ def test_the_recipe_derives_its_options_from_random_actions():
     args = parse(["--env-id", register()])
     assert args.gamma == parse(["--env-id", register(follows=False)]).gamma
     assert (args.exploration, args.her) == ("points", "relabel")
-    assert parse(["--env-id", register(follows=False)]).exploration == "actions"
+    for options in ({"follows": False}, {"num_actions": 5}):
+        assert parse(["--env-id", register(**options)]).exploration == "actions"
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,12 @@ from pathlib import Path
 import pytest
 
 import torch_panda
-from tests.learning.test_geometry import OneNumberMore
+from tests.learning.test_geometry import JointsFirst, OneNumberMore, Posed
 from torch_panda.learning.agents import make_agent
 from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args, default_args
 from torch_panda.learning.training import Run
+from torch_panda.tasks import GoalEntries
 
 TABLE = Path(__file__).with_name("recipes.json")
 # The ids that stand for their task in the table.
@@ -116,6 +117,50 @@ def test_the_recipe_fits_tasks_and_robots_of_users(control_type, exploration):
         agent = make_agent(env, args)
         assert agent.spaces.geometry.positions == (0, 6)
         env.rollout(2, agent.explore)
+
+
+class PosedFlip(torch_panda.Flip):
+    """Goals are position and quaternion."""
+
+    goal_dim = 7
+    goal_entries = GoalEntries("task", tuple(range(7)))
+
+    def achieved_goal(self, simulation):
+        return simulation.object_pose[:, 0]
+
+    def sample_goal(self, rng):
+        return (0.0, 0.0, 0.0, *super().sample_goal(rng))
+
+    def marker_pose(self, goal):
+        return goal.unsqueeze(-2)
+
+
+@pytest.mark.parametrize("task", [Posed, PosedFlip])
+def test_a_pose_is_the_goal_of_one_object(task):
+    robot = partial(torch_panda.Panda, block_gripper=True)
+    torch_panda.register("Posed-v0", robot=robot, task=task)
+    args = default_args("recipe", "Posed-v0")
+    assert (args.her, args.critics) == ("relabel", "whole")
+    with torch_panda.make("Posed-v0", num_envs=args.num_envs, seed=0) as env:
+        env.rollout(2, make_agent(env, args).explore)
+
+
+def test_the_recipe_fits_a_robot_with_an_observation_of_its_own():
+    robot = partial(JointsFirst, block_gripper=True)
+    torch_panda.register("JointsFirst-v0", robot=robot, task=torch_panda.Push)
+    args = default_args("recipe", "JointsFirst-v0")
+    assert (args.augmentation, args.exploration) == ("none", "actions")
+
+
+def test_the_discount_of_a_short_episode_is_positive():
+    for steps in (1, 2):
+        torch_panda.register(
+            "Short-v0",
+            robot=torch_panda.Panda,
+            task=torch_panda.Reach,
+            max_episode_steps=steps,
+        )
+        check_limits(default_args("recipe", "Short-v0"))
 
 
 if __name__ == "__main__":

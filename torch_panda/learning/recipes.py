@@ -12,11 +12,12 @@ from typing import Any
 
 from torch_panda.learning.environments import GoalEnv, is_from_gymnasium
 from torch_panda.learning.environments.geometry import (
-    declares_layout,
-    find_layout,
+    find_parts,
+    observes_hand_first,
     split_goal,
 )
 from torch_panda.learning.environments.gym_goal_env import GymGoalEnv
+from torch_panda.learning.environments.spaces import follows_points, read_spaces
 from torch_panda.registry import Registration, find_registration
 
 # The same for all tasks. `derive_options` adds what follows from the task.
@@ -71,15 +72,30 @@ UNPLOTTED_OPTIONS = {
 def derive_options(registration: Registration) -> dict[str, Any]:
     """Derive options of the recipe from what a task and a robot declare."""
     task, robot = registration.make_task(), registration.make_robot()
-    steps = registration.max_episode_steps or task.max_episode_steps
-    options: dict[str, Any] = {"gamma": round(1 - 1 / (HORIZON * steps), 4)}
-    if declares_layout(robot, task) and robot.control_type == "ee":
+    gamma = derive_gamma(registration.max_episode_steps)
+    options: dict[str, Any] = {"gamma": gamma}
+    declared = find_parts(robot, task)
+    if declared is not None and robot.control_type == "ee":
         options["augmentation"] = "mirror-shift"
-    if robot.control_type not in ("ee", "joints"):
+    if not follows_points(
+        robot.action_dim - robot.has_free_gripper,
+        knows_hand=robot.control_type == "ee" and observes_hand_first(robot),
+        moves_joints=robot.control_type == "joints",
+    ):
         options["exploration"] = "actions"
-    if len(split_goal(task.goal_dim)) > 1:
+    if declared is None:
+        has_several_objects = len(split_goal(task.goal_dim)) > 1
+    else:
+        quantities = [part.quantity for part, _ in declared[1]]
+        has_several_objects = len(quantities) > 1 and {*quantities} == {"position"}
+    if has_several_objects:
         options |= EACH_OBJECT
     return options
+
+
+def derive_gamma(steps: int) -> float:
+    """Derive the discount from the number of steps of an episode."""
+    return round(1 - 1 / max(HORIZON * steps, 2), 4)
 
 
 @functools.cache
@@ -94,12 +110,11 @@ def find_options(env: GoalEnv) -> dict[str, Any]:
 
     They play some episodes with random actions.
     """
-    hand, geometry = find_layout(env)
-    gamma = 1 - 1 / (HORIZON * env.max_episode_steps)
-    options: dict[str, Any] = {"gamma": round(gamma, 4)}
-    if hand is None:
+    spaces = read_spaces(env, finds_layout=True)
+    options: dict[str, Any] = {"gamma": derive_gamma(env.max_episode_steps)}
+    if not spaces.follows_points:
         options["exploration"] = "actions"
-    if len(geometry.goal_positions) > 1:
+    if spaces.geometry is not None and len(spaces.geometry.goal_positions) > 1:
         options |= EACH_OBJECT
     return options
 

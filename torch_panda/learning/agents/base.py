@@ -290,32 +290,18 @@ def check_spaces(spaces: Spaces, hp: Hyperparameters) -> None:
             "fine_fingers needs a task whose actions move the fingers, such as "
             "PickAndPlace, Stack or Flip: pass --no-fine-fingers"
         )
-    has_hand = spaces.geometry is None or bool(spaces.geometry.positions)
-    if hp.exploration == "points" and not (has_hand or spaces.moves_joints):
+    if hp.exploration == "points" and not spaces.follows_points:
         raise ValueError(
-            'exploration "points" needs the hand, but no three observed numbers follow '
-            "the first three actions: pass --exploration actions"
-        )
-    # Under end-effector control, three entries of an action displace the hand.
-    follows_points = spaces.moves_joints or spaces.num_arm_actions == 3
-    if hp.exploration == "points" and not follows_points:
-        raise ValueError(
-            'exploration "points" needs the control type "ee" or "joints": for another '
-            "one pass --exploration actions"
+            'exploration "points" needs the control type "joints", or three actions '
+            "that displace a hand whose position is observed: otherwise pass "
+            "--exploration actions"
         )
     if hp.critics == "parts" and len(split_goal(spaces.goal_size)) < 2:
         raise ValueError(
             'critics "parts" needs goals of several objects, such as those of Stack: '
             "pass --critics whole"
         )
-    uses_layout = (hp.relative_inputs, hp.augmentation) != ("none", "none")
-    if uses_layout and spaces.geometry is None:
-        raise ValueError(
-            "relative inputs and augmentation need a task whose observation_layout "
-            "and goal_entries name all entries of its observations and goals: declare "
-            "them, or pass --relative-inputs none --augmentation none"
-        )
-    has_mirror = spaces.geometry is None or spaces.geometry.action is not None
+    has_mirror = spaces.geometry is not None and spaces.geometry.action is not None
     if hp.augmentation != "none" and not has_mirror:
         raise ValueError(
             f"augmentation {hp.augmentation!r} needs end-effector control, and a task "

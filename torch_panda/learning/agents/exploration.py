@@ -80,7 +80,7 @@ class RandomPointModule(TensorDictModuleBase):
         self.in_keys = ["observation", "action"]
         self.out_keys = ["action"]  # type: ignore[misc]  # it has a setter
         num_envs, geometry = spaces.num_envs, spaces.geometry
-        hand_column, *object_columns = geometry.positions if geometry else (0,)
+        hand_column, *object_columns = (geometry and geometry.positions) or (0,)
         eps = torch.linspace(*hp.random_eps, num_envs)
         # A move lasts d steps on average. If it starts with probability p per step, the
         # pause before it lasts (1 - p) / p steps. Choose p so that d / (d + pause) is

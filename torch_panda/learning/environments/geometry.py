@@ -1,5 +1,6 @@
 """Geometry of a task: where its observations hold positions, and how to mirror them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -82,8 +83,8 @@ class Geometry:
         goal_height: Height of all goals that the task draws [m]. Networks that see
             differences of positions get this height for all goals, because achieved
             goals are lower. None leaves the goals unchanged.
-        orientation: First column of the object's quaternion in an observation, if goals
-            are orientations; else None.
+        orientation: First column of the object's quaternion in an observation, if a
+            goal is a quaternion and nothing else; else None.
         box: Lowest and highest (x, y, z) of the box in which the exploration "points"
             draws its points [m]; None means the box of the shipped tasks.
     """
@@ -174,6 +175,11 @@ def split_goal(size: int) -> list[slice]:
     return [slice(start, start + width) for start in range(0, size, width)]
 
 
+def observes_hand_first(robot: Robot) -> bool:
+    """Whether a robot observes what `Robot` does, which begins with the hand."""
+    return type(robot).observation is Robot.observation
+
+
 def declares_layout(robot: Robot, task: Task) -> bool:
     """Whether a task declares a layout that fits its observations and goals."""
     return find_parts(robot, task) is not None
@@ -186,12 +192,12 @@ def find_parts(
 
     Returns:
         Each quantity of an observation, and each of a goal: as a part of the
-        observation, with its first column in the goal. None if the task does not
-        declare ``observation_layout`` and ``goal_entries``, if they do not fit, or if a
-        subclass has changed the functions that they describe.
+        observation, with its first column in the goal, in the order of the goal. None
+        if the task does not declare ``observation_layout`` and ``goal_entries``, if
+        they do not fit, or if a subclass has changed the functions that they describe.
     """
     indices, layout = find_goal_indices(robot, task), task.observation_layout
-    if indices is None or layout is None:
+    if indices is None or layout is None or not observes_hand_first(robot):
         return None
     fingers = (WIDTH,) * (robot.observation_dim - 6)
     parts, start = [], 0
@@ -199,11 +205,8 @@ def find_parts(
         parts.append(Part(quantity, start))
         start += len(_MIRROR[quantity])
     goals = [(x, indices.index(x.start)) for x in parts if x.start in indices]
-    columns = [
-        x.start + k
-        for x, _ in sorted(goals, key=lambda goal: goal[1])
-        for k in range(len(_MIRROR[x.quantity]))
-    ]
+    goals.sort(key=lambda goal: goal[1])
+    columns = [x.start + k for x, _ in goals for k in range(len(_MIRROR[x.quantity]))]
     fits = start == robot.observation_dim + task.observation_dim
     return (parts, goals) if fits and tuple(columns) == indices else None
 
@@ -224,14 +227,13 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
 
     _, *objects = (part.start for part in parts if part.quantity == "position")
     positions = [goal for goal in goals if goal[0].quantity == "position"]
-    rotations = [goal for goal in goals if goal[0].quantity == "quaternion"]
     # Pairs of origin and point: the hand and an object, or an object and its goal. The
     # hand's position is at index 0.
     pairs = [(0, start) for start in objects]
     pairs += [(part.start, size + start) for part, start in positions]
     return Geometry(
-        points=tuple(point + axis for _, point in pairs for axis in range(3)),
-        origins=tuple(origin + axis for origin, _ in pairs for axis in range(3)),
+        points=_coordinates(point for _, point in pairs),
+        origins=_coordinates(origin for origin, _ in pairs),
         observation=tuple(x for part in parts for x in _MIRROR[part.quantity]),
         goal=tuple(x for part, _ in goals for x in _MIRROR[part.quantity]),
         action=(*_MIRROR["position"], *(1.0,) * (robot.observation_dim - 6))
@@ -240,8 +242,15 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
         positions=(0, *objects),
         goal_positions=tuple(start for _, start in positions),
         goal_height=task.sampled_goal_height,
-        orientation=rotations[0][0].start if rotations else None,
+        orientation=goals[0][0].start
+        if [part.quantity for part, _ in goals] == ["quaternion"]
+        else None,
     )
+
+
+def _coordinates(starts: Iterable[int]) -> tuple[int, ...]:
+    """The three columns of each position, from its first column."""
+    return tuple(start + axis for start in starts for axis in range(AXES))
 
 
 class Hand(NamedTuple):
@@ -326,8 +335,8 @@ def find_geometry(rollouts: TensorDict, hand: int | None = 0) -> Geometry:
 
     Args:
         rollouts: Transitions with random actions, [rollouts, steps].
-        hand: First column of ``observation`` with the position of the hand. Every
-            shipped robot observes it first. None means that it is unknown.
+        hand: First column of ``observation`` with the position of the hand. None means
+            that it is unknown.
     """
     following = rollouts.reshape(-1).get("next")
     observation, achieved = following["observation"], following["achieved_goal"]
@@ -358,8 +367,8 @@ def find_geometry(rollouts: TensorDict, hand: int | None = 0) -> Geometry:
             tuple((highest + margin[1]).tolist()),
         )
     return Geometry(
-        points=tuple(point + axis for _, point in pairs for axis in range(3)),
-        origins=tuple(origin + axis for origin, _ in pairs for axis in range(3)),
+        points=_coordinates(point for _, point in pairs),
+        origins=_coordinates(origin for origin, _ in pairs),
         observation=(1.0,) * size,
         goal=(1.0,) * goal_size,
         action=None,  # whether the task is symmetric is unknown

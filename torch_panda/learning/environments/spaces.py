@@ -15,9 +15,11 @@ from typing_extensions import Self
 from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.environments import GoalEnv
 from torch_panda.learning.environments.geometry import (
+    AXES,
     Geometry,
     find_geometry,
     find_layout,
+    observes_hand_first,
     probe,
     read_geometry,
 )
@@ -58,6 +60,15 @@ class Spaces:
         """Number of entries of an action that move the arm. They come first."""
         return self.action_size - int(self.has_free_gripper)
 
+    @property
+    def follows_points(self) -> bool:
+        """Whether the exploration "points" fits; see `follows_points`."""
+        return follows_points(
+            self.num_arm_actions,
+            knows_hand=self.geometry is None or bool(self.geometry.positions),
+            moves_joints=self.moves_joints,
+        )
+
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Make the object from the nested dict that `asdict` returned."""
@@ -71,6 +82,20 @@ class Spaces:
         device = torch.get_default_device()
         shape = torch.Size((*batch_size, self.action_size))
         return Bounded(-1.0, 1.0, shape, device=device)
+
+
+def follows_points(
+    num_arm_actions: int, *, knows_hand: bool, moves_joints: bool
+) -> bool:
+    """Whether the exploration "points" fits: it moves the hand or the joints.
+
+    Args:
+        num_arm_actions: Number of entries of an action that move the arm. Three of them
+            displace the hand.
+        knows_hand: Whether it is known where the position of the hand is observed.
+        moves_joints: Whether actions are displacements of joints.
+    """
+    return moves_joints or (knows_hand and num_arm_actions == AXES)
 
 
 def read_spaces(env: GoalEnv, *, finds_layout: bool = False) -> Spaces:
@@ -102,7 +127,7 @@ def _read_robot_spaces(env: RobotTaskEnv, *, finds_layout: bool) -> Spaces:
     robot = env.robot
     geometry = read_geometry(env)
     if geometry is None and finds_layout:
-        geometry = find_geometry(probe(env))
+        geometry = find_geometry(probe(env), 0 if observes_hand_first(robot) else None)
     return Spaces(
         **_read_sizes(env),
         has_free_gripper=robot.has_free_gripper,
