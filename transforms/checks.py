@@ -296,8 +296,12 @@ class DataCheck:
 
     def __init__(self, keys: Keys, ignored: tuple[NestedKey, ...]) -> None:
         self.shapes: dict[NestedKey, torch.Size] | None = None
-        self.is_finished = False
         self._keys, self._ignored = keys, ignored
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets the rows seen so far, for the data of another buffer."""
+        self.is_finished = False
         self._num_checks, self._num_rows = 0, 0
         self._pool: TensorDict | None = None  # the newest rows
         self._warned: set[str] = set()  # subjects of the warnings given so far

@@ -136,6 +136,7 @@ class Hindsight(envs.Transform):
             self._keys, single_env=self.single_env, capacity=self.capacity
         )
         self._has_checked_setup = self._has_sampled = False
+        self._data_check.restart()
 
     @classmethod
     def from_env(cls, env: envs.EnvBase, *args: Any, **options: Any) -> Self:  # noqa: ANN401
@@ -587,7 +588,9 @@ class HindsightRelabel(Hindsight):
         reward_key: Key of the reward.
         success_key: Key of the success.
         trajectory_key: Key of the trajectory ids. Data without ids must have the batch
-            shape [*environments, time].
+            shape [*environments, time]. If there is an entry "mask" of the same
+            nesting, of one bool per row, the rows where it is false are padding and
+            dropped (torchrl's `split_trajectories` writes this entry).
         single_env: Whether data of one dimension and without ids are successive steps
             of one environment.
         unit: Rows that share a goal. "row" draws a goal for each row. "slice" draws one

@@ -304,6 +304,15 @@ def test_scaled_rewards_are_refused(env_id, scaling):
         store(env, HindsightRelabel.from_env(env), 50, 30)
 
 
+def test_the_data_of_another_buffer_are_checked_too():
+    env = make("PandaPush-v1", 8)
+    relabel = HindsightRelabel.from_env(env)
+    store(env, relabel)
+    relabel.empty()
+    with pytest.raises(ValueError, match=r"\* reward_fn.*RewardScaling"):
+        store(TransformedEnv(make("PandaPush-v1", 8), RewardScaling(0.0, 0.1)), relabel)
+
+
 def test_rewards_that_frame_skipping_added_up_are_refused():
     torch.manual_seed(1)  # of the random actions
     env = TransformedEnv(make("PandaPush-v1", 8), FrameSkipTransform(4))
