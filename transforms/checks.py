@@ -37,7 +37,7 @@ UNKNOWN_ROWS = (
     "rows of the buffer did not pass through this transform when they were stored: put "
     "the transform into the buffer before the first extend(), put transforms that "
     "select or exclude entries after it, and pass rows that are stored already through "
-    "prepare()"
+    "prepare(); only one thread may write to the buffer"
 )
 FIX = "compute it in the buffer, after this transform (append_transform)"
 

@@ -46,6 +46,9 @@ class TrajectoryMemory:
     ``i % size``. `_serials` leads from a trajectory number to the serial numbers of its
     transitions. To draw a goal for a transition means to choose one of these.
 
+    Only one thread may write to the buffer. The memory takes transitions in the order
+    in which they pass through the transform, and two threads may store them in another.
+
     A new transition continues the open trajectory with the same id. (A trajectory is
     open until one of its transitions is done.) But a second collector may reuse an id
     that the first one left open. The memory detects this by the root goal, which is the
