@@ -3,13 +3,17 @@
 import importlib
 import re
 from dataclasses import fields
+from functools import partial
 from math import inf, nan
 from typing import get_args, get_type_hints
 
 import pytest
 
 from torch_panda.commands import train, watch
+from torch_panda.learning.agents import find_agent
 from torch_panda.learning.limits import check_limits, find_limits
+from torch_panda.learning.options import Args, check
+from torch_panda.learning.training import Run
 
 
 def numbers(hint):
@@ -54,6 +58,26 @@ def test_training_refuses_numbers_out_of_range(tmp_path, option, value):
     out = tmp_path / "run"
     refused(train, message, **{option: value}, out=out)
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        *(("network", "layernorm"), ("augmentation", "mirror_shift"), ("algo", "ppo")),
+        *(("exploration", "point"), ("her", "relabelled"), ("critics", "part")),
+        *(("preset", "recipes"), ("logger", None)),
+    ],
+)
+def test_training_refuses_unknown_choices(tmp_path, option, value):
+    args = Args(**{option: value})
+    for start in (check, partial(Run, out=tmp_path)):
+        with pytest.raises(ValueError, match=f"^{option} must be one of .*{value}"):
+            start(args)
+
+
+def test_an_unknown_algorithm_is_not_taken_for_an_offline_one():
+    with pytest.raises(ValueError, match=r"algo must be one of .*, got 'ppo'"):
+        find_agent(Args(algo="ppo"))
 
 
 @pytest.mark.parametrize("device", ["", "nothing", "meta", "cuda:99"])

@@ -3,10 +3,10 @@
 A limit is part of the type of an option, such as ``batch_size: Positive``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,12 @@ Discount = Annotated[float, Limit("above 0 and at most 1", lambda x: 0 < x <= 1)
 
 
 def check_limits(args: object) -> None:
-    """Check the options of a command. An option that is None is always accepted.
+    """Check the options of a command. A number that is None is always accepted.
 
     Raises:
-        ValueError: An option is out of its limits.
+        ValueError: An option is out of its limits, or not one of its choices.
     """
+    check_choices(type(args), vars(args))
     for name, hint in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
         numbers = value if isinstance(value, tuple) else (value,)
@@ -47,6 +48,24 @@ def check_limits(args: object) -> None:
         for limit in find_limits(hint):
             if not all(number is None or limit.holds(number) for number in numbers):
                 raise ValueError(f"{name} must be {limit.description}, got {value}")
+
+
+def check_choices(options: type, values: Mapping[str, Any]) -> None:
+    """Check the values of options that have a `Literal` as their type.
+
+    Args:
+        options: Dataclass of the options.
+        values: Values of some of the options, by name.
+
+    Raises:
+        ValueError: A value is not one of the choices.
+    """
+    for name, hint in get_type_hints(options).items():
+        choices = get_args(hint) if get_origin(hint) is Literal else ()
+        if choices and name in values and values[name] not in choices:
+            raise ValueError(
+                f"{name} must be one of {', '.join(choices)}, got {values[name]!r}"
+            )
 
 
 def find_limits(hint: Any) -> Iterator[Limit]:  # noqa: ANN401 (any type)

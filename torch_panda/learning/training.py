@@ -30,6 +30,7 @@ from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.evaluation.curve import NUM_ENVS, Curve
 from torch_panda.learning.files.logger import make_logger
 from torch_panda.learning.files.run_files import Checkpoint, Progress
+from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args
 from torch_panda.learning.sources import Batches, DataSet, Experience
 
@@ -54,8 +55,8 @@ class Run:
 
     Raises:
         TypeError: The task does not have one of the ``task_options``.
-        ValueError: An option does not fit the task, the data or another option, or the
-            run to resume cannot be read.
+        ValueError: An option is out of its limits or does not fit the task, the data or
+            another option, or the run to resume cannot be read.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Run:
         *,
         make_own_env: Callable[[int], GoalEnv] | None = None,
     ) -> None:
+        check_limits(args)
         self.args = args
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         # With "medium", PyTorch leaves products of float32 matrices to oneDNN. On CPUs

@@ -37,7 +37,7 @@ def find_agent(hp: Hyperparameters) -> type[Agent]:
     """Find the class of an algorithm.
 
     Raises:
-        ValueError: The algorithm does not learn offline, or only offline.
+        ValueError: The algorithm is unknown, does not learn offline, or only offline.
     """
     agents = OFFLINE_AGENTS if hp.offline else AGENTS
     if hp.algo in agents:
@@ -47,7 +47,9 @@ def find_agent(hp: Hyperparameters) -> type[Agent]:
             f"--offline learns by {', '.join(OFFLINE_AGENTS)}, got --algo {hp.algo}: "
             "choose one of them, or leave out --offline"
         )
-    raise ValueError(f"{hp.algo} learns offline: add --offline")
+    if hp.algo in OFFLINE_AGENTS:
+        raise ValueError(f"{hp.algo} learns offline: add --offline")
+    raise ValueError(f"algo must be one of {', '.join(AGENTS)}, got {hp.algo!r}")
 
 
 def make_agent(env: GoalEnv, hp: Hyperparameters) -> Agent:

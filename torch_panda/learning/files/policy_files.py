@@ -1,9 +1,7 @@
 """Files of trained policies: their weights, and the numbers to build the networks."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torch_panda.learning import files
 from torch_panda.learning.agents import Agent, Hyperparameters, find_agent
 from torch_panda.learning.environments.spaces import Spaces
+from torch_panda.learning.limits import check_choices
 from torch_panda.policies import shipped_policies
 
 
@@ -70,9 +69,10 @@ def _read_policy(path: Path) -> Policy:
     keys = ("env_id", ("spaces", "geometry"), *finite)
     content = files.read(path, "a policy", keys, finite=finite)
     try:
-        hp = _read_hyperparameters(path, content["hyperparameters"])
+        check_choices(Hyperparameters, content["hyperparameters"])
+        hp = Hyperparameters(**content["hyperparameters"])
         spaces = Spaces.from_dict(content["spaces"])
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(
             f"{path} was saved by another version of torch_panda, which has other "
             f"options or describes environments by other entries: {error}"
@@ -89,23 +89,6 @@ def _read_policy(path: Path) -> Policy:
             "hyperparameters"
         ) from None
     return Policy(agent.policy, content["env_id"], spaces)
-
-
-def _read_hyperparameters(path: Path, values: Mapping[str, Any]) -> Hyperparameters:
-    """Make the hyperparameters that a file holds.
-
-    Raises:
-        ValueError: This version of torch_panda does not know one of their values.
-        TypeError: It does not know one of their names.
-    """
-    for name, hint in get_type_hints(Hyperparameters).items():
-        choices = get_args(hint) if get_origin(hint) is Literal else ()
-        if choices and name in values and values[name] not in choices:
-            raise ValueError(
-                f"{path} was saved by another version of torch_panda: {name} must be "
-                f"one of {choices}, got {values[name]!r}"
-            )
-    return Hyperparameters(**values)
 
 
 def save_policy(path: Path, agent: Agent, env_id: str) -> None:
