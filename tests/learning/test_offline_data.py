@@ -1,5 +1,7 @@
 """Data of offline learning: rewards, goals and waypoints of sampled transitions."""
 
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -49,6 +51,16 @@ def test_rewards_are_those_of_the_value_goal(env, transitions):
     assert torch.equal(b.ends, reached)
     for key in ("observation", "action"):
         assert torch.equal(batch[key], transitions[key][batch["index"]])
+
+
+def test_an_observation_that_holds_numbers_of_the_goal_causes_no_warning():
+    with torch_panda.make("PandaPegInsertion-v1", num_envs=16, seed=0) as env:
+        data = env.rollout(3).reshape(-1)
+        data["collector", "traj_ids"] = torch.arange(len(data)) // 3
+        offline = OfflineData(data.select(*STORED_KEYS), env, GOALS, discount=0.99)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            offline.sample(100)
 
 
 @pytest.mark.parametrize(

@@ -60,9 +60,11 @@ class OfflineData:
         data["next", "reward"] = reward(
             data["next", "achieved_goal"], data["desired_goal"]
         )
-        transform = GoalSampler(
+        transform = GoalSampler.from_env(
+            env,
             goal_strategies,
             reward_fn=reward,
+            success_fn=None,
             terminated_fn=self.is_success,
             discount=discount,
         )
