@@ -5,11 +5,14 @@ import os
 import socket
 import time
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
+import torch_panda
 from tests.commands.runs import Kill, kill, points, weights
+from tests.learning.test_geometry import OneNumberMore
 from torch_panda.commands import train
 from torch_panda.learning.files import run_files
 from torch_panda.learning.files.run_files import check_folder, lock_folder
@@ -21,7 +24,6 @@ pytestmark = pytest.mark.usefixtures("quick")
 
 def train_whole(args, out):
     """Train until the end, and return the weights and the curve without times."""
-    out.mkdir(exist_ok=True)
     run = Run(args, out)
     run.train()
     run.close()
@@ -43,6 +45,16 @@ def test_a_run_killed_in_its_first_evaluation_can_be_resumed(tmp_path, monkeypat
     check_folder(out, resume=True)
     resumed = train_whole(replace(args, resume=True), out)
     torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
+
+
+def test_a_run_is_not_resumed_after_its_task_has_changed(tmp_path):
+    robot = partial(torch_panda.Panda, block_gripper=True)
+    args = Args(env_id="Changed-v0", num_envs=2, total_steps=100, updates_per_step=0.1)
+    torch_panda.register("Changed-v0", robot=robot, task=torch_panda.Push)
+    train_whole(args, tmp_path)
+    torch_panda.register("Changed-v0", robot=robot, task=OneNumberMore)
+    with pytest.raises(ValueError, match=r"cannot resume .* the task or the version"):
+        Run(replace(args, resume=True), tmp_path)
 
 
 def hold(folder, sender):

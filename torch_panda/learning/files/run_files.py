@@ -113,7 +113,8 @@ class Checkpoint:
         The options must be those of the saved run. Only `total_steps` may be larger.
 
         Raises:
-            ValueError: The file is damaged, or its run had other options or data.
+            ValueError: The file is damaged, or its run had other options, data or sizes
+                of observations.
         """
         keys = (
             *("args", "agent", "optimizer", "updates", "buffer"),
@@ -145,7 +146,13 @@ class Checkpoint:
                 "cannot resume with other data: the run learned from data with the "
                 f"hash {data_hash}, these have {self.data_hash}"
             )
-        self.agent.load_state_dict(state["agent"])
+        try:
+            self.agent.load_state_dict(state["agent"])
+        except RuntimeError:
+            raise ValueError(
+                f"cannot resume {self.out}: its networks have other sizes than those "
+                "for the task, so the task or the version of torch_panda has changed"
+            ) from None
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]
         if self.buffer is not None:
