@@ -14,7 +14,8 @@ from torch_panda.bullet import FAST
 from torch_panda.commands import plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import sources
-from torch_panda.learning.options import default_args
+from torch_panda.learning.options import Args, default_args
+from torch_panda.learning.recipes import OFFLINE
 from torch_panda.learning.sources import draw_batches
 from torch_panda.learning.training import Training
 
@@ -181,7 +182,9 @@ def test_a_file_trains_as_its_data_do_and_a_changed_file_is_refused(tmp_path):
     first = make_args(tmp_path / "first", total_steps=2)
     train.main(first)
     data = tmp_path / "first" / "data.pt"
-    args = make_args(tmp_path / "second", data=str(data), total_steps=2)
+    unused = {"transitions": Args.transitions, "num_envs": OFFLINE["num_envs"]}
+    out = tmp_path / "second"
+    args = make_args(out, data=str(data), total_steps=2, **unused)
     train.main(args)
     runs = [tmp_path / name for name in ("first", "second")]
     ours, theirs = map(read_weights, runs)

@@ -56,7 +56,8 @@ def parse(arguments: Sequence[str]) -> Args:
     Preset, task and algorithm determine the defaults, so these options are read first.
 
     Raises:
-        ValueError: A module of ``--import`` does not exist.
+        ValueError: A module of ``--import`` does not exist, or the preset does not fit
+            ``--offline``.
     """
     # The help is printed at the end, with the defaults of this preset and algorithm.
     without_help = [x for x in arguments if x not in ("-h", "--help")]
@@ -64,7 +65,12 @@ def parse(arguments: Sequence[str]) -> Args:
     first = tyro.cli(Args, prog=PROG, args=without_help, default=recipe)
     import_modules(first.imports)
     names = [x.split("=")[0].replace("_", "-") for x in arguments]
-    if first.offline and "--preset" not in names:
+    if first.offline:
+        if "--preset" in names and first.preset != "offline":
+            raise ValueError(
+                f"--offline goes with the preset offline only, got {first.preset}: "
+                "drop --preset"
+            )
         first.preset = "offline"
     algo = first.algo if "--algo" in names else None
     default = default_args(first.preset, first.env_id, algo)

@@ -231,6 +231,18 @@ def check_offline(args: Args) -> None:
         raise ValueError(f"seeds must differ, got {', '.join(map(str, args.seeds))}")
     if args.seeds and args.seed:
         raise ValueError("seed has no effect with --seeds: drop --seed")
+    if args.seeds and args.stop_when_solved:
+        raise ValueError(
+            "seeds learn together until the last step: drop --stop-when-solved, or "
+            "train each seed alone with --seed"
+        )
+    default = Args(**OFFLINE)
+    for name in ("transitions", "num_envs"):
+        if args.data not in KINDS and getattr(args, name) != getattr(default, name):
+            raise ValueError(
+                f"{name} has no effect with the data of {args.data}: drop "
+                f"--{name.replace('_', '-')}"
+            )
 
 
 def check(args: Args) -> None:
