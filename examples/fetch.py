@@ -20,7 +20,6 @@ TOTAL_STEPS = 1_200
 def main(out: Path) -> Evaluation:
     """Train with the recipe, and evaluate the policy."""
     args = replace(default_args("recipe", ENV_ID), total_steps=TOTAL_STEPS)
-    out.mkdir()
     run = Run(args, out)  # writes curve.csv, curve.png and checkpoint.pt
     run.train()
     run.close()

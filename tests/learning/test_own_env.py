@@ -84,16 +84,18 @@ def test_a_torchrl_environment_of_ones_own_is_trained_from_python(tmp_path):
     assert options == {"gamma": 1 - 1 / (0.4 * STEPS)}
     options |= {"total_steps": 320, "eval_interval": 160, "updates_per_step": 0.25}
     options = RECIPE | options
-    made = []
+    made, out = [], tmp_path / "new" / "run"
     run = Run(
         Args(env_id="Point", preset="recipe", **options),
-        tmp_path,
+        out,
         make_own_env=lambda n: made.append(n) or Point(n),
     )
     assert run.train()
     run.close()
+    with pytest.raises(ValueError, match="holds a run"):
+        Run(run.args, out, make_own_env=Point)
     assert made == [8, 16]  # for the episodes of the training and of the evaluations
-    assert [row["step"] for row in read_curve(tmp_path)] == ["0", "160", "320"]
+    assert [row["step"] for row in read_curve(out)] == ["0", "160", "320"]
     assert run.agent.updates == 80
     spaces = run.agent.spaces
     assert spaces.geometry.positions == (0,)  # the hand

@@ -29,7 +29,11 @@ from torch_panda.learning.agents.stacked import StackedAgents
 from torch_panda.learning.environments import GoalEnv, make_env
 from torch_panda.learning.evaluation.curve import NUM_ENVS, Curve
 from torch_panda.learning.files.logger import make_logger
-from torch_panda.learning.files.run_files import Checkpoint, Progress
+from torch_panda.learning.files.run_files import (
+    Checkpoint,
+    Progress,
+    check_folder,
+)
 from torch_panda.learning.limits import check_limits
 from torch_panda.learning.options import Args
 from torch_panda.learning.sources import Batches, DataSet, Experience
@@ -45,7 +49,7 @@ class Run:
 
     Args:
         args: Options of the training.
-        out: Folder of the results.
+        out: Folder of the results, which is made if it does not exist.
         data: Transitions (n,), as `torch_panda.datasets.read_demos` returns them. With
             the option ``offline``, they are the data set to learn from. Otherwise they
             are demonstrations, which are a part of each batch.
@@ -56,7 +60,8 @@ class Run:
     Raises:
         TypeError: The task does not have one of the ``task_options``.
         ValueError: An option is out of its limits or does not fit the task, the data or
-            another option, or the run to resume cannot be read.
+            another option, the run to resume cannot be read, or the folder holds a run
+            that is not resumed.
     """
 
     def __init__(
@@ -69,6 +74,7 @@ class Run:
         make_own_env: Callable[[int], GoalEnv] | None = None,
     ) -> None:
         check_limits(args)
+        check_folder(out, resume=args.resume)
         self.args = args
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         # With "medium", PyTorch leaves products of float32 matrices to oneDNN. On CPUs
@@ -109,6 +115,7 @@ class Run:
         if args.resume:
             self.checkpoint.load()
         self.random_state = torch.get_rng_state()
+        out.mkdir(parents=True, exist_ok=True)
 
     def _make_env(self) -> GoalEnv:
         """Make the environments of the options, for training."""
