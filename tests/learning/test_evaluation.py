@@ -79,6 +79,13 @@ def test_the_wilson_interval_is_that_of_the_textbook():
     assert wilson_interval(8, 10) == pytest.approx((0.490, 0.943), abs=1e-3)
 
 
+class Stay(torch.nn.Module):
+    """Changes the TensorDict in place, and returns nothing."""
+
+    def forward(self, tensordict):
+        tensordict["action"] = 0 * tensordict["desired_goal"]
+
+
 @pytest.mark.parametrize("tasks", ["random", "fixed"])
 def test_a_function_may_be_the_policy(tasks):
     def stay(tensordict):
@@ -87,9 +94,10 @@ def test_a_function_may_be_the_policy(tasks):
     module = TensorDictModule(lambda goal: 0 * goal, ["desired_goal"], ["action"])
     results = [
         torch_panda.evaluate(policy, "PandaReach-v1", episodes=5, tasks=tasks)
-        for policy in (stay, module)
+        for policy in (stay, module, Stay())
     ]
-    assert torch.equal(results[0].returns, results[1].returns)
+    for result in results[1:]:
+        assert torch.equal(results[0].returns, result.returns)
 
 
 def test_a_policy_in_training_mode_is_not_changed():
@@ -156,6 +164,7 @@ def test_episodes_of_a_fixed_task_differ_and_depend_on_the_seed_alone():
         ({"policy": "PandaReach-v1"}, TypeError, "load_policy reads one from a file"),
         ({"policy": torch.nn.Linear}, TypeError, "must be a module or a function"),
         ({"policy": lambda td: td["desired_goal"]}, TypeError, "wrap a network as"),
+        ({"policy": torch.nn.Linear(6, 3)}, TypeError, "wrap a network as"),
         ({"n_envs": 4}, TypeError, "n_envs"),
     ],
 )

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torch_panda.checks import check_positive
@@ -122,8 +123,9 @@ def evaluate(
         )
     if tasks not in get_args(Tasks):
         raise ValueError(f'tasks must be "random" or "fixed", got {tasks!r}')
-    if not isinstance(policy, torch.nn.Module):
-        policy = _check_results(policy)
+    acting = policy
+    if not isinstance(policy, TensorDictModuleBase):
+        acting = _check_results(policy)
     num_envs = min(num_envs, episodes)
     with (
         _evaluation_mode(policy),
@@ -133,8 +135,8 @@ def evaluate(
             if not isinstance(env, RobotTaskEnv):
                 raise refusal(env_id, "fixed tasks")
             states = evaluation_tasks(env_id)
-            return evaluate_fixed_starts(env, policy, episodes, states, seed=seed)
-        return evaluate_episodes(env, policy, episodes)
+            return evaluate_fixed_starts(env, acting, episodes, states, seed=seed)
+        return evaluate_episodes(env, acting, episodes)
 
 
 @contextmanager
@@ -157,16 +159,20 @@ def _evaluation_mode(policy: Policy) -> Iterator[None]:
 
 def _check_results(policy: Policy) -> Policy:
     """Return a function that refuses other results of a policy than a TensorDict."""
+    keys = "in_keys=[...], out_keys=['action']"
+    hint = f"wrap a network as TensorDictModule(network, {keys})"
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
-        result = policy(tensordict)
+        try:
+            result = policy(tensordict)
+        except TypeError as error:
+            raise TypeError(f"policy failed with a TensorDict: {hint}") from error
         if result is None:  # the policy has changed the TensorDict in place
             return tensordict
         if not isinstance(result, TensorDictBase):
             raise TypeError(
                 f"policy must write 'action' into the TensorDict and return it, got "
-                f"{type(result).__name__}: wrap a network as "
-                "TensorDictModule(network, in_keys=[...], out_keys=['action'])"
+                f"{type(result).__name__}: {hint}"
             )
         return result
 
