@@ -145,7 +145,11 @@ def spoil_curve(folder):
     (folder / "curve.csv").write_text("step,success\n100,abc\n")
 
 
-@pytest.mark.parametrize("spoil", [spoil_arguments, spoil_curve])
+def spoil_columns(folder):
+    (folder / "curve.csv").write_text("step,return\n100,-40\n")
+
+
+@pytest.mark.parametrize("spoil", [spoil_arguments, spoil_curve, spoil_columns])
 def test_a_run_that_cannot_be_read_is_named(runs, tmp_path, spoil):
     spoil(runs / "1")
     with pytest.raises(

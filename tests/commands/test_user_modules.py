@@ -98,7 +98,7 @@ def test_a_missing_extra_is_one_error_with_its_command(monkeypatch):
 @pytest.mark.parametrize("arguments", [["~/runs"], ["runs", "--out=~/curves.png"]])
 def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch, arguments):
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setattr(plot, "read_runs", lambda folders: folders)
+    monkeypatch.setattr(plot, "read_runs", lambda folders, metric: folders)
     drawn = []
     monkeypatch.setattr(plot, "plot_panels", lambda *args: drawn.extend(args))
     main(["plot", *arguments])

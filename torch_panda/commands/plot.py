@@ -30,7 +30,7 @@ def main(args: Args) -> None:
     out = args.out.with_suffix(args.out.suffix or ".png")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        plot_panels(read_runs(args.runs), args.metric, out)
+        plot_panels(read_runs(args.runs, args.metric), args.metric, out)
     except (ValueError, OSError) as error:
         raise SystemExit(f"cannot draw: {error}") from None
     print(f"wrote {out}")

@@ -102,11 +102,11 @@ def draw_panel(axes: Axes, lines: Lines, metric: Metric) -> None:
     axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
-def read_runs(folders: list[Path]) -> dict[str, Lines]:
-    """Read the curves of all runs below some folders, by task.
+def read_runs(folders: list[Path], metric: Metric = "success") -> dict[str, Lines]:
+    """Read a column of the curves of all runs below some folders, by task.
 
     Raises:
-        ValueError: There is no run, or a run cannot be read.
+        ValueError: There is no run, or a run cannot be read or lacks the column.
     """
     runs: dict[str, Lines] = {}
     for path in sorted({p for folder in folders for p in folder.rglob("curve.csv")}):
@@ -121,7 +121,7 @@ def read_runs(folders: list[Path]) -> dict[str, Lines]:
             options = args.get("label") or line_label(str(args["preset"]), changed)
             with path.open() as file:
                 curve = [
-                    {key: float(value) for key, value in row.items() if value}
+                    {key: float(row[key]) for key in ("step", metric)}
                     for row in csv.DictReader(file)
                 ]
         except (OSError, ValueError, KeyError, TypeError) as error:
