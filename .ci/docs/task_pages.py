@@ -26,7 +26,8 @@ TEMPLATE = Template(Path(__file__).with_name("task.md").read_text())
 POLICIES = "torch_panda/policies/README.md"
 LEARNING = "torch_panda/learning/README.md"
 
-SIZES = {"number": 1, "quaternion": 4}  # of a quantity; the others have 3 numbers
+# Sizes of quantities; the others have 3 numbers.
+SIZES = {"number": 1, "quaternion": 4, "cube_quaternion": 4}
 ROBOT_ENTRIES = (
     (3, "position of the end-effector, the point between the fingers"),
     (3, "velocity of the end-effector"),

@@ -130,6 +130,22 @@ def test_rotations_are_the_same_for_the_24_orientations_that_look_alike():
         torch.testing.assert_close(again, expected, atol=1e-5, rtol=0)
 
 
+class FlipCan(torch_panda.Flip):
+    """The object has a quaternion, but does not look the same in 24 orientations."""
+
+    observation_layout = ("position", "quaternion", "velocity", "angular_velocity")
+
+
+def test_only_a_cube_looks_the_same_in_24_orientations():
+    robot = torch_panda.Panda()
+    with torch_panda.RobotTaskEnv(robot=robot, task=FlipCan(), num_envs=2) as env:
+        geometry = read_geometry(env)
+        assert geometry.orientation is None
+        assert geometry.goal == (-1, 1, -1, 1)
+        agent = make_agent(env, Hyperparameters(relative_inputs="fine"))
+        env.rollout(2, agent.explore)
+
+
 class Reversed(torch_panda.Push):
     """Observes the numbers of the inherited layout in another order."""
 

@@ -327,9 +327,9 @@ class Robot(Configured):
             target: Return value of `arm_setpoint`, (num_envs, 3) or (num_envs, 7).
             ee_frame: See `VectorSimulation`.
         """
-        centre, rotation = target.new_tensor(ee_frame).split((3, 4))
-        if not centre.any():  # as in the Panda
+        if not any(ee_frame[:3]):  # as in the Panda
             return target
+        centre, rotation = target.new_tensor(ee_frame).split((3, 4))
         position, orientation = target[:, :3], target[:, 3:]
         if self.control_type == "ee":
             orientation = target.new_tensor(self.ee_orientation)

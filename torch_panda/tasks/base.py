@@ -16,11 +16,18 @@ from torch_panda.rotations import NO_ROTATION
 
 RewardType = Literal["sparse", "dense"]
 Quantity = Literal[
-    "position", "velocity", "euler_angles", "quaternion", "angular_velocity", "number"
+    "position",
+    "velocity",
+    "euler_angles",
+    "quaternion",
+    "cube_quaternion",
+    "angular_velocity",
+    "number",
 ]
 """Physical quantity that consecutive numbers of an observation describe. A "number" is
 one number, which does not change if the scene is rotated or mirrored. A quaternion
-(xyzw) has 4 numbers. The other quantities have 3, in the world frame."""
+(xyzw) has 4 numbers; that of a cube says that 24 orientations look the same. The other
+quantities have 3 numbers, in the world frame."""
 OBJECT_LAYOUT: tuple[Quantity, ...] = (
     "position",
     "euler_angles",

@@ -48,7 +48,7 @@ class Flip(Task):
     goal_dim = 4
     observation_dim = 13
     goal_entries = GoalEntries("task", (3, 4, 5, 6))
-    observation_layout = ("position", "quaternion", "velocity", "angular_velocity")
+    observation_layout = ("position", "cube_quaternion", "velocity", "angular_velocity")
     changeable: ClassVar[tuple[str, ...]] = ("obj_xy_range",)
 
     distance_threshold: float = 0.2

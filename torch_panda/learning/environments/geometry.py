@@ -31,6 +31,7 @@ _MIRROR: dict[Quantity, tuple[float, ...]] = {
     "euler_angles": (-1.0, 1.0, -1.0),
     "angular_velocity": (-1.0, 1.0, -1.0),
     "quaternion": (-1.0, 1.0, -1.0, 1.0),
+    "cube_quaternion": (-1.0, 1.0, -1.0, 1.0),
     "number": (1.0,),
 }
 
@@ -84,7 +85,7 @@ class Geometry:
             differences of positions get this height for all goals, because achieved
             goals are lower. None leaves the goals unchanged.
         orientation: First column of the object's quaternion in an observation, if a
-            goal is a quaternion and nothing else; else None.
+            goal is the quaternion of a cube and nothing else; else None.
         box: Lowest and highest (x, y, z) of the box in which the exploration "points"
             draws its points [m]; None means the box of the shipped tasks.
     """
@@ -243,7 +244,7 @@ def read_geometry(env: RobotTaskEnv) -> Geometry | None:
         goal_positions=tuple(start for _, start in positions),
         goal_height=task.sampled_goal_height,
         orientation=goals[0][0].start
-        if [part.quantity for part, _ in goals] == ["quaternion"]
+        if [part.quantity for part, _ in goals] == ["cube_quaternion"]
         else None,
     )
 
