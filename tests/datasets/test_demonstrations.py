@@ -159,7 +159,7 @@ def test_imitation_goes_on_where_it_was_stopped(make_demos, tmp_path):
     options = {"total_steps": 0, "pretrain_updates": 20, "augmentation": "mirror"}
     args = small(make_demos(), algo="td3", **options)
 
-    whole = make_run(args, tmp_path)
+    whole = make_run(args, tmp_path / "whole")
     before = weights(whole)
     assert whole.train()
     after = weights(whole)
@@ -205,7 +205,7 @@ def test_the_imitation_is_evaluated_also_after_a_kill(make_demos, tmp_path):
     """A kill, or a second Ctrl-C, ends the evaluation after the last imitation."""
     options = {"total_steps": 100, "pretrain_updates": 4, "updates_per_step": 0.05}
     args = small(make_demos(), **options)
-    whole = make_run(args, tmp_path)
+    whole = make_run(args, tmp_path / "whole")
     assert whole.train()
     whole.close()
 
