@@ -377,6 +377,13 @@ class Hindsight(envs.Transform):
                     "one goal per slice",
                     stacklevel=2,
                 )
+            sampler = getattr(buffer, "sampler", None)
+            overwrites_ends = getattr(sampler, "truncated_key", None) is not None
+            if TERMINATED in self._functions and overwrites_ends:
+                raise ValueError(
+                    "the sampler overwrites terminated and done of relabelled rows: "
+                    "pass it truncated_key=None"
+                )
         # One buffer of an ensemble may hold rows of another transform.
         if is_first or isinstance(buffer, ReplayBufferEnsemble):
             achieved = batch.get(keys.next_achieved_goal)

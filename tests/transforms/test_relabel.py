@@ -414,6 +414,22 @@ def test_slices_share_a_goal(strategy, strict):
     assert abs(share.mean() - 0.8) <= 6 * 0.4 / len(share) ** 0.5
 
 
+def test_a_sampler_that_overwrites_relabelled_ends_is_refused():
+    def sample(**options):
+        sampler = SliceSampler(
+            slice_len=4, traj_key=("collector", "traj_ids"), **options
+        )
+        rb = make_buffer(
+            100, sampler=sampler, unit="slice", terminated_fn=terminated_fn
+        )
+        rb.extend(Envs(1, [8]).chunk(16).reshape(-1))
+        return rb.sample()
+
+    sample(truncated_key=None)
+    with pytest.raises(ValueError, match="truncated_key=None"):
+        sample()
+
+
 def test_padded_slices_share_a_goal():
     sampler = SliceSampler(
         slice_len=6,
