@@ -72,7 +72,10 @@ class GoalEnv(GoalFunctions, gymnasium.Env[Observation, NDArray[np.float32]]):
         else:
             check_no_arguments(arguments)
         if env.batch_size:
-            raise ValueError(f"the batch size must be [], got {list(env.batch_size)}")
+            raise ValueError(
+                f"the batch size must be [], got {list(env.batch_size)}: for several "
+                "environments use gymnasium.make_vec or GoalVectorEnv"
+            )
         self.torch_env = env
         self.metadata = metadata_of(env)
         self.render_mode = render_mode
