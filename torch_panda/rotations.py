@@ -68,6 +68,11 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack(product, dim=-1)
 
 
+def inverse(quaternion: Tensor) -> Tensor:
+    """Inverse rotations, (..., 4)."""
+    return torch.cat((-quaternion[..., :3], quaternion[..., 3:]), -1)
+
+
 def rotate_vector(quaternion: Sequence[float], vector: Sequence[float]) -> list[float]:
     """Rotate one vector by one quaternion, as `rotate` does, but without tensors."""
     x, y, z, w = quaternion

@@ -14,11 +14,6 @@ from torch_panda.rotations import dot
 from torch_panda.rotations import quaternion_product as compose
 
 
-def inverse(quaternion: Tensor) -> Tensor:
-    """Inverse rotations, (..., 4)."""
-    return torch.cat((-quaternion[..., :3], quaternion[..., 3:]), -1)
-
-
 def to_matrix(quaternion: Tensor) -> Tensor:
     """Matrices of rotations, (..., 3, 3)."""
     x, y, z, w = quaternion.unbind(-1)

@@ -26,6 +26,7 @@ from torch_panda.checks import (
 from torch_panda.robots.gripper import Gripper
 from torch_panda.rotations import (
     NO_ROTATION,
+    inverse,
     quaternion_product,
     rotate,
     rotation_vector_to_quaternion,
@@ -334,8 +335,8 @@ class Robot(Configured):
         if self.control_type == "ee":
             orientation = target.new_tensor(self.ee_orientation)
             orientation = orientation / torch.linalg.vector_norm(orientation)
-        inverse = rotation * rotation.new_tensor((-1.0, -1.0, -1.0, 1.0))
-        offset = rotate(quaternion_product(orientation, inverse), centre)
+        link_orientation = quaternion_product(orientation, inverse(rotation))
+        offset = rotate(link_orientation, centre)
         return torch.cat((position - offset, target[:, 3:]), dim=1)
 
     def control(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_panda.bullet import PhysicsClient, VectorSimulation, Visual
 from torch_panda.checks import check_above_zero, check_not_negative
-from torch_panda.rotations import NO_ROTATION, rotate, rotation_distance
+from torch_panda.rotations import NO_ROTATION, inverse, rotate, rotation_distance
 from torch_panda.tasks.base import Bodies, GoalEntries, ObjectState, Task
 from torch_panda.tasks.table import (
     CUBE,
@@ -111,10 +111,9 @@ class Flip(Task):
         """The cube in the goal's orientation, with its lowest corner on the table."""
         position = torch.zeros_like(goal[:, :3])
         upwards = goal.new_tensor((0.0, 0.0, 1.0))
-        inverse = goal * goal.new_tensor((-1.0, -1.0, -1.0, 1.0))
         # In the cube's frame, the 1-norm of the table's normal is the height of the
         # centre above the lowest corner, in half edge lengths.
-        normal = rotate(inverse, upwards)
+        normal = rotate(inverse(goal), upwards)
         position[:, 2] = CUBE_SIZE / 2 * normal.abs().sum(dim=1)
         return objects._replace(pose=torch.cat((position, goal), dim=1).unsqueeze(1))
 

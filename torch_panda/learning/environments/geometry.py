@@ -13,13 +13,13 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.envs.goal_observation import find_goal_indices
 from torch_panda.experts.cube_orientations import (
     compose,
-    inverse,
     same_half,
     straight_orientations,
     straighten,
     to_matrix,
 )
 from torch_panda.robots import Robot
+from torch_panda.rotations import inverse
 from torch_panda.tasks import Task
 from torch_panda.tasks.base import Quantity
 
