@@ -84,6 +84,12 @@ def test_make_says_what_to_use_for_an_unknown_argument(option, value, advice):
         torch_panda.make("PandaPush-v1", **{option: value})
 
 
+@pytest.mark.parametrize("from_pixels", [False, True])
+def test_make_refuses_a_sensor_without_a_sequence(from_pixels):
+    with pytest.raises(TypeError, match=r"tuple or list of names .*got 'joint_state'"):
+        torch_panda.make("PandaPush-v1", sensors="joint_state", from_pixels=from_pixels)
+
+
 def test_make_says_what_to_use_with_an_id_of_a_user(env_id):
     with pytest.raises(TypeError, match=r"use task_options=\{'reward_type': 'dense'}"):
         torch_panda.make(env_id, reward_type="dense")

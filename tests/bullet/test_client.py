@@ -106,6 +106,7 @@ def test_ctrl_c_in_close_does_not_free_a_client_twice(monkeypatch):
         ("set_joints", (1, (0, 7), (0, 0), (0, 0)), "body 1 has 7 joints, .*got 7"),
         ("set_base", (-1, (0, 0, 0)), r"body id must be one of \(0, 1\), got -1"),
         ("mass", (0, 0), "body 0 has 0 links .*got 0"),
+        ("state", (7,), r"body id must be one of \(0, 1\), got 7"),
     ],
 )
 def test_bodies_and_links_that_do_not_exist_are_refused(method, arguments, message):

@@ -675,7 +675,12 @@ class PhysicsClient:
         return self.struct.num_detections
 
     def state(self, body: int) -> BodyState:
-        """The state of a body: base, joints, links, and forces in the joints."""
+        """The state of a body: base, joints, links, and forces in the joints.
+
+        Raises:
+            ValueError: The body does not exist.
+        """
+        self._check_link(body)
         command = capi.state_init(self.connection.handle, body)
         return BodyState(
             self.connection.submit(

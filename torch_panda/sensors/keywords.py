@@ -51,7 +51,9 @@ def read_keywords(
 
     Raises:
         ValueError: The keywords contradict each other, or a size is out of range.
+        TypeError: ``sensors`` is no sequence of sensors.
     """
+    _check_sequence(sensors)
     if not (from_pixels or depth or segmentation):
         if camera is not None or render_size is not None:
             raise ValueError(
@@ -72,11 +74,7 @@ def resolve_sensors(
         ValueError: A name is unknown, or the robot cannot have a sensor.
         TypeError: An argument has a wrong type.
     """
-    if isinstance(sensors, str) or not isinstance(sensors, Sequence):
-        raise TypeError(
-            f"sensors must be a tuple or list of names or Sensor objects, got "
-            f"{sensors!r}"
-        )
+    _check_sequence(sensors)
     for sensor in sensors:
         if not isinstance(sensor, str):
             check_instance("each of sensors", sensor, Sensor)
@@ -89,3 +87,12 @@ def resolve_sensors(
     for sensor in read:
         sensor.check(robot)
     return tuple(read)
+
+
+def _check_sequence(sensors: object) -> None:
+    """Check that an argument is a sequence; a text is one name, not a sequence."""
+    if isinstance(sensors, str) or not isinstance(sensors, Sequence):
+        raise TypeError(
+            f"sensors must be a tuple or list of names or Sensor objects, got "
+            f"{sensors!r}"
+        )
