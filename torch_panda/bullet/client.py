@@ -82,8 +82,6 @@ class PhysicsClient:
 
     Args:
         physics: Parameters of the integration.
-        is_self_test: Whether the client serves the self-test of the faster solver,
-            which is then being activated.
 
     Raises:
         ImportError: The C API of the installed pybullet is not the supported one.
@@ -97,14 +95,11 @@ class PhysicsClient:
         gravity: Gravity along the world's z axis [m/s^2]; see `set_gravity`.
     """
 
-    def __init__(
-        self, *, physics: PhysicsParams = EXACT, is_self_test: bool = False
-    ) -> None:
-        if not is_self_test:
-            # Imported here, because its self-test needs this module.
-            from torch_panda.bullet import solver
+    def __init__(self, *, physics: PhysicsParams = EXACT) -> None:
+        # Imported here, because only clients need this package.
+        from torch_panda.bullet import solver
 
-            solver.activate()
+        solver.activate()
         self.connection = connect()
         self.struct = structs.Client(handle=self.connection.handle)
         self._physics = physics

@@ -10,12 +10,11 @@ must be equal bit for bit.
 from ctypes import c_double, c_float, c_int
 from pathlib import Path
 
-import numpy as np
-
 from torch_panda.bullet import capi
-from torch_panda.bullet.client import VELOCITY_GAIN, PhysicsClient
-from torch_panda.bullet.connection import BulletError
-from torch_panda.bullet.physics import PhysicsParams
+from torch_panda.bullet.blueprint import Vector
+from torch_panda.bullet.body_state import Q_OFFSET, U_OFFSET, BodyState
+from torch_panda.bullet.building import ORIGIN, create_body, load_urdf
+from torch_panda.bullet.connection import BulletError, Connection, connect, doubles
 from torch_panda.bullet.solver.native import (
     FIXED,
     FOLLOW,
@@ -27,22 +26,20 @@ from torch_panda.bullet.solver.native import (
     IncompatibleError,
     SolverLibrary,
 )
+from torch_panda.rotations import NO_ROTATION
 
 _URDF = Path(__file__).with_name("self_test.urdf")
 _NUM_STEPS = 60
-_PHYSICS = PhysicsParams(
-    timestep=0.004,
-    solver_iterations=40,
-    residual_threshold=1e-8,
-    position_gain=0.3,
-    ik_iterations=6,
-    ik_damping=0.02,
-)
+_TIME_STEP = 0.004
+_NUM_ITERATIONS = 40
+_RESIDUAL_THRESHOLD = 1e-8
 _FORCE = 40.0
 _FRICTION = 0.6
 _RESTITUTION = 0.3
 _MASSES = (0.2, 0.1)  # of the boxes
-_BOXES = ((0.03, 0.03, 0.03), (0.02, 0.03, 0.02))  # half their edges
+_KP = 0.3
+_KD = 1.0
+_GRAVITY = -9.81
 _JOINT_DAMPING = 0.2
 _DAMPING = c_float(0.04).value  # Bullet's default, linear and angular
 _MAX_VELOCITY = 100.0  # Bullet's default
@@ -52,6 +49,8 @@ _LINK_MASSES = (0.7, 0.4, 0.1, 0.05, 0.05)
 _NUM_JOINTS = 4
 _JOINT_TARGET = 0.8  # lies beyond the limits of all joints
 _TARGET = (0.3, 0.1, 0.2, 0.5, 0.5, 0.1, 0.7)  # pose for the inverse kinematics
+_IK_DAMPING = 0.02
+_IK_ITERATIONS = 6
 _SAVE_STEP, _LOAD_STEP = 20, 40  # before which a snapshot is taken and loaded
 
 
@@ -69,28 +68,28 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
     expectation = Expectation(
         motor_table,
         limit_table,
-        _PHYSICS.timestep,
-        _PHYSICS.residual_threshold,
-        _FORCE * _PHYSICS.timestep,
+        _TIME_STEP,
+        _RESIDUAL_THRESHOLD,
+        _FORCE * _TIME_STEP,
         _FRICTION * _FRICTION,
         _RESTITUTION * _RESTITUTION,
         (c_double * 2)(*_MASSES),
-        _PHYSICS.solver_iterations,
+        _NUM_ITERATIONS,
         _NUM_JOINTS,
         len(_JOINT_TYPES),
         (c_int * len(_JOINT_TYPES))(*_JOINT_TYPES),
-        _PHYSICS.position_gain,
-        VELOCITY_GAIN,
+        _KP,
+        _KD,
         len(_MASSES) + 2,  # the boxes, the arm and the table
         (c_double * len(_LINK_MASSES))(*_LINK_MASSES),
-        _PHYSICS.gravity,
+        _GRAVITY,
         _JOINT_DAMPING,
         _DAMPING,
         _MAX_VELOCITY,
         _TABLE_SIZE,
         (c_double * 7)(*_TARGET),
-        _PHYSICS.ik_damping,
-        _PHYSICS.ik_iterations,
+        _IK_DAMPING,
+        _IK_ITERATIONS,
     )
     try:
         solver.set_mode(PROBE, expectation)
@@ -143,71 +142,142 @@ def run_self_test(solver: SolverLibrary, *, motor_table: int, limit_table: int) 
 def _simulate() -> list[bytes]:
     """Step the scene in a new client; return the bytes of the state after each step."""
     try:
-        with PhysicsClient(physics=_PHYSICS, is_self_test=True) as client:
-            arm, *boxes = _build(client)
+        connection = connect()
+        try:
+            arm, *boxes = _build(connection)
             states = []
             for step in range(_NUM_STEPS):
                 if step == _SAVE_STEP:
-                    snapshot = client.save()
+                    snapshot = _save(connection)
                 if step == _LOAD_STEP:
-                    _load(client, snapshot)
-                # Drive the joints to their upper limits, and later to the lower ones.
-                target = _JOINT_TARGET if step < _NUM_STEPS // 2 else -_JOINT_TARGET
-                targets = np.full(_NUM_JOINTS, target)
-                client.control_joints(arm, targets, (_FORCE,) * _NUM_JOINTS)
-                client.step()
-                state = b"".join(_state(client, body) for body in (arm, *boxes))
-                answer = np.empty(_NUM_JOINTS)
-                client.inverse_kinematics(
-                    arm,
-                    step % len(_JOINT_TYPES),
-                    np.array(_TARGET[:3]),
-                    _TARGET[3:],
-                    answer,
+                    _load(connection, snapshot)
+                _drive(connection, arm, step)
+                connection.submit(
+                    capi.step_init(connection.handle),
+                    capi.CMD_STEP_FORWARD_SIMULATION_COMPLETED,
+                    "step",
                 )
-                states.append(state + answer.tobytes())
+                bodies = (_state(connection, body) for body in (arm, *boxes))
+                link = step % len(_JOINT_TYPES)
+                states.append(b"".join((*bodies, _reach(connection, arm, link))))
             return states
+        finally:
+            connection.close()
     except BulletError as error:
         raise IncompatibleError(f"the self-test failed: {error}") from None
 
 
-def _build(client: PhysicsClient) -> list[int]:
-    arm = client.load_urdf(_URDF, fixed_base=True)
-    table = client.create_box(
-        (_TABLE_SIZE, _TABLE_SIZE, 0.05), mass=0.0, position=(0.0, 0.0, -0.05)
+def _build(connection: Connection) -> list[int]:
+    handle = connection.handle
+    command = capi.physics_init(handle)
+    capi.physics_set_timestep(command, _TIME_STEP)
+    capi.physics_set_gravity(command, 0.0, 0.0, _GRAVITY)
+    capi.physics_set_solver_iterations(command, _NUM_ITERATIONS)
+    capi.physics_set_residual_threshold(command, _RESIDUAL_THRESHOLD)
+    connection.submit(command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set parameters")
+    arm = load_urdf(
+        connection,
+        str(_URDF),
+        ORIGIN,
+        NO_ROTATION,
+        fixed_base=True,
+        flags=capi.URDF_IGNORE_VISUAL_SHAPES,
     )
+    table = _box(connection, 0.0, (_TABLE_SIZE, _TABLE_SIZE, 0.05), (0.0, 0.0, -0.05))
     boxes = [
-        client.create_box(size, mass=mass, position=(0.44, 0.05, height))
-        for size, mass, height in zip(_BOXES, _MASSES, (0.03, 0.08), strict=True)
+        _box(connection, _MASSES[0], (0.03, 0.03, 0.03), (0.44, 0.05, 0.03)),
+        _box(connection, _MASSES[1], (0.02, 0.03, 0.02), (0.44, 0.05, 0.08)),
     ]
     for body in (arm, table, *boxes):
-        for link in range(-1, len(client.joints(body))):
-            client.set_dynamics(
-                body,
-                link,
-                lateral_friction=_FRICTION,
-                spinning_friction=0.1,
-                restitution=_RESTITUTION,
-                joint_damping=_JOINT_DAMPING if body == arm else None,
+        for link in range(-1, capi.joint_count(handle, body)):
+            command = capi.dynamics_init(handle)
+            capi.dynamics_set_lateral_friction(command, body, link, _FRICTION)
+            capi.dynamics_set_spinning_friction(command, body, link, 0.1)
+            capi.dynamics_set_restitution(command, body, link, _RESTITUTION)
+            if body == arm:
+                capi.dynamics_set_joint_damping(command, body, link, _JOINT_DAMPING)
+            connection.submit(
+                command, capi.CMD_CLIENT_COMMAND_COMPLETED, "set dynamics"
             )
     return [arm, *boxes]
 
 
-def _load(client: PhysicsClient, snapshot: int) -> None:
-    command = capi.load_init(client.connection.handle)
+def _box(
+    connection: Connection, mass: float, half_extents: Vector, position: Vector
+) -> int:
+    command = capi.shape_init(connection.handle)
+    capi.shape_add_box(command, doubles(half_extents))
+    status = connection.submit(
+        command, capi.CMD_CREATE_COLLISION_SHAPE_COMPLETED, "create a shape"
+    )
+    shape = int(capi.status_shape(status))
+    return create_body(connection, position, mass=mass, collision_shape=shape)
+
+
+def _drive(connection: Connection, arm: int, step: int) -> None:
+    """Drive the joints to their upper limits, and in the second half to the lower."""
+    target = _JOINT_TARGET if step < _NUM_STEPS // 2 else -_JOINT_TARGET
+    command = capi.motor_init(
+        connection.handle, arm, capi.CONTROL_MODE_POSITION_VELOCITY_PD
+    )
+    for joint in range(_NUM_JOINTS):
+        capi.motor_set_position(command, Q_OFFSET + joint, target)
+        capi.motor_set_velocity(command, U_OFFSET + joint, 0.0)
+        capi.motor_set_kp(command, U_OFFSET + joint, _KP)
+        capi.motor_set_kd(command, U_OFFSET + joint, _KD)
+        capi.motor_set_force(command, U_OFFSET + joint, _FORCE)
+    connection.submit(
+        command, capi.CMD_DESIRED_STATE_RECEIVED_COMPLETED, "control joints"
+    )
+
+
+def _save(connection: Connection) -> int:
+    status = connection.submit(
+        capi.save_init(connection.handle),
+        capi.CMD_SAVE_STATE_COMPLETED,
+        "save a state",
+    )
+    return int(capi.status_snapshot(status))
+
+
+def _load(connection: Connection, snapshot: int) -> None:
+    command = capi.load_init(connection.handle)
     capi.load_set_snapshot(command, snapshot)
-    client.connection.submit(command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state")
+    connection.submit(command, capi.CMD_RESTORE_STATE_COMPLETED, "load a state")
 
 
-def _state(client: PhysicsClient, body: int) -> bytes:
+def _reach(connection: Connection, arm: int, link: int) -> bytes:
+    """Bytes of the joint positions that bring a link to the target."""
+    command = capi.ik_init(connection.handle, arm)
+    capi.ik_set_target(command, link, doubles(_TARGET[:3]), doubles(_TARGET[3:]))
+    capi.ik_set_iterations(command, _IK_ITERATIONS)
+    capi.ik_set_damping(command, _NUM_JOINTS, doubles((_IK_DAMPING,) * _NUM_JOINTS))
+    status = connection.submit(
+        command,
+        capi.CMD_CALCULATE_INVERSE_KINEMATICS_COMPLETED,
+        "solve the inverse kinematics",
+    )
+    joints = (c_double * _NUM_JOINTS)()
+    capi.ik_result(status, c_int(), c_int(), joints)
+    return bytes(joints)
+
+
+def _state(connection: Connection, body: int) -> bytes:
     """Bytes of a body's positions, velocities and motor forces."""
-    state = client.state(body)
+    handle = connection.handle
+    state = BodyState(
+        connection.submit(
+            capi.state_init(handle, body),
+            capi.CMD_ACTUAL_STATE_UPDATE_COMPLETED,
+            "report a state",
+        )
+    )
     parts = [
         state.base_pose,
         state.base_velocity,
         state.joint_positions,
         state.joint_velocities,
     ]
-    if client.joints(body):
+    if capi.joint_count(handle, body):
         parts.append(state.motor_forces)
     return b"".join(part.tobytes() for part in parts)
