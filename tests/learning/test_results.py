@@ -253,6 +253,7 @@ def test_numbers_of_1000_episodes_stand_beside_their_command():
         assert not has_numbers or "--episodes 1000" in section or title == "Summary"
 
 
+RETURNS = read_section("Returns compared with published agents", PAGE)
 RECIPE_TASKS = ("Reach", "Push", "PickAndPlace", "Drawer")
 
 
@@ -291,6 +292,22 @@ def test_the_readme_has_the_numbers_of_the_results(task):
     assert (number, summary_steps) == (str(len(seeds)), steps)
     policy = read_cells(POLICIES, f"`Panda{task}-v1`")
     assert (policy[0], policy[3]) == (f"{seeds[0]} %", steps)
+
+
+@pytest.mark.parametrize(
+    ("task", "row"),
+    [("Slide", "Slide, the same"), ("Stack", "Stack, special starts; stopped")],
+)
+def test_the_readme_has_the_numbers_of_a_single_seed(task, row):
+    steps, minutes, (success,) = read_recipe_row(row)
+    _, *cells, _ = read_cells(README, task)
+    assert cells == [success, steps, "1", minutes]
+    policy = read_cells(POLICIES, f"`Panda{task}-v1`")
+    assert (policy[0], policy[3]) == (f"{success} %", steps)
+    (ours,) = re.findall(
+        rf"^\| {task}(?: \(.*?\))? \| .*? \| ([\d,]+) \|", RETURNS, re.M
+    )
+    assert ours == steps
 
 
 @pytest.mark.parametrize(
