@@ -90,6 +90,11 @@ DEMOS = ["--demos", "nofile.pt"]
             ["--verify", "--env-id", "PandaDrawer-v1"],
             "no hashes of 1000 transitions of PandaDrawer",
         ),
+        (
+            "record",
+            ["--verify", *DATA[:2], "--transitions", "10"],
+            r"no hashes of 10 transitions of \S+ noisy were published",
+        ),
         ("record", ["--verify", "--transitions", "5"], "numbers 1000, 100000, 1000000"),
         (
             "record",

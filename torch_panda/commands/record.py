@@ -15,7 +15,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -28,6 +28,7 @@ import torch_panda
 from torch_panda.commands.evaluate import print_share
 from torch_panda.datasets.formats import Writer, load_format
 from torch_panda.datasets.generation import (
+    PLAY_NOISE,
     Kind,
     batch_shape,
     episode_seed,
@@ -84,10 +85,10 @@ class Args:
     """module or .py file to import first, which registers ids of your own"""
     kind: Literal["expert", Kind] = "expert"
     """demonstrations ("expert"), or data of `torch_panda.datasets.generate`: the expert
-    with noise on its actions ("noisy"), the expert pursuing goal after goal without
-    reset ("play"), or random actions ("random")"""
-    play_noise: Weight = 0.0
-    """scale of smooth noise on the actions of the kind "play"; 0.1 is that of OGBench's
+    with noise on its actions ("noisy"), the expert with smooth noise pursuing goal
+    after goal without reset ("play"), or random actions ("random")"""
+    play_noise: Weight = PLAY_NOISE
+    """scale of the smooth noise of the kind "play"; the default is that of OGBench's
     play data"""
     transitions: Positive | None = None
     """number of generated transitions, rounded up to whole episodes; None means
@@ -133,7 +134,8 @@ def check(args: Args) -> None:
         )
     if is_generated and args.out is None:
         raise ValueError(f"the kind {args.kind} needs a file or name to write, --out")
-    if not is_generated and (args.transitions is not None or args.play_noise):
+    changes_data = args.transitions is not None or args.play_noise != PLAY_NOISE
+    if not is_generated and changes_data:
         raise ValueError(
             "transitions and play_noise do not work with the kind expert; use episodes "
             "and noise_eps, or another kind"
@@ -277,15 +279,17 @@ def verify(args: Args) -> None:
     """
     transitions = args.transitions or 1_000
     published = json.loads(PUBLISHED.read_text())
-    hashes = published.get(str(transitions), {}).get(args.env_id)
-    if hashes is None:
+    hashes = published.get(str(transitions), {}).get(args.env_id, {})
+    kinds: list[Kind] = list(hashes) if args.kind == "expert" else [args.kind]
+    if not hashes.keys() & kinds:
         ids = ", ".join(published["1000"])
+        data_sets = " ".join([args.env_id, *kinds])
         raise ValueError(
-            f"no hashes of {transitions} transitions of {args.env_id} were published; "
+            f"no hashes of {transitions} transitions of {data_sets} were published; "
             f"the published ids are {ids}, and the numbers {', '.join(published)}"
         )
     different = []
-    for kind in get_args(Kind) if args.kind == "expert" else (args.kind,):
+    for kind in kinds:
         data = generate(
             args.env_id,
             kind=kind,

@@ -31,8 +31,10 @@ Kind = Literal["noisy", "play", "random"]
 PLAY_STEPS = 1000  # length of an episode of "play"
 HOLD_STEPS = 10  # steps for which "play" stays at a goal after reaching it
 MAX_NOISE = 0.5  # largest standard deviation of the noise of "noisy"
-# A Gaussian filter with a standard deviation of half a step smooths `play_noise`. It is
-# cut off after four standard deviations. Its weights, as multiples of the largest one:
+# Noise of "play" as in OGBench's play data (arXiv 2410.20092): its scale, and the
+# weights of the filter that smooths it, as multiples of the largest one. The filter is
+# Gaussian with a standard deviation of half a step, cut off after four of them.
+PLAY_NOISE = 0.1
 SMOOTHING = [math.exp(-2 * k**2) for k in range(-2, 3)]
 
 
@@ -44,7 +46,7 @@ def generate(
     seed: int,
     num_envs: int,
     num_threads: int | None = None,
-    play_noise: float = 0.0,
+    play_noise: float = PLAY_NOISE,
     progress: Callable[[int], object] | None = None,
     **make_options: Any,  # noqa: ANN401 (options of `torch_panda.make`)
 ) -> TensorDict:
@@ -58,19 +60,18 @@ def generate(
         env_id: Id of the task.
         kind: How actions are chosen. "noisy": by the scripted expert, with Gaussian
             noise whose standard deviation is drawn per episode from 0 to `MAX_NOISE`.
-            "play": by the expert, which pursues one goal after another without reset,
-            for `PLAY_STEPS` steps. It gets the next goal when it has stayed at a goal
-            for `HOLD_STEPS` steps, or when it has pursued the goal for
+            "play": by the expert with smooth noise. It pursues one goal after another
+            without reset, for `PLAY_STEPS` steps. It gets the next goal when it has
+            stayed at a goal for `HOLD_STEPS` steps, or when it has pursued the goal for
             `Task.max_episode_steps` steps. "random": uniformly.
         transitions: Number of transitions, rounded up to whole episodes.
         seed: Seed of the data set.
         num_envs: Number of environments stepped in parallel.
         num_threads: Number of threads that step them; None means one per core
             that the process may use.
-        play_noise: Scale of noise on the actions of "play", as in OGBench's play data
-            (arXiv 2410.20092), where it is 0.1: Gaussian noise of this standard
-            deviation, smoothed over time by a Gaussian filter whose standard deviation
-            is half a step. The data contain the executed, noisy actions.
+        play_noise: Scale of the noise on the actions of "play": Gaussian noise of this
+            standard deviation, smoothed over time by a Gaussian filter whose standard
+            deviation is half a step. The data contain the executed, noisy actions.
         progress: Called with the number of new transitions after every step.
         **make_options: Further arguments of `torch_panda.make`.
 
@@ -127,7 +128,7 @@ def generate_parts(
         raise ValueError(f"kind must be one of {names}, got {kind!r}")
     check_positive(transitions=transitions, num_envs=num_envs)
     check_not_negative(play_noise=play_noise)
-    if play_noise and kind != "play":
+    if play_noise != PLAY_NOISE and kind != "play":
         raise ValueError(
             f'play_noise works with the kind play only, got {play_noise} and "{kind}"'
         )
