@@ -5,10 +5,12 @@ import json
 import re
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from torch_panda.commands.train import parse
+from torch_panda.learning.agents.hyperparameters import OfflineAlgo
 from torch_panda.learning.evaluation import wilson_interval
 from torch_panda.learning.files.run_files import fixed_options
 from torch_panda.learning.options import Args
@@ -19,8 +21,11 @@ RESULTS = ROOT / "examples" / "results"
 RUNS = RESULTS / "runs"
 PAGE = (RESULTS / "README.md").read_text()
 HELPED = (RESULTS / "what_helped.md").read_text()
+OFFLINE = (RESULTS / "offline.md").read_text()
 README = (ROOT / "README.md").read_text()
 POLICIES = (ROOT / "torch_panda" / "policies" / "README.md").read_text()
+# The other sections are older, and their runs were not kept.
+OFFLINE_COMMANDS = OFFLINE.split("\n## Noise of play data")[1].split("\n## ")[0]
 # These options may differ between a command and its run: the page's seed is a
 # placeholder, and runs may begin on another device.
 FREE = {"seed", "device"}
@@ -32,7 +37,7 @@ HAS_FETCH = find_spec("gymnasium_robotics") is not None
 
 def read_commands():
     """The commands of trainings that the pages print."""
-    text = re.sub(r" \\\n +", " ", PAGE + HELPED + POLICIES)
+    text = re.sub(r" \\\n +", " ", PAGE + HELPED + POLICIES + OFFLINE_COMMANDS)
     found = re.findall(r"(?:^python -m torch_panda |`)(train [^`#\n]+)", text, re.M)
     commands = dict.fromkeys(command.strip() for command in found)
     return [x for x in commands if HAS_FETCH or "gymnasium_robotics" not in x]
@@ -54,7 +59,10 @@ def commands():
     """The options of each command that the pages print; with `--algo A` of each."""
     options = {}
     for command in read_commands():
-        algos = ("ddpg", "td3", "sac") if "--algo A" in command else ("ddpg",)
+        algos: tuple[str, ...] = ("ddpg",)
+        if "--algo A" in command:
+            is_offline = "--offline" in command
+            algos = get_args(OfflineAlgo) if is_offline else ("ddpg", "td3", "sac")
         options[command] = [read_options(command, algo) for algo in algos]
     return options
 
@@ -72,7 +80,8 @@ def runs():
         if args["preset"] == "recipe":  # an option since, with this default
             args.setdefault("keep_unmoved", RECIPE["keep_unmoved"])
         args = default | args
-        if args["preset"] not in ("recipe", "paper") or "no-her" in name:
+        presets = ("recipe", "paper", "offline")
+        if args["preset"] not in presets or "no-her" in name:
             continue
         if HAS_FETCH or not name.startswith("Fetch"):
             runs[name] = args
@@ -203,6 +212,18 @@ def test_numbers_of_trainings_are_in_the_curves():
                 assert is_rounded(percent, success), (folder, seed, step)
                 compared += 1
     assert compared > 70
+
+
+def test_numbers_of_offline_learning_are_in_the_curves():
+    (table,) = read_tables(read_section("Noise of play data", OFFLINE))
+    assert len(table) > 6
+    for agent, *cells in table[2:]:
+        for cell, data in zip(cells, ("play-no-noise", "play"), strict=True):
+            name = f"PandaPush-v1-{agent.strip('`')}-{data}-0"
+            for number, column in zip(
+                cell.split(" / "), ("success", "fixed_success"), strict=True
+            ):
+                assert is_rounded(read_percent(name, 30_000, column), number), name
 
 
 def test_reach_is_learned_in_all_runs():
