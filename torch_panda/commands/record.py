@@ -15,7 +15,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 import tyro
@@ -279,14 +279,14 @@ def verify(args: Args) -> None:
     """
     transitions = args.transitions or 1_000
     published = json.loads(PUBLISHED.read_text())
-    hashes = published.get(str(transitions), {}).get(args.env_id, {})
-    kinds: list[Kind] = list(hashes) if args.kind == "expert" else [args.kind]
-    if not hashes.keys() & kinds:
+    kinds = get_args(Kind) if args.kind == "expert" else (args.kind,)
+    hashes = published.get(str(transitions), {}).get(args.env_id)
+    if hashes is None:
         ids = ", ".join(published["1000"])
-        data_sets = " ".join([args.env_id, *kinds])
         raise ValueError(
-            f"no hashes of {transitions} transitions of {data_sets} were published; "
-            f"the published ids are {ids}, and the numbers {', '.join(published)}"
+            f"no hashes of {transitions} transitions of {args.env_id} "
+            f"{', '.join(kinds)} were published; the published ids are {ids}, and the "
+            f"numbers {', '.join(published)}"
         )
     different = []
     for kind in kinds:
