@@ -16,6 +16,7 @@ from tests.devices import DEVICES
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
 from torch_panda.learning import sources, training
+from torch_panda.learning.environments import reached
 from torch_panda.learning.environments.starts import states_at_objects
 from torch_panda.learning.evaluation import curve, evaluate_episodes
 from torch_panda.learning.options import Args, check, default_args
@@ -69,14 +70,14 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
     assert run.progress.curve[0]["return"] == expected
 
 
-# Kinds of state: SAC's temperature; state of exploration, averaged weights, delayed
-# targets, special starts and a falling learning rate. Other algorithms have no state of
-# another kind.
+# Kinds of state: SAC's temperature and reached states; state of exploration, averaged
+# weights, delayed targets, special starts and a falling learning rate. Other algorithms
+# have no state of another kind.
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     "options",
     [
-        {"algo": "sac", "desired_ratio": 0.5},
+        {"algo": "sac", "desired_ratio": 0.5, "start_at_reached": 0.5},
         {
             **{"keep_unmoved": 0.1, "relative_inputs": "fine"},
             **{"augmentation": "mirror-shift", "start_at_object": 0.5},
@@ -86,8 +87,9 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
     ids=["sac", "recipe"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_run_bit_for_bit(
-    tmp_path, options, device
+    tmp_path, options, device, monkeypatch
 ):
+    monkeypatch.setattr(reached, "FEWEST", 10)
     args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=200, **options)
     args = replace(args, updates_per_step=0.1, eval_interval=100, device=device)
     whole = Run(args, tmp_path)

@@ -37,6 +37,11 @@ DEMOS = ["--demos", "nofile.pt"]
             "critics parts needs algo ddpg, got td3: pass --critics whole",
         ),
         ("train", ["--start-at-object", "0.5"], "needs end-effector control"),
+        (
+            "train",
+            ["--start-at-object", "0.5", "--start-at-reached", "0.5"],
+            "drop one of --start-at-object and --start-at-reached",
+        ),
         ("train", ["--task-options", "goal", "1"], "unexpected keyword .* 'goal'"),
         (
             "train",

@@ -491,6 +491,7 @@ def test_the_recipe_derives_its_options_from_random_actions():
     ("options", "name"),
     [
         ({"start_at_object": 0.5}, "start_at_object"),
+        ({"start_at_reached": 0.5}, "start_at_reached"),
         ({"demos": Path("demos.pt")}, "demos"),
         ({"physics": "fast"}, "physics"),
         ({"task_options": {"goal_range": 1.0}}, "task_options"),

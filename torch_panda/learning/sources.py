@@ -19,12 +19,13 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.buffers import PartRewards, make_buffer, select_sequences
 from torch_panda.learning.environments import GoalEnv
+from torch_panda.learning.environments.reached import StartReached
 from torch_panda.learning.environments.starts import StartFrom, states_at_objects
 from torch_panda.learning.evaluation.curve import reseed
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import DEMO_RATIO, Args
 
-# With ``--start-at-object``, each environment takes at most this number of steps in an
+# With special starts, each environment takes at most this number of steps in an
 # iteration. Episodes that start in the middle of the task need no more. The limit also
 # cuts the other episodes, because all environments take the same number of steps.
 MAX_STEPS_FROM_MIDDLE = 50
@@ -66,8 +67,8 @@ class Experience:
     """Transitions that an agent collects in environments, and demonstrations.
 
     Each iteration resets all environments, and steps each of them for the length of an
-    episode (with ``--start-at-object`` at most `MAX_STEPS_FROM_MIDDLE` steps). If
-    success ends episodes, an environment may play several of them in one iteration.
+    episode (with special starts at most `MAX_STEPS_FROM_MIDDLE` steps). If success ends
+    episodes, an environment may play several of them in one iteration.
 
     Args:
         args: Options of the training.
@@ -81,7 +82,7 @@ class Experience:
     ) -> None:
         self.args, self.env, self.agent = args, env, agent
         steps = env.max_episode_steps
-        if args.start_at_object:
+        if args.start_at_object or args.start_at_reached:
             steps = min(steps, MAX_STEPS_FROM_MIDDLE)
         steps_per_iteration = args.num_envs * steps
         self.buffer = make_buffer(
@@ -109,6 +110,12 @@ class Experience:
         if args.start_at_object:
             states = states_at_objects(args.env_id, seed=args.seed, **args.env_options)
             explored = TransformedEnv(env, StartFrom(states, args.start_at_object))
+        # What a run needs to be resumed.
+        self.buffers: dict[str, ReplayBuffer] = {"buffer": self.buffer}
+        if args.start_at_reached:
+            starts = StartReached(args.start_at_reached)
+            self.buffers["reached"] = starts.states
+            explored = TransformedEnv(env, starts)
         # A batch [num_envs, steps] begins with a reset of all environments. Episodes
         # that are still running at its end are cut.
         self.collector = Collector(
@@ -176,12 +183,11 @@ class DataSet:
         data: Transitions (n,), see `OfflineData`.
     """
 
-    buffer: ReplayBuffer | None = None  # its state need not be saved
-
     def __init__(
         self, args: Args, env: RobotTaskEnv, agent: Agent, data: TensorDictBase
     ) -> None:
         self.env, self.agent = env, agent
+        self.buffers: dict[str, ReplayBuffer] = {}  # the data need not be saved
         at_once = drawn_at_once(env.device)
         self.steps = math.gcd(at_once, args.eval_interval, args.total_steps)
         self.data = OfflineData(

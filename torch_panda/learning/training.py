@@ -110,7 +110,7 @@ class Run:
         )
         self.progress = Progress()
         self.checkpoint = Checkpoint(
-            out, args, self.agent, self.source.buffer, self.progress, data_hash
+            out, args, self.agent, self.source.buffers, self.progress, data_hash
         )
         if args.resume:
             self.checkpoint.load()

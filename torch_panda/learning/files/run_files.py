@@ -16,7 +16,7 @@ import io
 import json
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -83,7 +83,7 @@ class Checkpoint:
     out: Path
     args: Any  # options of the run, a dataclass
     agent: Agent
-    buffer: ReplayBuffer | None  # None in offline learning
+    buffers: Mapping[str, ReplayBuffer]  # by name; none in offline learning
     progress: Progress
     data_hash: str = ""  # of demonstrations or offline data; empty without both
 
@@ -98,11 +98,11 @@ class Checkpoint:
             "agent": self.agent.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
             "updates": self.agent.updates,
-            "buffer": self.buffer.state_dict() if self.buffer is not None else {},
             "data_hash": self.data_hash,
             "random": torch.get_rng_state(),
             "cuda_random": torch.cuda.get_rng_state_all(),
             "progress": asdict(self.progress),
+            **{name: buffer.state_dict() for name, buffer in self.buffers.items()},
         }
         files.save(self.out / STATE, state)
         save_policy(self.out / POLICY, self.agent, self.args.env_id)
@@ -117,8 +117,8 @@ class Checkpoint:
                 of observations.
         """
         keys = (
-            *("args", "agent", "optimizer", "updates", "buffer"),
-            *("data_hash", "random", "cuda_random", "progress"),
+            *("args", "agent", "optimizer", "updates", "data_hash"),
+            *("random", "cuda_random", "progress", *self.buffers),
         )
         finite = ("agent", "optimizer")
         path = self.out / STATE
@@ -155,8 +155,8 @@ class Checkpoint:
             ) from None
         self.agent.optimizer.load_state_dict(state["optimizer"])
         self.agent.updates = state["updates"]
-        if self.buffer is not None:
-            self.buffer.load_state_dict(state["buffer"])
+        for name, buffer in self.buffers.items():
+            buffer.load_state_dict(state[name])
         for name, value in state["progress"].items():
             setattr(self.progress, name, value)
         # Last, so that nothing draws random numbers before the run continues.
