@@ -217,7 +217,7 @@ def test_numbers_of_trainings_are_in_the_curves():
 def test_numbers_of_offline_learning_are_in_the_curves():
     (table,) = read_tables(read_section("Noise of play data", OFFLINE))
     rows = {agent.strip("`"): cells for agent, *cells in table[2:]}
-    assert rows.keys() == {*get_args(OfflineAlgo)} - {"qrl"}  # without noise only
+    assert rows.keys() == {*get_args(OfflineAlgo)}
     for agent, cells in rows.items():
         for cell, data in zip(cells, ("play-no-noise", "play"), strict=True):
             name = f"PandaPush-v1-{agent}-{data}-0"
