@@ -15,10 +15,11 @@ from torch_panda.envs import robot_task
 
 
 def run(env, steps):
-    """Reset the environments and push the objects for some steps."""
+    """Reset the environments, push the objects for some steps, and observe them."""
     policy, td = pusher(env, noise=0.3), env.reset()
     for _ in range(steps):
         td = env.step(policy(td))["next"]
+    return td
 
 
 @pytest.fixture
@@ -185,6 +186,15 @@ def test_a_state_that_is_set_and_read_keeps_float64(env):
         # Bullet reports rotations from a matrix: the last bit may differ.
         tolerance = 1e-15 if key == "object_pose" else 0.0
         torch.testing.assert_close(again[key], value, rtol=0.0, atol=tolerance)
+
+
+def test_a_step_observes_the_hand_one_substep_before_its_state(env):
+    td = run(env, 20)
+    hand, velocity = td["observation"][:, :6].split(3, dim=1)
+    start = env.reset(env.get_state(), set_state=True)
+    moved = start["observation"][:, :3] - hand
+    assert (moved.abs().amax(1) > 1e-5).all()
+    torch.testing.assert_close(moved, velocity / 500, rtol=0.0, atol=1e-5)
 
 
 def test_a_partial_state_leaves_the_rest_neutral_or_sampled(env):
