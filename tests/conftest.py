@@ -2,7 +2,6 @@
 
 import multiprocessing
 import signal
-from functools import partial
 
 import pytest
 import torch
@@ -58,16 +57,12 @@ def make_demos(tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Evaluate few episodes, draw small videos and make few special starts.
+    """Evaluate few episodes, and draw small videos.
 
     Signal handlers and numbers of threads are restored afterwards.
     """
-    from torch_panda.learning import sources
-    from torch_panda.learning.environments import starts
     from torch_panda.learning.evaluation import curve, video
 
-    few_states = partial(starts.states_at_objects, number=8)
-    monkeypatch.setattr(sources, "states_at_objects", few_states)
     monkeypatch.setattr(curve, "EPISODES", 2)
     monkeypatch.setattr(curve, "NUM_ENVS", 2)
     monkeypatch.setattr(video, "CELL", (64, 80))

@@ -107,7 +107,7 @@ def test_a_label_in_the_options_names_the_line(tmp_path, figures):
 def test_a_long_label_leaves_room_to_its_panel(tmp_path, figures):
     way = {"gamma": 0.9, "noise_eps": 0.1, "batch_size": 64, "ema_rate": 0.01}
     way |= {"desired_ratio": 0.5, "updates_per_step": 0.2, "randomize": 3.0}
-    args = Args(env_id="PandaPush-v1", num_envs=9, start_at_object=0.5, **way)
+    args = Args(env_id="PandaPush-v1", num_envs=9, start_at_reached=0.5, **way)
     write_run(tmp_path / "way", args)
     for task in ("Reach", "Slide"):
         write_run(tmp_path / task, Args(env_id=f"Panda{task}-v1"))

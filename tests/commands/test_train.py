@@ -15,9 +15,8 @@ from tests.commands.runs import After, Kill, points, read_curve, weights
 from tests.devices import DEVICES
 from torch_panda.commands import evaluate, plot, train
 from torch_panda.commands.train import parse
-from torch_panda.learning import sources, training
-from torch_panda.learning.environments import reached
-from torch_panda.learning.environments.starts import states_at_objects
+from torch_panda.learning import training
+from torch_panda.learning.environments import starts
 from torch_panda.learning.evaluation import curve, evaluate_episodes
 from torch_panda.learning.options import Args, check, default_args
 from torch_panda.learning.training import Run
@@ -70,17 +69,17 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
     assert run.progress.curve[0]["return"] == expected
 
 
-# Kinds of state: SAC's temperature and reached states; state of exploration, averaged
-# weights, delayed targets, special starts and a falling learning rate. Other algorithms
-# have no state of another kind.
+# Kinds of state: SAC's temperature; state of exploration, averaged weights, delayed
+# targets, reached states and a falling learning rate. Other algorithms have no state of
+# another kind.
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     "options",
     [
-        {"algo": "sac", "desired_ratio": 0.5, "start_at_reached": 0.5},
+        {"algo": "sac", "desired_ratio": 0.5},
         {
             **{"keep_unmoved": 0.1, "relative_inputs": "fine"},
-            **{"augmentation": "mirror-shift", "start_at_object": 0.5},
+            **{"augmentation": "mirror-shift", "start_at_reached": 0.5},
             **{"exploration": "points", "ema_rate": 0.1},
         },
     ],
@@ -89,7 +88,7 @@ def test_the_curve_is_that_of_the_saved_policy(tmp_path):
 def test_a_resumed_run_equals_an_uninterrupted_run_bit_for_bit(
     tmp_path, options, device, monkeypatch
 ):
-    monkeypatch.setattr(reached, "FEWEST", 10)
+    monkeypatch.setattr(starts, "FEWEST", 10)
     args = Args(env_id="PandaPush-v1", num_envs=2, total_steps=200, **options)
     args = replace(args, updates_per_step=0.1, eval_interval=100, device=device)
     whole = Run(args, tmp_path)
@@ -274,20 +273,9 @@ def test_a_number_of_steps_on_the_command_line_is_always_trained():
     assert not parse(["--total_steps=4000"]).stop_when_solved
 
 
-def test_starts_at_objects_and_demonstrations_have_the_options_of_the_task(
-    tmp_path, monkeypatch, make_demos
-):
-    def make_states(env_id, **options):
-        states.append(states_at_objects(env_id, number=8, **options))
-        return states[0]
-
-    states = []
-    monkeypatch.setattr(sources, "states_at_objects", make_states)
-    options = {"obj_xy_range": 0.0, "distance_threshold": 10.0}
-    args = Args(env_id="PandaPush-v1", start_at_object=0.5, task_options=options)
-    train.make_run(args, tmp_path).close()
-    assert states[0]["object_pose"][..., :2].abs().max() < 0.01
-    # The demonstrations succeed only with the task's own threshold.
+def test_demonstrations_need_the_options_of_the_task(tmp_path, make_demos):
+    """They succeed only with the task's own threshold."""
+    args = Args(env_id="PandaPush-v1", task_options={"distance_threshold": 10.0})
     with pytest.raises(ValueError, match="of the rewards differ"):
         train.make_run(replace(args, demos=make_demos()), tmp_path)
 

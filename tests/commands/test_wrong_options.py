@@ -36,12 +36,6 @@ DEMOS = ["--demos", "nofile.pt"]
             ["--env-id", "PandaStack-v1", "--critics", "parts", "--algo", "td3"],
             "critics parts needs algo ddpg, got td3: pass --critics whole",
         ),
-        ("train", ["--start-at-object", "0.5"], "needs end-effector control"),
-        (
-            "train",
-            ["--start-at-object", "0.5", "--start-at-reached", "0.5"],
-            "drop one of --start-at-object and --start-at-reached",
-        ),
         ("train", ["--task-options", "goal", "1"], "unexpected keyword .* 'goal'"),
         (
             "train",

@@ -490,7 +490,6 @@ def test_the_recipe_derives_its_options_from_random_actions():
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        ({"start_at_object": 0.5}, "start_at_object"),
         ({"start_at_reached": 0.5}, "start_at_reached"),
         ({"demos": Path("demos.pt")}, "demos"),
         ({"physics": "fast"}, "physics"),

@@ -303,8 +303,7 @@ def limits(seeds):
 
 @pytest.mark.parametrize("task", RECIPE_TASKS)
 def test_the_readme_has_the_numbers_of_the_results(task):
-    name = {"PickAndPlace": "PickAndPlace, no special starts"}.get(task, task)
-    steps, minutes, seeds = read_recipe_row(name)
+    steps, minutes, seeds = read_recipe_row(task)
     _, success, *others, _ = read_cells(README, task)
     assert read_range(success) == limits(seeds)
     assert others == [steps, str(len(seeds)), minutes]
@@ -333,7 +332,7 @@ def test_the_readme_has_the_numbers_of_a_single_seed(task, row):
 
 
 @pytest.mark.parametrize(
-    "row", ["Reach-v3", "Push-v3", "PickAndPlace-v3, special starts"]
+    "row", ["Reach-v3", "Push-v3", "PickAndPlace-v3, reached starts"]
 )
 def test_the_summary_has_the_numbers_of_version_3(row):
     steps, _, seeds = read_recipe_row(row)

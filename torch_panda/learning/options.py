@@ -98,10 +98,6 @@ class RunOptions:
     A --total-steps on the command line turns this off"""
     eval_interval: Positive = 400
     """steps between evaluations"""
-    start_at_object: Ratio = 0.0
-    """fraction of training episodes that start in the middle of the task: the hand is
-    at an object or holds it, or the first cube of Stack is at its goal. If it is above
-    0, all training episodes last at most 50 steps"""
     start_at_reached: Ratio = 0.0
     """fraction of training episodes that start in rare states which the agent itself
     has reached, for tasks whose goals are rarely reached by chance, such as Stack. If
@@ -168,10 +164,7 @@ class ArgGroups:
 
 
 # Options that environments of Gymnasium do not have.
-OWN_OPTIONS = (
-    *("task_options", "physics", "start_at_object", "start_at_reached"),
-    *("randomize", "demos"),
-)
+OWN_OPTIONS = ("task_options", "physics", "start_at_reached", "randomize", "demos")
 
 
 # Options that have an effect only with an environment, or only with --offline.
@@ -179,8 +172,7 @@ ONLINE_OPTIONS = (
     *("double_q", "action_l2", "ema_rate", "noise_eps"),
     *("random_eps", "exploration", "fine_fingers", "augmentation", "her", "critics"),
     *("desired_ratio", "keep_unmoved", "updates_per_step", "randomize"),
-    *("pretrain_updates", "start_at_object", "start_at_reached"),
-    *("demos", "workers"),
+    *("pretrain_updates", "start_at_reached", "demos", "workers"),
 )
 OFFLINE_OPTIONS = ("alpha", "actor_goal", "data", "transitions", "seeds")
 
@@ -279,11 +271,6 @@ def check(args: Args) -> None:
             raise ValueError(
                 f"critics parts needs algo ddpg, got {args.algo}: pass --critics whole"
             )
-    if args.start_at_object and args.start_at_reached:
-        raise ValueError(
-            "start_at_object and start_at_reached choose the starts of the same "
-            "episodes: drop one of --start-at-object and --start-at-reached"
-        )
     if args.pretrain_updates and args.demos is None:
         raise ValueError("pretrain_updates needs demonstrations: pass --demos")
     has_demos = args.demos is not None and args.total_steps > 0

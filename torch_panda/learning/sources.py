@@ -19,13 +19,12 @@ from torch_panda.envs import RobotTaskEnv
 from torch_panda.learning.agents import Agent
 from torch_panda.learning.buffers import PartRewards, make_buffer, select_sequences
 from torch_panda.learning.environments import GoalEnv
-from torch_panda.learning.environments.reached import StartReached
-from torch_panda.learning.environments.starts import StartFrom, states_at_objects
+from torch_panda.learning.environments.starts import StartReached
 from torch_panda.learning.evaluation.curve import reseed
 from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import DEMO_RATIO, Args
 
-# With special starts, each environment takes at most this number of steps in an
+# With ``--start-at-reached``, each environment takes at most this number of steps in an
 # iteration. Episodes that start in the middle of the task need no more. The limit also
 # cuts the other episodes, because all environments take the same number of steps.
 MAX_STEPS_FROM_MIDDLE = 50
@@ -67,8 +66,8 @@ class Experience:
     """Transitions that an agent collects in environments, and demonstrations.
 
     Each iteration resets all environments, and steps each of them for the length of an
-    episode (with special starts at most `MAX_STEPS_FROM_MIDDLE` steps). If success ends
-    episodes, an environment may play several of them in one iteration.
+    episode (with ``--start-at-reached`` at most `MAX_STEPS_FROM_MIDDLE` steps). If
+    success ends episodes, an environment may play several of them in one iteration.
 
     Args:
         args: Options of the training.
@@ -82,7 +81,7 @@ class Experience:
     ) -> None:
         self.args, self.env, self.agent = args, env, agent
         steps = env.max_episode_steps
-        if args.start_at_object or args.start_at_reached:
+        if args.start_at_reached:
             steps = min(steps, MAX_STEPS_FROM_MIDDLE)
         steps_per_iteration = args.num_envs * steps
         self.buffer = make_buffer(
@@ -107,9 +106,6 @@ class Experience:
                 self.demos.append_transform(PartRewards(env.compute_reward))
             self.num_demos = int(DEMO_RATIO * args.batch_size)
         explored: EnvBase = env
-        if args.start_at_object:
-            states = states_at_objects(args.env_id, seed=args.seed, **args.env_options)
-            explored = TransformedEnv(env, StartFrom(states, args.start_at_object))
         # What a run needs to be resumed.
         self.buffers: dict[str, ReplayBuffer] = {"buffer": self.buffer}
         if args.start_at_reached:
