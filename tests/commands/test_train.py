@@ -212,7 +212,7 @@ def test_critics_of_parts_learn_from_rewards_of_parts(tmp_path, make_demos):
     demos = TensorDict(torch.load(path)).auto_batch_size_(1)
     args = default_args("recipe", "PandaStack-v1")
     assert args.critics == "parts"
-    args = replace(args, num_envs=1, updates_per_step=0.01, keep_unmoved=1.0)
+    args = replace(args, num_envs=1, updates_per_step=1 / 50, keep_unmoved=1.0)
     run = Run(args, tmp_path, demos)
     run.iterate()
     [(batch, demonstrated)] = run.source.sample(args.batch_size, 1)

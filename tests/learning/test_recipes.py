@@ -8,7 +8,7 @@ again, and read its difference:
 
 import json
 import re
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -79,7 +79,7 @@ def test_the_recipe_fits_joint_control(tmp_path):
 @pytest.mark.usefixtures("quick")
 def test_episodes_that_start_in_the_middle_of_the_task_are_shorter(tmp_path):
     """An episode of Stack lasts 100 steps otherwise."""
-    args = replace(default_args("recipe", "PandaStack-v1"), start_at_reached=0.75)
+    args = default_args("recipe", "PandaStack-v1")
     args.num_envs = 2
     run = Run(args, tmp_path)
     data = next(iter(run.source.collector))

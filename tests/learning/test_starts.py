@@ -7,7 +7,7 @@ from torchrl.envs import TransformedEnv
 
 import torch_panda
 from torch_panda.learning.environments import starts
-from torch_panda.learning.environments.starts import StartReached, draw_weights
+from torch_panda.learning.environments.starts import StartReached, weigh
 
 NUM_ENVS = 8
 
@@ -38,7 +38,7 @@ def test_a_state_with_fewer_neighbours_is_likelier():
     torch.manual_seed(0)
     common = make_states([(0.0, 0.0, 0.02 + 0.0001 * k) for k in range(80)])
     rare = make_states([(0.05, 0.0, 0.02 + 0.0001 * k) for k in range(20)])
-    weights = draw_weights(torch.cat((START, common, rare)))
+    weights = weigh(torch.cat((START, common, rare)))
     assert weights[1] == weights[80]
     # There are four times as many common states as rare ones.
     assert float(weights[-1] / weights[1]) == pytest.approx(4**2.5, rel=0.3)
@@ -50,7 +50,7 @@ def test_a_state_is_rare_if_one_of_its_objects_is_at_a_rare_place():
     lifted = [(*on_table, 0.0, 0.0, 0.06), (0.0, 0.0, 0.06, *on_table)]
     states = make_states(goals + lifted, desired=(*on_table, 0.0, 0.0, 0.06))
     states["step_count"][:] = 0
-    weights = draw_weights(states)
+    weights = weigh(states)
     assert (weights[50:] > 100 * weights[:50].max()).all()
 
 
@@ -64,7 +64,7 @@ def test_states_with_fast_or_distant_objects_are_left_out():
             *(make_states(kept, speed=0.49), make_states(kept, speed=-0.51)),
         )
     )
-    is_drawn = draw_weights(states) > 0
+    is_drawn = weigh(states) > 0
     assert is_drawn.tolist() == [True] * 4 + [False] * 3 + [True] * 3 + [False] * 3
 
 
@@ -97,7 +97,7 @@ def prefer_moving(states):
 
 
 def test_episodes_start_in_reached_states_with_goals_of_their_own(env, monkeypatch):
-    monkeypatch.setattr(starts, "draw_weights", prefer_moving)
+    monkeypatch.setattr(starts, "weigh", prefer_moving)
     env.reset()
     env.rollout(5)
     td = env.reset()
@@ -117,8 +117,14 @@ def test_episodes_start_in_reached_states_with_goals_of_their_own(env, monkeypat
     assert env.rollout(3).shape == (NUM_ENVS, 3)
 
 
+def test_episodes_start_as_usual_if_no_state_fits(env, monkeypatch):
+    env.rollout(5)
+    monkeypatch.setattr(starts, "weigh", lambda states: torch.zeros(len(states)))
+    assert (env.reset()["observation"][:, 3:6] == 0).all()  # the hand rests
+
+
 def test_a_ratio_of_the_episodes_starts_there(env, monkeypatch):
-    monkeypatch.setattr(starts, "draw_weights", prefer_moving)
+    monkeypatch.setattr(starts, "weigh", prefer_moving)
     env.rollout(5)
     env.transform.ratio = 0.3
     torch.manual_seed(0)
@@ -145,7 +151,7 @@ def test_a_partial_reset_starts_only_its_own_there(env):
 
 @pytest.mark.usefixtures("env")  # for its constants
 def test_objects_with_joints_start_where_they_were(monkeypatch):
-    monkeypatch.setattr(starts, "draw_weights", prefer_moving)
+    monkeypatch.setattr(starts, "weigh", prefer_moving)
     with torch_panda.make("PandaDrawer-v1", num_envs=NUM_ENVS, seed=0) as base:
         drawer = TransformedEnv(base, StartReached(1.0))
         td = drawer.reset()

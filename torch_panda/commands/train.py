@@ -233,6 +233,7 @@ def describe_recipe(args: Args, spaces: Spaces, *, is_declared: bool) -> str:
         f"critics {args.critics!r}",
         f"inputs {args.relative_inputs!r}",
         f"augmentation {args.augmentation!r}",
+        f"{args.start_at_reached:.0%} reached starts",
     ]
     return f"{args.env_id}: {', '.join(parts)}"
 

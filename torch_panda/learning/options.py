@@ -100,8 +100,9 @@ class RunOptions:
     """steps between evaluations"""
     start_at_reached: Ratio = 0.0
     """fraction of training episodes that start in rare states which the agent itself
-    has reached, for tasks whose goals are rarely reached by chance, such as Stack. If
-    it is above 0, all training episodes last at most 50 steps"""
+    has reached, for tasks whose goals are rarely reached by chance. The recipe sets it
+    for goals of several objects. If it is above 0, all training episodes last at most
+    50 steps"""
     demos: Path | None = None
     """demonstrations to learn from, in addition to the transitions of the run: a file
     of `record`, or the folder of a data set"""

@@ -25,9 +25,9 @@ from torch_panda.learning.offline_data import OfflineData
 from torch_panda.learning.options import DEMO_RATIO, Args
 
 # With ``--start-at-reached``, each environment takes at most this number of steps in an
-# iteration. Episodes that start in the middle of the task need no more. The limit also
-# cuts the other episodes, because all environments take the same number of steps.
-MAX_STEPS_FROM_MIDDLE = 50
+# iteration. Episodes that start in reached states need no more. The limit also cuts the
+# other episodes, because all environments take the same number of steps.
+MAX_STEPS_FROM_REACHED = 50
 FIT_ROWS = 100_000  # rows of a data set from which the normaliser gets its statistics
 # Batches that are drawn at once on a GPU. The CPU draws their goals. For one batch this
 # takes longer than the gradient step, and for a hundred batches ten times as long.
@@ -66,7 +66,7 @@ class Experience:
     """Transitions that an agent collects in environments, and demonstrations.
 
     Each iteration resets all environments, and steps each of them for the length of an
-    episode (with ``--start-at-reached`` at most `MAX_STEPS_FROM_MIDDLE` steps). If
+    episode (with ``--start-at-reached`` at most `MAX_STEPS_FROM_REACHED` steps). If
     success ends episodes, an environment may play several of them in one iteration.
 
     Args:
@@ -82,7 +82,7 @@ class Experience:
         self.args, self.env, self.agent = args, env, agent
         steps = env.max_episode_steps
         if args.start_at_reached:
-            steps = min(steps, MAX_STEPS_FROM_MIDDLE)
+            steps = min(steps, MAX_STEPS_FROM_REACHED)
         steps_per_iteration = args.num_envs * steps
         self.buffer = make_buffer(
             env,

@@ -3,9 +3,9 @@
 Hindsight goals teach nothing about an object until something moves it, and nothing
 about heights until something lifts it. In tasks such as Stack, this rarely happens by
 chance. But what has happened once can be the start of many episodes, from which the
-agent goes on to states that are even rarer. Earlier methods that start there are
-reverse curriculum generation (arXiv 1707.05300) and Go-Explore (arXiv 1901.10995). That
-rare achieved goals show the way comes from MEGA (arXiv 2007.02832).
+agent goes on to states that are even rarer. Reverse curriculum generation (arXiv
+1707.05300) and Go-Explore (arXiv 1901.10995) also start episodes in reached states. The
+preference for rare achieved goals comes from MEGA (arXiv 2007.02832).
 """
 
 import torch
@@ -18,19 +18,21 @@ from torch_panda.envs.state import BODY_KEYS
 from torch_panda.learning.environments.geometry import split_goal
 
 CAPACITY = 6_000  # number of the latest states that are kept
-FEWEST = 500  # kept states with which episodes begin to start there
-KEPT = 0.2  # fraction of the steps whose states are kept
-# A state is rare if few of COMPARED other states have achieved goals within NEAR [m]
-# (without unit for goals that are no positions). A state with n such neighbours is
-# drawn with a probability in proportion to (1 + n) ** -RARITY.
+FEWEST = 500  # episodes start there once this many states are kept
+# Fraction of the steps at which the states of all environments are kept, besides those
+# at a reset of all environments.
+KEPT = 0.2
+# A state is rare if few of COMPARED states, drawn from all, have achieved goals within
+# NEAR [m] (without unit for goals that are no positions). A state with n such
+# neighbours is drawn with a probability in proportion to (1 + n) ** -RARITY.
 COMPARED, NEAR, RARITY = 2_000, 0.03, 2.5
 # Objects that fall, and objects far from the task's own starts and goals, do not help.
-MAX_SPEED = 0.5  # of an object at a start [m/s]
+MAX_SPEED = 0.5  # of an object in a state that is drawn [m/s]
 MARGIN = 0.05  # distance to the range of the task's own starts and goals [m]
 
 
 class StartReached(Transform):
-    """Starts some episodes in rare reached states, and keeps each episode's goal.
+    """Starts some episodes in rare reached states, with goals drawn by the task.
 
     Args:
         ratio: Fraction of the episodes that start in these states. torch's global
@@ -46,8 +48,8 @@ class StartReached(Transform):
         self.ratio = ratio
         storage = LazyTensorStorage(CAPACITY, device="cpu")
         self.states = TensorDictReplayBuffer(storage=storage)
-        # States and their weights at the last reset of all environments. Weights for
-        # each reset would double the time of a training with short episodes.
+        # States and their weights, computed once after each reset of all environments.
+        # Weights for each reset would double the time of trainings on short episodes.
         self._weighted: tuple[TensorDict, Tensor] | None = None
 
     def _step(
@@ -76,8 +78,10 @@ class StartReached(Transform):
         if self._weighted is None:
             states: TensorDict = self.states[:]
             keys = [key for key in BODY_KEYS if key in states.keys()]  # noqa: SIM118
-            self._weighted = states.select(*keys), draw_weights(states)
+            self._weighted = states.select(*keys).clone(), weigh(states)
         states, weights = self._weighted
+        if not weights.any():
+            return tensordict_reset
         chosen = torch.multinomial(weights, env.batch_size.numel(), replacement=True)
         start = tensordict_reset.copy().update(states[chosen].to(env.device))
         # Reset the chosen environments again, to these states. The others keep the
@@ -93,8 +97,8 @@ class StartReached(Transform):
         self.states.extend(state.cpu())
 
 
-def draw_weights(states: TensorDictBase) -> Tensor:
-    """How likely an episode is to start in each state, in proportion to 1, (n,).
+def weigh(states: TensorDictBase) -> Tensor:
+    """Unnormalised probability that an episode starts in each state, (n,).
 
     Args:
         states: States (n,), see `StartReached`.
@@ -108,7 +112,8 @@ def draw_weights(states: TensorDictBase) -> Tensor:
         for part in parts
     ]
     weights = (1.0 + torch.stack(neighbours).amin(0)).pow(-RARITY)
-    # The range of the task's own starts and goals.
+    # The range of the task's own starts and goals, for all objects together. Only the
+    # task's own starts are kept with no step.
     is_start = states["step_count"].squeeze(1) == 0
     known = torch.cat((desired, achieved[is_start])).unflatten(-1, (len(parts), -1))
     lowest, highest = known.flatten(0, 1).aminmax(dim=0)
