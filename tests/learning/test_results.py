@@ -221,19 +221,14 @@ def test_numbers_of_offline_learning_are_in_the_curves():
         "PickAndPlace, play": ("PickAndPlace", "play"),
     }
     assert {row[0].strip("`") for row in rows} == {*get_args(OfflineAlgo)}
-    compared = 0
     for agent, *cells in rows:
         for title, cell in zip(header[1:], cells, strict=True):
-            if not cell:
-                continue
             task, kind = data[title]
             name = f"Panda{task}-v1-{agent.strip('`')}-{kind}-0"
             for number, column in zip(
                 cell.split(" / "), ("success", "fixed_success"), strict=True
             ):
                 assert is_rounded(read_percent(name, 30_000, column), number), name
-                compared += 1
-    assert compared > 40
 
 
 def test_reach_is_learned_in_all_runs():
