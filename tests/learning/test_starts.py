@@ -150,6 +150,27 @@ def test_a_partial_reset_starts_only_its_own_there(env):
 
 
 @pytest.mark.usefixtures("env")  # for its constants
+def test_states_that_were_weighed_stay_starts_when_later_ones_replace_them(monkeypatch):
+    def prefer_first(states):
+        return (torch.arange(len(states)) == 0).double()
+
+    monkeypatch.setattr(starts, "weigh", prefer_first)
+    monkeypatch.setattr(starts, "CAPACITY", NUM_ENVS)
+    monkeypatch.setattr(starts, "FEWEST", NUM_ENVS)
+    with torch_panda.make("PandaPush-v1", num_envs=NUM_ENVS, seed=0) as base:
+        env = TransformedEnv(base, StartReached(1.0))
+        td = env.reset()
+        first = env.transform.states[0].clone()
+        td = env.step(env.rand_action(td))["next"]
+        assert (env.transform.states[0]["step_count"] == 1).all()
+        td["_reset"] = torch.zeros(NUM_ENVS, 1, dtype=torch.bool)
+        td["_reset"][2] = True
+        env.reset(td)
+        pose = base.get_state()["object_pose"][2]
+        torch.testing.assert_close(pose, first["object_pose"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.usefixtures("env")  # for its constants
 def test_objects_with_joints_start_where_they_were(monkeypatch):
     monkeypatch.setattr(starts, "weigh", prefer_moving)
     with torch_panda.make("PandaDrawer-v1", num_envs=NUM_ENVS, seed=0) as base:
