@@ -9,6 +9,9 @@ difference of their weights must be a small fraction of the weights; see `TOLERA
 
 A second table compares `SEEDS` agents that take their steps together, as with ``train
 --offline --seeds``, with the same agents one after another.
+
+Without a GPU it takes a few plain steps with each algorithm, which measures nothing and
+shows that the script works.
 """
 
 import sys
@@ -24,6 +27,7 @@ import torch
 import torchrl.collectors
 import torchrl.objectives
 from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
 
 
 class Absent(Loader):
@@ -58,15 +62,16 @@ from torch_panda.learning.offline_data import OfflineData  # noqa: E402
 from torch_panda.learning.sources import DRAWN_AT_ONCE, draw_batches  # noqa: E402
 from torch_panda.transforms import HindsightRelabel  # noqa: E402
 
-DEVICE = torch.device("cuda")
-EPISODES, STEPS = 2_000, 50
+HAS_GPU = torch.cuda.is_available()
+DEVICE = torch.device("cuda" if HAS_GPU else "cpu")
+EPISODES, STEPS = 2_000 if HAS_GPU else 20, 50
 BATCH_SIZE = 256
 SEEDS = 8  # agents whose steps are taken together
-COMPARED = 20  # steps whose results are compared
+COMPARED = 20 if HAS_GPU else 2  # steps whose results are compared
 # Largest root mean square of the differences, as a fraction of that of the weights. A
 # wrong batch or a missing update makes it 0.01 or more.
 TOLERANCE = 1e-3
-WARM_UP, TIMED = 200, 1_000  # steps before the timing, and timed ones
+WARM_UP, TIMED = (200, 1_000) if HAS_GPU else (0, 2)  # steps before and in the timing
 # The layout of Push. The hand's position is in the first three of the 18 observed
 # numbers, and the cube's position follows the hand's velocity.
 SIGNS = (1.0, -1.0, 1.0)
@@ -107,6 +112,18 @@ ALGORITHMS = {
 def is_success(achieved_goal: torch.Tensor, desired_goal: torch.Tensor) -> torch.Tensor:
     """Whether the cube is within 5 cm of its goal, (..., 1)."""
     return (achieved_goal - desired_goal).norm(dim=-1, keepdim=True) < 0.05
+
+
+ENV = SimpleNamespace(
+    is_success=is_success,
+    device=DEVICE,
+    ndim=0,
+    observation_spec=Composite(
+        observation=Unbounded((SPACES.observation_size,)),
+        achieved_goal=Unbounded((SPACES.goal_size,)),
+        desired_goal=Unbounded((SPACES.goal_size,)),
+    ),
+)
 
 
 def reward(achieved_goal: torch.Tensor, desired_goal: torch.Tensor) -> torch.Tensor:
@@ -151,8 +168,7 @@ class Training:
             self.agent = find_agent(hp)(SPACES, hp)
         self.agent.normalizer.update(data["observation"], data["desired_goal"])
         if hp.offline:
-            env = SimpleNamespace(is_success=is_success, device=DEVICE)
-            rows = OfflineData(data, env, self.agent.goal_strategies, self.agent.gamma)
+            rows = OfflineData(data, ENV, self.agent.goal_strategies, self.agent.gamma)
             self.draw = lambda size: self.agent.extend(rows.sample(size), rows)
         else:
             buffer = torchrl.data.TensorDictReplayBuffer(
@@ -171,7 +187,7 @@ class Training:
         """Take gradient steps, on batches drawn at once or one by one."""
         for batch in self.batches(number, at_once=at_once):
             self.agent.update(batch)
-        torch.cuda.synchronize()
+        synchronize()
 
     def measure(self, *, at_once: bool) -> float:
         """Gradient steps per second."""
@@ -179,6 +195,12 @@ class Training:
         start = time.perf_counter()
         self.take_steps(TIMED, at_once=at_once)
         return TIMED / (time.perf_counter() - start)
+
+
+def synchronize() -> None:
+    """Wait for the GPU."""
+    if HAS_GPU:
+        torch.cuda.synchronize()
 
 
 def weights(agent: Agent) -> torch.Tensor:
@@ -196,7 +218,7 @@ def compare_recorded(algo: str, data: TensorDict) -> tuple[float, float, float]:
     """Plain and recorded steps per second, and the difference of their weights."""
     results, speeds = [], []
     for records in (False, True):
-        Agent.records_steps = records
+        Agent.records_steps = records and HAS_GPU
         training = Training(algo, data)
         training.take_steps(COMPARED, at_once=True)
         results.append(weights(training.agent))
@@ -207,7 +229,7 @@ def compare_recorded(algo: str, data: TensorDict) -> tuple[float, float, float]:
 
 def compare_seeds(algo: str, data: TensorDict) -> tuple[float, float, float]:
     """Steps per second of one agent and of `SEEDS`, and the difference of weights."""
-    Agent.records_steps = True
+    Agent.records_steps = HAS_GPU
     alone, group = ([Training(algo, data, i) for i in range(SEEDS)] for _ in range(2))
     agents = StackedAgents([training.agent for training in group])
 
@@ -216,7 +238,7 @@ def compare_seeds(algo: str, data: TensorDict) -> tuple[float, float, float]:
         rows = [*zip(*drawn, strict=True)]
         for batches in rows:
             agents.update(batches)
-        torch.cuda.synchronize()
+        synchronize()
         return rows
 
     rows = take_together(COMPARED)
@@ -230,14 +252,15 @@ def compare_seeds(algo: str, data: TensorDict) -> tuple[float, float, float]:
     take_together(WARM_UP)
     start = time.perf_counter()
     for _ in range(0, TIMED, DRAWN_AT_ONCE):
-        take_together(DRAWN_AT_ONCE)
+        take_together(min(DRAWN_AT_ONCE, TIMED))
     speed = SEEDS * TIMED / (time.perf_counter() - start)
     return alone[0].measure(at_once=True), speed, max(differences)
 
 
 def main() -> None:
     """Check every algorithm, and print a row of a table for it."""
-    print(torch.cuda.get_device_name(), "torch", torch.__version__, flush=True)
+    device = torch.cuda.get_device_name() if HAS_GPU else "no GPU, nothing is measured:"
+    print(device, "torch", torch.__version__, flush=True)
     data, failed = make_data(), []
     offline = [algo for algo, options in ALGORITHMS.items() if options is OFFLINE]
     for compare, names, algorithms in (
