@@ -167,6 +167,8 @@ def test_gciql_takes_the_calculated_step(algo):
     if algo == "gciql-nstep":
         discounts = [0.9, 0.5, 0.7, 0.2]
         rows["discount"] = torch.tensor(discounts)
+        # The second row reaches its goal, after a step that did not.
+        rows["next", "reward"][1] = -1.0
     disperse(agent.value, scale=4, bias=-5)
     for net in (*agent.critic, *agent.target_critic):
         disperse(net, scale=4)
@@ -183,7 +185,7 @@ def test_gciql_takes_the_calculated_step(algo):
     target = torch.tensor(
         [-1 + discount * v for discount, v in zip(discounts, v_next, strict=True)]
     )
-    target[1] = 0.0  # the second row reaches its goal
+    target[1] = rows["next", "reward"][1]  # the second row reaches its goal
     q = pair_of_values(agent.critic, x, action)
     critic_loss = ((q - target) ** 2).mean(1).sum()
 

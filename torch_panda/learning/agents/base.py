@@ -236,7 +236,8 @@ class Agent(nn.Module, ABC):
     def _prepare(self, b: Batch) -> Batch:
         """Augment a batch, penalise failures, and convert actions for the networks."""
         b = augment(b, self.spaces.geometry, self.hp.augmentation)
-        if self.min_return is not None and self.min_return > -math.inf:
+        has_failures = not self.hp.offline  # in data sets, only goals end a return
+        if has_failures and self.min_return is not None and self.min_return > -math.inf:
             # A failure that ends an episode gets the return of never reaching the goal.
             # With its reward of -1, an agent would fail on purpose, to avoid the
             # rewards of -1 in the steps that follow.
